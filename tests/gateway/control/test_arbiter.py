@@ -1,4 +1,4 @@
-"""The arbiter over the whole product of what it looks at: stop wins everywhere, and nobody moves what they may not."""
+"""Tests of the arbiter on all combinations of its inputs. Stop always wins. Nobody moves a car without permission."""
 
 import functools
 import itertools
@@ -62,9 +62,9 @@ WHATS: list[Action] = [
     Find(),
 ]
 DIRECTIONS: list[Action] = [Pause("listen"), Unpause(), Lend("bob", 60.0), EndLoan()]
-"""What test_people.py goes through, with leads and pauses."""
+"""Commands that test_people.py tests, with leads and pauses."""
 MOVES = (Drive, SetMode, ChangeSpeed, Fan)
-"""What moves the car, or how it moves; with servo and arm it needs the lease."""
+"""Commands that move the car or change how it moves. These, servo and arm need the lease."""
 KINDS = [SenderKind.PERSON, SenderKind.SCRIPT, SenderKind.COORDINATOR]
 SENDERS = [Sender("ann", kind) for kind in KINDS]
 LEASES = [
@@ -77,19 +77,19 @@ MODES = [
     *((mode, contradicted) for mode in (Mode.MANUAL, Mode.TRACKING) for contradicted in (False, True)),
     (Mode.COLOR_LED, False),
 ]
-"""The mode that was asked, and whether what is heard contradicts it."""
+"""The commanded mode, and whether readings contradict it."""
 RANK = list(reversed(KINDS))
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
 
 @functools.cache
 def situations() -> tuple[CommandContext, ...]:
-    """Return them, made once: each of 96 tests goes through all of them twice."""
+    """Return all states, made once, because each of 69 tests goes through them twice."""
     return tuple(_situations())
 
 
 def _situations() -> Iterator[CommandContext]:
-    """30,720 states: link, answering, closing, hold, e-stop, lease, battery, queue; mode and verdict; platform."""
+    """Yield 15,360 states: link, answering, closing, hold, e-stop, lease, battery, queue, mode, verdict, platform."""
     for (
         (link, answering, closing, held, estopped, lease, battery, queued),
         (asked, contradicted),
@@ -152,7 +152,7 @@ def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
 
 
 def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
-    """What must hold, said in another way than the arbiter's rules."""
+    """Require the rules of the arbiter, written in another way."""
     what, kind = command.what, command.sender.kind
     if isinstance(what, Stop | EmergencyStop):
         assert reason is None, "stop wins from every state"

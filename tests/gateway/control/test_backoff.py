@@ -1,4 +1,4 @@
-"""How long to wait before the next try to connect, and what of many tries is news."""
+"""Tests of the delay between attempts to connect, and of the attempts that are logged."""
 
 import pytest
 from hypothesis import given

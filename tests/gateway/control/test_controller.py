@@ -1,4 +1,4 @@
-"""Commands through control: their lives, what merges and what queues, hold, refusals, recovery, the end."""
+"""Tests of commands through control: phases, merging and queueing, hold, refusals, recovery, shutdown."""
 
 import random
 import re
@@ -143,7 +143,7 @@ def test_the_same_motion_held_on_is_not_written_again(desk: Workbench) -> None:
 
 
 def test_the_newest_motion_wins_and_only_it_is_written(desk: Workbench) -> None:
-    desk.ask(WHISTLE)  # blocks for 0.3 s: what comes now waits
+    desk.ask(WHISTLE)  # blocks for 0.3 s, so the next commands wait
     for number, motion in enumerate([Motion.FORWARD, Motion.LEFT, Motion.RIGHT, Motion.BACK]):
         assert desk.ask(Drive(motion, 2.0), identity=f"m{number}").status is QUEUED
     desk.run(1.0)
@@ -694,7 +694,7 @@ def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> N
 
 
 def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:
-    """The gateway before this one may have left it driving."""
+    """The previous gateway may have left the car driving."""
     desk = Workbench()
     desk.control.shut_down(desk.now)
     assert desk.control.stops.finished
@@ -704,7 +704,7 @@ def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() 
 
 
 def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
-    """A link that loses what is written; a recovery is tried before, and listened for."""
+    """The link loses all frames. Before the gateway gives up, it tries a recovery and waits for evidence."""
     pair = Pair(start_s=2.0).ready()
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
@@ -774,7 +774,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         ends = [each for each in desk.records if each.command.id == "the-stop"]
         if (
             desk.car.fan and not desk.control.model.believed.fan
-        ):  # it ran when the link was lost: nobody knows why it is silent
+        ):  # the fan ran when the link was lost, so control does not know why the car is silent
             assert (ends[-1].phase, ends[-1].reason) == (Phase.FAILED, Reason.NOT_SHOWN), seed
             assert desk.control.model.motors == "unknown", seed
             continue

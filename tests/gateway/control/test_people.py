@@ -1,4 +1,4 @@
-"""Who may do what: rank by action by state, at the arbiter; and pauses and loans, through control."""
+"""Tests of permissions: each rank, action and state at the arbiter, and pauses and loans through control."""
 
 import itertools
 from collections.abc import Callable
@@ -66,11 +66,11 @@ SENDERS = {
     "other": Sender("cid@lab-5", PERSON),
     "nobody": Sender("dan@lab-6", PERSON),
 }
-"""A lead, a person who drives the car, her script, the coordinator, a person of other cars, one who is not listed."""
+"""A lead, a person who drives the car, her script, the coordinator, a person of other cars, an unlisted person."""
 
 
 def names(kind: SenderKind) -> str:
-    """Somebody else of this rank."""
+    """Return the name of another sender of this rank."""
     return {LEAD: "head", PERSON: "bob", SCRIPT: "bob", COORDINATOR: "plan2"}[kind] + "@lab-9"
 
 
@@ -114,7 +114,7 @@ TABLES: dict[str, dict[str, str] | None] = {
     "no leads": {"teacher": "", "ann": "", "cid": "other"},
     "leads": {"teacher": "lead", "ann": "", "cid": "other"},
 }
-"""Without leads the person called teacher is one like any other."""
+"""Without leads, teacher is a person like any other."""
 
 
 def refused(what: Action, sender: Sender, at: CommandContext) -> tuple[Reason | None, str]:
@@ -124,7 +124,7 @@ def refused(what: Action, sender: Sender, at: CommandContext) -> tuple[Reason | 
 @pytest.mark.parametrize("table", TABLES)
 @pytest.mark.parametrize("who", SENDERS)
 def test_every_rank_every_action_every_state(who: str, table: str) -> None:
-    """Free, leased, held, e-stopped and paused by each rank, lent to oneself and to others, and not in `drives`."""
+    """The car is free, or leased, held, e-stopped or paused by each rank, or lent. Some senders may not drive it."""
     listed = TABLES[table]
     people = NO_PEOPLE if listed is None else People.parse(":".join(filter(None, each)) for each in listed.items())
     sender = people.ranked(SENDERS[who])
@@ -148,7 +148,7 @@ def test_every_rank_every_action_every_state(who: str, table: str) -> None:
 
 
 def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: CommandContext) -> Reason | None:
-    """The rules once more, from the words of docs/explanation/who-may-drive.md."""
+    """Return the expected reason, by the rules of docs/explanation/who-may-drive.md."""
     person, lead, plan = sender.person, sender.kind is LEAD, sender.kind is COORDINATOR
     leads = listed is not None and "lead" in listed.values()
     borrows = at.loan is not None and at.loan.to == person
@@ -157,7 +157,7 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
     lent = at.loan is not None and not borrows and not lead and not (leads and person == "teacher")
 
     def is_protected(rank: SenderKind) -> bool:
-        # Without a table nobody of these senders is a lead, and none of them began anything as one.
+        # Without a table none of these senders is a lead, and none of them began anything as a lead.
         return rank is LEAD and not lead and (leads or listed is None)
 
     if action in ("stop", "e-stop", "free"):
@@ -226,7 +226,7 @@ def resumed(
         (PEOPLE, (PERSON,), "A lead"),
         (NO_PEOPLE, (PERSON,), "A person"),
         (NO_PEOPLE, (LEAD, PERSON), "A lead"),
-        (People.parse(["ann"]), (LEAD,), "A person"),  # there is no lead who could
+        (People.parse(["ann"]), (LEAD,), "A person"),  # the table has no lead
     ],
 )
 def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[SenderKind, ...], who: str) -> None:
@@ -377,7 +377,7 @@ def test_a_gateway_without_a_table_frees_nothing_that_a_lead_began() -> None:
     assert rule in desk.ask(Unpause(), ANN).words
     assert [pause.id for pause in desk.control.safety.pauses] == ["p1"]
     assert desk.control.safety.ended_pauses == (), "no other gateway would follow"
-    # The state names one lead: the person who began it.
+    # The state names one lead: the person who began the hold, the e-stop and the pause.
     teacher = Sender("teacher@phone", PERSON)
     assert desk.ask(Unpause(), teacher).words == "the pause has ended"
     assert desk.ask(Resume(all=True), teacher).reason is None
@@ -426,7 +426,7 @@ def test_a_loan_that_ends_early_stops_a_mode_of_the_borrower_and_nobody_elses(de
 
 def test_a_loan_goes_on_after_a_restart_for_the_time_that_is_left() -> None:
     loan = Loan("cid", "teacher@lab", LEAD, int(60.0 * 1e9), 100.0)
-    desk = Workbench(kept=PersistedSafety(loan=loan), people=PEOPLE).ready()  # its clock begins at 100 s
+    desk = Workbench(kept=PersistedSafety(loan=loan), people=PEOPLE).ready()  # the workbench begins at 100 s
     assert desk.ask(FORWARD, ANN).reason is Reason.LENT
     desk.run(161.0 - desk.now)
     assert desk.ask(FORWARD, ANN).status is Phase.QUEUED

@@ -1,4 +1,4 @@
-"""So much per second and no more."""
+"""Tests of the rate limit."""
 
 from gateway.control.rate_limit import TokenBucket
 

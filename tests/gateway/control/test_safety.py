@@ -1,4 +1,4 @@
-"""Hold, e-stops and lease as values; e-stops united among gateways in any order end alike."""
+"""Tests of hold, e-stops, pauses, loan and lease as values. Gateways agree, in whatever order they merge e-stops."""
 
 from dataclasses import replace
 
@@ -102,7 +102,7 @@ def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
 
 
 def test_a_gateway_without_people_learns_that_a_lead_did_an_e_stop() -> None:
-    """The e-stop of a lead reaches each gateway directly. One without people latches it as that of a person."""
+    """The e-stop of a lead reaches each gateway directly. One without people latches it as a person's."""
     own = estop("a")
     lead = replace(own, rank=SenderKind.LEAD)
     safety = Safety()
@@ -138,7 +138,7 @@ def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) 
 def test_gateways_agree_on_pauses_in_whatever_order_they_see_each_other(
     order: list[int], steps: list[tuple[int, str, bool]]
 ) -> None:
-    """A pause of one id may reach them with another time, and its end may reach them first."""
+    """A pause may reach the gateways with different times, and its end may arrive first."""
     cars = [Safety() for _ in order]
     for number, identity, ends in steps:
         if ends:

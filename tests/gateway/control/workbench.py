@@ -1,4 +1,4 @@
-"""A controller at a desk, on virtual time: it hears what a car that obeys would send, and what the test says."""
+"""A controller on a workbench, on virtual time. It receives readings of an obedient car, and frames of the test."""
 
 from collections.abc import Callable
 
@@ -26,7 +26,7 @@ RUNNING = {
 REPORT_S = 1.0
 RUNNING_S = 0.1
 TICK_S = 0.2
-"""Interval of reports in mode 0, and of readings in a mode that reports."""
+"""Intervals of reports in mode 0, of readings in a mode that reports, and of the controller's ticks."""
 
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
@@ -41,7 +41,7 @@ COORDINATOR = Sender("plan", SenderKind.COORDINATOR)
 
 
 class ObedientCar:
-    """When a car that obeys every frame sends its readings: none while it is blocked, or in a silent mode."""
+    """A car that obeys every frame. It sends no readings in a block, in a silent mode, or while its fan runs."""
 
     def __init__(self, platform: str, now: float) -> None:
         self._profile = parse_platform(platform.replace("unknown", "arduino"))
@@ -71,7 +71,7 @@ class ObedientCar:
             self.fan = not self.fan
 
     def report(self, now: float) -> bytes:
-        """Return what it sends now, and go on; empty if it sends nothing."""
+        """Return the reading that the car sends now, and schedule the next one. Empty if the car is silent."""
         running = RUNNING.get(self._mode, b"")
         self.report_at = now + (RUNNING_S if running else REPORT_S)
         if self._mode is not Mode.MANUAL:
@@ -80,7 +80,7 @@ class ObedientCar:
 
 
 class Workbench:
-    """Drives a controller exactly as its loop does: it is woken by what it says, and by what happens."""
+    """Drives a controller exactly as its loop does. It wakes at the controller's own deadlines, and at each event."""
 
     def __init__(
         self, platform: str = "arduino", *, kept: PersistedSafety | None = None, people: People = NO_PEOPLE
@@ -98,7 +98,7 @@ class Workbench:
         self._awake = 0
 
     def ready(self) -> "Workbench":
-        """Connect, recover, and forget what was written until then: the car has shown that it stands."""
+        """Connect, and wait until the car has shown that it stands. Forget all frames and records until then."""
         self.control.link_up(self.now)
         self.pump()
         self.until(lambda: self.control.model.known, 12.0)
@@ -111,7 +111,7 @@ class Workbench:
         return self
 
     def hear(self, frame: bytes = b"") -> None:
-        """The car sends a frame now; if none is given, a mode-0 reading."""
+        """Let the car send a frame now. The default is a mode-0 reading."""
         self.car.report_at = self.now + REPORT_S
         self._hear(frame or self.car.reading)
 
@@ -149,7 +149,7 @@ class Workbench:
         return answer
 
     def run(self, seconds: float, *, reports: bool = True) -> None:
-        """Let time pass; without reports nothing that the car sends is heard."""
+        """Let time pass. Without `reports`, all readings of the car are lost."""
         end = self.now + seconds
         while self.now < end - 1e-9:
             wake = min(self.car.report_at, self._next_tick, self.control.next_at(self.now))
@@ -166,14 +166,14 @@ class Workbench:
             self.pump()
 
     def until(self, so: Callable[[], bool], seconds: float = 30.0) -> None:
-        """Let time pass until it is so."""
+        """Let time pass until `so` returns True."""
         end = self.now + seconds
         while not so():
             assert self.now < end, self.sent[-6:]
             self.run(0.05)
 
     def pump(self) -> None:
-        """Write what is to be written."""
+        """Write all frames that are due."""
         while (write := self.control.poll(self.now)) is not None:
             self.sent.append((self.now, write.data, write.why))
             self.control.on_written(write, self.now)
@@ -181,7 +181,7 @@ class Workbench:
         self.take()
 
     def take(self) -> None:
-        """Take the records."""
+        """Collect the records and the log of the controller."""
         for record in self.control.take_records():
             if isinstance(record, CommandRecord):
                 self.records.append(record)
@@ -190,14 +190,14 @@ class Workbench:
 
     @property
     def frames(self) -> list[bytes]:
-        """What was written."""
+        """The written frames."""
         return [data for _, data, _ in self.sent]
 
     def life(self, identity: str) -> list[Phase]:
-        """The phases of a command."""
+        """Return the phases of a command."""
         return [record.phase for record in self.records if record.command.id == identity]
 
     def end(self, identity: str) -> tuple[Phase, Reason | None]:
-        """How a command ended."""
+        """Return the last phase of a command, and its reason."""
         record = [record for record in self.records if record.command.id == identity][-1]
         return record.phase, record.reason

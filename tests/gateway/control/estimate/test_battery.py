@@ -1,4 +1,4 @@
-"""What a battery voltage means; 6.4 V empty to 8.4 V full (docs/reference/protocol.md#readings)."""
+"""Tests of the battery estimate. 6.4 V is empty, 8.4 V is full (docs/reference/protocol.md#readings)."""
 
 import random
 
@@ -53,7 +53,7 @@ def test_always_a_share_and_an_error(voltage_v: float, loaded: bool) -> None:
 
 
 def hear(battery: Battery, *voltages: float, loaded: bool = False, from_s: float = 0.0) -> list[float]:
-    """One reading a second; when the level changed."""
+    """Feed one reading a second. Return the times at which the level changed."""
     start = max(battery.measured_at + 1.0, from_s)
     return [
         start + second
@@ -129,9 +129,9 @@ def test_noise_around_a_threshold_does_not_flap(seed: int) -> None:
 
 @given(st.integers(0, 2**32), st.sampled_from([7.6, 7.25, 6.85, 6.4]), st.booleans())
 def test_the_level_does_not_flap_from_the_first_reading_on(seed: int, rest_v: float, from_a_drive: bool) -> None:
-    """A gateway that starts while motors run, stops them (their sag recovers), and gets a damaged reading now and then.
+    """A gateway starts, sometimes while motors run. Once they stop, the voltage recovers. Some readings are damaged.
 
-    At first it does not know of the motors; what it is told then goes one way, and where the voltage at rest is.
+    From the first reading on the level only falls, never rises.
     """
     moments = random.Random(seed)
     battery, levels = Battery(), ["ok"]

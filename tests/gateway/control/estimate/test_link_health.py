@@ -1,4 +1,4 @@
-"""Whether the car is heard: each state, its words, and the counters."""
+"""Tests of the link health: each state, its reason, and the counters."""
 
 import pytest
 
@@ -79,7 +79,7 @@ def test_a_link_is_not_online_while_the_car_counts_as_unheard(limit_s: float | N
 
 
 def test_no_time_is_negative() -> None:
-    """A reading may be taken later than the clock that judges it."""
+    """A reading may have a later time than the clock that rates the link."""
     health = LinkHealth()
     health.on_open(1.0)
     health.on_reading(7.0)

@@ -1,4 +1,4 @@
-"""Which mode the car is in: every way from assumed to confirmed, to contradicted and back."""
+"""Tests of the mode estimate: every way from assumed to confirmed, to contradicted and back."""
 
 import pytest
 
@@ -15,11 +15,11 @@ SHAPES = {
     Mode.FOLLOWING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00$",
 }
 EITHER = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM00"
-"""Before a silence: light seeking whose `#` is late, or following, which has none."""
+"""Before a silence, this is light seeking with a late `#`, or following, which sends none."""
 SILENT = (Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED)
 BLOCK_S = 2.5
 SETTLED_S = {mode: BLOCK_S + (0.1 if mode is Mode.MANUAL else 1.0) for mode in Mode}
-"""The turn of the mode that is left, and the block."""
+"""Time until a mode is open: the turn of the previous mode, and the block."""
 
 
 def reading(shape: bytes, at: float) -> Sensors:
@@ -30,7 +30,7 @@ def reading(shape: bytes, at: float) -> Sensors:
 
 
 def asked(mode: Mode) -> ModeEstimator:
-    """A car that was in mode 0, or in tracking, and heard there; at 0.0 the mode was asked."""
+    """Return the estimate of a car that reported in mode 0 or in tracking, and got the command for `mode` at 0.0."""
     truth = ModeEstimator(parse_platform("arduino"))
     before = Mode.TRACKING if mode is Mode.MANUAL else Mode.MANUAL
     truth.on_mode_sent(before, now=-10.0, block_s=1.0)
@@ -87,7 +87,7 @@ def test_two_of_another_mode_are_forgotten_when_its_own_comes() -> None:
 
 
 def test_a_damaged_reading_of_another_mode_does_not_confirm() -> None:
-    """A tracking frame with one digit changed has the shape of mode 0: there is no checksum."""
+    """A tracking frame with one wrong digit has the shape of mode 0, because there is no checksum."""
     truth = asked(Mode.MANUAL)
     damaged = reading(b"$4WD,CSB0,PV8,GS0,LF1001,HW01,GM00#", 5.0)
     assert damaged.signature is Mode.MANUAL
@@ -170,7 +170,7 @@ def test_a_fan_that_runs_silences_the_car_and_what_was_confirmed_fades() -> None
 
 
 def test_a_mode_without_its_own_readings_is_contradicted_as_by_silence() -> None:
-    """Mode 0 reports once a second: three of its readings would take three times as long."""
+    """Mode 0 reports once a second, so three of its readings would take three times as long."""
     truth = asked(Mode.TRACKING)
     truth.on_reading(reading(SHAPES[Mode.TRACKING], 9.9))
     truth.on_reading(reading(SHAPES[Mode.MANUAL], 10.8))

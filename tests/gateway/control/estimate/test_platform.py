@@ -1,4 +1,4 @@
-"""Which program runs on the car, by its bytes: told and contradicted, or looked for and settled."""
+"""Tests of the platform detector: readings contradict a configured platform, or settle the platform of `auto`."""
 
 import random
 
@@ -33,7 +33,7 @@ def hear(truth: PlatformDetector, *frames: str) -> list[str]:
 
 @pytest.mark.parametrize("row", CASES, ids=ids(CASES))
 def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
-    """Vectors: frames in turn, each so many times; what is contradicted then, and the platform that `auto` has."""
+    """Vectors: frames in order with their counts, the contradictions that follow, and the platform of `auto`."""
     auto = PlatformDetector(parse_platform("unknown"), auto=True)
     told = {name: PlatformDetector(parse_platform(name)) for name in ("arduino", "stm32", "raspberry_pi", "unknown")}
     events: dict[str, list[str]] = {name: [] for name in told}

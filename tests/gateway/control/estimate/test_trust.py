@@ -1,4 +1,4 @@
-"""The state machine of trust: every state and event, by rules that hold for the whole table."""
+"""Tests of the trust state machine: every state and event, by rules that hold for the whole table."""
 
 from itertools import product
 

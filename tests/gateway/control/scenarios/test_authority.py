@@ -1,4 +1,4 @@
-"""Who may move the car, through control: e-stops, leases, and streams that must pause after a stop."""
+"""Tests of the right to move the car, through control: e-stops, leases, and streams that must pause after a stop."""
 
 import pytest
 
@@ -150,7 +150,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
 
 
 def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only(desk: Workbench) -> None:
-    """A person who stops a car, and drives it a little, is not to see it driven off by the coordinator at once."""
+    """If a person stops a car and drives it a little, the coordinator must not drive it off at once."""
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
     desk.run(1.1)
@@ -165,7 +165,7 @@ def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only
 
 
 def test_a_holder_that_is_back_has_its_lease_again(desk: Workbench) -> None:
-    """A hub that was restarted takes all tokens down for a moment."""
+    """A restart of the hub removes all tokens for a moment."""
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
     desk.run(1.1)
@@ -336,7 +336,7 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> No
 
 
 def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> None:
-    """Or the coordinator closes it again while it opens: that takes 3.5 s, longer than a lease outlives its drive."""
+    """A mode opens for 3.5 s, longer than a lease outlives its drive. The coordinator must not close it meanwhile."""
     desk.ask(SetMode(Mode.TRACKING), PERSON)
     desk.run(4.0, reports=False)
     assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).reason is Reason.LEASED
@@ -345,7 +345,7 @@ def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> No
 
 
 def test_a_token_that_is_known_only_from_its_end_ends_the_drive() -> None:
-    """Changes of tokens are merged: one that came and went within 50 ms is told as gone."""
+    """The bus service merges changes of tokens. Of a token that came and went within 50 ms it reports only the end."""
     desk = Workbench().ready()
     desk.ask(Drive(Motion.FORWARD, 60.0), SCRIPT, identity="drive")
     desk.control.on_sender_token(SCRIPT.name, alive=False, now=desk.now)

@@ -1,4 +1,4 @@
-"""`--platform auto`: it begins as an unknown car, settles on what the bytes show, and stops accordingly."""
+"""With `--platform auto`, a car is unknown at first. Its bytes settle the platform, and with it the kind of stop."""
 
 import pytest
 

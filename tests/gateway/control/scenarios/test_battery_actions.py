@@ -1,4 +1,4 @@
-"""What a battery's level does to a car: warn, refuse what would drain it, stop it."""
+"""The gateway reacts to the battery level: it warns, refuses commands that drain the battery, or stops the car."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What is claimed of a drive when nothing shows that the car got it."""
+"""The gateway claims no drive as complete, and no mode as confirmed, if the car does not show it."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from tests.support.virtual import Pair
 
 
 def driven(*, deaf: bool) -> Pair:
-    """A car that was driven for a second, as far as it heard."""
+    """Drive a car for a second. A deaf car receives no frame."""
     pair = Pair(start_s=2.0)
     if deaf:
         pair.lose_frames()

@@ -1,4 +1,4 @@
-"""Which car is which: `find` blinks and beeps, by the simulated car's truth, and leaves the car as it was."""
+"""`find` makes a car blink and beep, and leaves the car as it was. The simulated car's truth is the judge."""
 
 import pytest
 
@@ -11,7 +11,7 @@ WHITE, COLOUR = "#ffffff", "#0a141e"
 
 
 def seen(pair: Pair, seconds: float) -> list[str]:
-    """What the LED shows, one after the other, while time passes."""
+    """Let time pass. Return the colors of the LED in order."""
     shown = [pair.car.truth.led]
     end = pair.now + seconds
     while pair.now < end:
@@ -22,7 +22,7 @@ def seen(pair: Pair, seconds: float) -> list[str]:
 
 
 def beeps(pair: Pair, before: int) -> int:
-    """Frames that whistle, of those written since."""
+    """Return the number of whistle frames after the first `before` frames."""
     return sum(data.split(b",")[2:3] == [b"1"] and data.startswith(b"$") for _, data in pair.sent[before:])
 
 

@@ -1,7 +1,7 @@
-"""Every row of the hazards tables of docs/reference/protocol.md, careless against ours: the same situation, same wish.
+"""Tests each row of the hazards tables of docs/reference/protocol.md twice: with careless frames, and with control.
 
-The careless half writes frames straight to the simulated car (tests/gateway/sim/hazards.py asserts what that does);
-ours asks the gateway's control for the same. The judge of both is the simulated car's motors.
+The careless half writes frames straight to the simulated car. tests/gateway/sim/hazards.py asserts the result. Our half
+requests the same from the gateway's control, in the same situation. The simulated car's motors judge both.
 """
 
 import random
@@ -21,16 +21,16 @@ from tests.gateway.sim.strangers import virtual
 from tests.support.virtual import Pair
 
 RECOVERED_S = 7.3
-"""docs/reference/protocol.md#stops: in theory recovery never takes longer outside avoidance."""
+"""Maximum time of recovery outside avoidance, in theory (docs/reference/protocol.md#stops)."""
 SETTLED_S = 9.0
-"""Long enough for every stop, and for a car that drives on to be seen."""
+"""Time in which every stop ends, and in which a car that drives on shows it."""
 
 Ours = Callable[[Pair], None]
 OURS: dict[str, Ours] = {}
 
 
 def ours(*rows: str) -> Callable[[Ours], Ours]:
-    """Register what the gateway does in a row's situation, by the beginning of the row's words."""
+    """Register the gateway's half of each row whose words begin with one of `rows`."""
 
     def keep(play: Ours) -> Ours:
         OURS.update(dict.fromkeys(rows, play))
@@ -59,7 +59,7 @@ def test_every_counterpart_has_its_row() -> None:
     assert [row for row in OURS if not any(name.startswith(row) for name in rows)] == []
 
 
-# ---------------------------------------------------------------------- how it is judged
+# ---------------------------------------------------------------------- the judge
 
 
 def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
@@ -68,13 +68,16 @@ def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
 
 
 def blocked(pair: Pair, by: OneShot | Fan) -> None:
-    """Deaf from now on, by a frame that the car has read."""
+    """Block the car with a frame that it has read."""
     pair.ask(by)
     pair.until(lambda: pair.car.truth.blocked, 3.0)
 
 
 def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
-    """Ask for a stop: the motors are off for good within what the answer announces. `sent`: why nothing shows it."""
+    """Request a stop. Require that the motors are off for good within the announced time.
+
+    `sent` is the case of the stop if the car cannot show it.
+    """
     asked_at = pair.now
     answer = pair.ask(Stop(), verb="stop", identity="the-stop")
     pair.run(SETTLED_S)
@@ -94,7 +97,7 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
 
 
 def recovers(pair: Pair) -> None:
-    """The link is back: recovery brings the car to rest in mode 0, and the gateway knows it."""
+    """Open the link again. Require that recovery brings the car to rest in mode 0, and that the gateway knows it."""
     since = pair.now
     assert pair.control.model.motors == "unknown"
     pair.connect()
@@ -121,7 +124,7 @@ PTZ = OneShot(Ptz(90))
 
 @ours("one frame while it is blocked")
 def one_frame(pair: Pair) -> None:
-    """A run during a block is obeyed after it, and ends when its time is over."""
+    """Request a run during a block. The car obeys after the block, and the run ends when its time is over."""
     blocked(pair, PTZ)
     pair.ask(Drive(Motion.FORWARD, 1.5))
     pair.until(lambda: pair.car.truth.driving, 1.5)
@@ -166,7 +169,7 @@ def mode_then_stop(pair: Pair) -> None:
 
 @ours("MODE00 alone, in any mode (", "a general stop in a mode other than 0")
 def in_any_mode(pair: Pair) -> None:
-    """Whatever the mode, and whichever way of stopping is asked: what is written is the frame that stops there."""
+    """End the motion in every mode. The gateway writes the frames that stop the car in that mode."""
     for mode in (mode for mode in Mode if mode is not Mode.MANUAL):
         driving(pair)
         pair.ask(SetMode(mode))
@@ -181,7 +184,7 @@ def in_any_mode(pair: Pair) -> None:
 
 @ours("a mode opened while driving (")
 def opened_while_driving(pair: Pair) -> None:
-    """The motors are off before the mode's frame is written."""
+    """Require that the motors are off before the gateway writes the frame of the mode."""
     for mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED, Mode.TRACKING):
         driving(pair, Motion.BACK)
         pair.ask(SetMode(mode), identity=mode)
@@ -200,7 +203,7 @@ def wedged(pair: Pair) -> None:
 
 
 def cut(pair: Pair, what: OneShot | Drive, count: int) -> None:
-    """A write that is cut after so many bytes, and the link with it."""
+    """Cut the next write after `count` bytes, and the link with it."""
     pair.cut = count
     pair.ask(what)
     pair.run(2.0)
@@ -232,7 +235,7 @@ def half_general(pair: Pair) -> None:
 
 @ours("a lone # with nothing pending acts as a stop in mode 0")
 def lone_hash(pair: Pair) -> None:
-    """It is only ever written by recovery, which wants the car stopped."""
+    """Require that only recovery writes a lone `#`, since recovery stops the car anyway."""
     driving(pair)
     assert not any(data == b"#" for _, data in pair.sent[4:])
     pair.lose()
@@ -242,7 +245,7 @@ def lone_hash(pair: Pair) -> None:
 
 @ours("half a frame, #, 50 ms, MODE00, all while blocked")
 def half_while_blocked(pair: Pair) -> None:
-    """A recovery whose second frame is cut, and the next one, all within one block."""
+    """Cut the second frame of a recovery, and begin the next recovery, all within one block."""
     for count in range(1, 12):
         driving(pair)
         blocked(pair, PTZ)
@@ -257,7 +260,7 @@ def half_while_blocked(pair: Pair) -> None:
 
 @ours("the fan on: obeys motion, but sends no readings until it is off again")
 def fan(pair: Pair) -> None:
-    """A stop needs no reading to end, says that it is only sent, and toggles nothing."""
+    """Stop a car whose fan runs. The stop ends without a reading, only as `sent`, and does not toggle the fan."""
     pair.ask(Fan())
     pair.until(lambda: pair.car.truth.fan, 3.0)
     driving(pair)
@@ -288,7 +291,7 @@ def pi_mode(pair: Pair) -> None:
     "over TCP, two frames in one receive: only the first",
 )
 def pi_writes(pair: Pair) -> None:
-    """One whole frame in each write, 60 ms between them: nothing for a receive to join or cut."""
+    """Require one whole frame in each write, 60 ms apart, so that no receive joins or cuts frames."""
     moments = random.Random(7)
     for _ in range(30):
         pair.ask(Drive(moments.choice([Motion.FORWARD, Motion.BACK, Motion.LEFT]), 5.0))
@@ -318,7 +321,7 @@ def pi_fan(pair: Pair) -> None:
 
 @ours("a short frame kills the program")
 def pi_short(pair: Pair) -> None:
-    """A general frame is written with its nine fields or not at all."""
+    """Require that the gateway writes each general frame whole, with its nine fields."""
     pi_writes(pair)
     assert all(len(data) == 19 for _, data in pair.sent)
     assert pair.car.alive
@@ -336,7 +339,7 @@ def pi_lone_hash(pair: Pair) -> None:
 
 @ours("the TCP client goes away")
 def pi_hang_up(pair: Pair) -> None:
-    """No gateway at this end can prevent it, so it says what is so. What it can: close only after a stop."""
+    """Require that the gateway closes only after a stop. It cannot prevent a lost link, so it reports the danger."""
     driving(pair)
     pair.control.shut_down(pair.now)
     pair.until(lambda: pair.control.stops.finished, 3.0)
@@ -372,7 +375,7 @@ def pi_light(pair: Pair) -> None:
 
 @ours("no dead-man")
 def dead_man(pair: Pair) -> None:
-    """A motion that nobody holds ends by itself: half a second after it was asked."""
+    """Require that a motion that nobody renews ends by itself, half a second after its request."""
     pair.ask(Drive(Motion.FORWARD))
     asked_at = pair.now
     pair.run(SETTLED_S)

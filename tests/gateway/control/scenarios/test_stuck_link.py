@@ -1,4 +1,4 @@
-"""A link that is open and delivers nothing: what is said of the car meanwhile, and what is done when it is back."""
+"""Tests of an open link that delivers nothing: claims about the car meanwhile, and stops after the link recovers."""
 
 import random
 from collections.abc import Callable
@@ -18,7 +18,7 @@ FORWARD = Drive(Motion.FORWARD, 3.0)
 
 
 class Wire:
-    """What is between control and the car: while it is stuck it takes what is written, and keeps it."""
+    """The wire between control and the car. While it is stuck, it accepts all written frames and holds them."""
 
     def __init__(self, pair: Pair) -> None:
         self._pair = pair
@@ -59,7 +59,7 @@ def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_a
     pair.run(5.0)
     assert pair.car.truth.motor_left, "its stop is in the wire"
     assert pair.control.model.motors == "unknown"
-    pair.ask(Drive(Motion.BACK, 0.5))  # also this is kept by the wire, with its stops, and arrives with them
+    pair.ask(Drive(Motion.BACK, 0.5))  # the wire also holds this drive and its stops, and delivers them together
     pair.run(3.0)
     wire.free()
     pair.until(lambda: pair.control.model.motors == "off", 12.0)
@@ -83,7 +83,7 @@ def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
-    """It says so at once, fails when nothing is heard, and is carried out when the car is heard again."""
+    """The answer warns at once, and the stop fails while the car is silent. With a free wire the next stop ends."""
     ends = (Phase.SENT, Basis.SENT) if platform == "raspberry_pi" else (Phase.COMPLETE, Basis.SHOWN)
     pair = Pair(platform, start_s=2.0).ready()
     wire = Wire(pair)
@@ -122,11 +122,11 @@ def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None
     assert not [log for log in pair.logs if log.code in ("unheard", "mode_contradicted")]
 
 
-# ---------------------------------------------------------------------- a link that loses what is written
+# ---------------------------------------------------------------------- a link that loses written frames
 
 
 def slow(pair: Pair, delay_s: float) -> None:
-    """From now on all that is written or sent takes so long."""
+    """Delay all bytes in both directions by `delay_s` from now on."""
     feed, advance = pair.car.feed, pair.car.advance
     down: list[tuple[float, bytes]] = []
     up: list[tuple[float, bytes]] = []
@@ -151,7 +151,7 @@ def slow(pair: Pair, delay_s: float) -> None:
 
 
 def deaf(pair: Pair) -> list[bytes]:
-    """From now on nothing that is written reaches the car; what was kept from it."""
+    """Lose all written frames from now on. Return the list that collects them."""
     lost: list[bytes] = []
     pair.car.feed = lambda data, now: lost.append(data)  # type: ignore[method-assign]
     return lost
@@ -159,7 +159,7 @@ def deaf(pair: Pair) -> list[bytes]:
 
 @pytest.mark.parametrize("platform", ["arduino", "stm32"])
 def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on(platform: str) -> None:
-    """docs/reference/protocol.md#evidence-of-a-stop: the reports of a deaf car come on, or no pause shows it."""
+    """A deaf car keeps reporting, or no pause shows the stop (docs/reference/protocol.md#evidence-of-a-stop)."""
     tries = 40
     for seed in range(tries):
         pair = Pair(platform, seed=seed, start_s=2.0).ready()
@@ -240,7 +240,7 @@ def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_as
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.25, 0.4])
 def test_a_slow_link_is_no_deaf_one(delay_s: float) -> None:
-    """What a car sent before `MODE00` had come to it says nothing of whether it came."""
+    """Reports that a car sent before it received `MODE00` do not show whether `MODE00` arrived."""
     pair = Pair("arduino", start_s=2.0)
     slow(pair, delay_s)
     pair.ready()

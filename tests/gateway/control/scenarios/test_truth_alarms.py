@@ -1,4 +1,4 @@
-"""A car that nothing is wrong with raises no alarm: some minutes of each mode here, ten hours of each in tests/soak."""
+"""A healthy car raises no alarm. Each mode runs for two minutes here, and for ten hours in tests/soak."""
 
 import pytest
 

@@ -1,7 +1,6 @@
-"""Which mode a car is in, against the car: every pair of (asked, true) of tests/vectors/mode_truth.tsv.
+"""Compares the estimated mode with the car's true mode, for every pair (asked, true) of tests/vectors/mode_truth.tsv.
 
-The true mode is made another in each way that a car's mode changes without us: another writer on its link, a reset, a
-mode frame that is lost.
+The true mode changes in each way that it can without us: another writer on the link, a reset, a lost mode frame.
 """
 
 import pytest
@@ -15,7 +14,7 @@ from tests.support.virtual import Pair
 
 TABLE = rows("mode_truth")
 LONG_S = 15.0
-"""Longer than any time of the table."""
+"""A time longer than any time of the table."""
 TALKING = frozenset({Mode.MANUAL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
 BY = {
     "3 readings": ("3 consecutive readings",),
@@ -41,7 +40,7 @@ def modes(row: Row) -> tuple[Mode, Mode]:
 
 
 def contradicted(pair: Pair, row: Row, within: str, since: float) -> None:
-    """It is contradicted in time, and by what the table says."""
+    """Require that the mode is contradicted in time, with the evidence of the table."""
     pair.until(lambda: pair.control.model.mode.verdict is Verdict.CONTRADICTED, LONG_S)
     assert pair.now - since <= float(row[within]), pair.control.model.mode
     assert any(words in pair.control.model.mode.evidence for words in BY[row["by"]]), pair.control.model.mode.evidence
@@ -49,7 +48,7 @@ def contradicted(pair: Pair, row: Row, within: str, since: float) -> None:
 
 
 def never(pair: Pair, row: Row) -> None:
-    """What cannot be told apart stays assumed, and the candidates say so."""
+    """Require that a mode stays assumed if readings cannot distinguish it, with both modes among the candidates."""
     pair.run(LONG_S)
     assert pair.control.model.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
     assert set(modes(row)) <= set(pair.control.model.mode.candidates)
@@ -112,7 +111,7 @@ FROM_ASKING = [row for row in TABLE if row["asked_s"] != "-"]
 @each_world
 @pytest.mark.parametrize("row", [row for row in FROM_ASKING if row["asked"] != row["true"]], ids=names)
 def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
-    """Control asks for a mode while the car is in the true one, and the frame does not reach it."""
+    """Control requests a mode while the car is in the true one, and the frame does not reach the car."""
     asked, true = modes(row)
     pair = car_in(true, world, seed=TABLE.index(row))
     lost = lose_next_mode_frame(pair)
@@ -126,7 +125,7 @@ def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
 
 
 def told_again(pair: Pair, world: str) -> None:
-    """Silence contradicts no stop that goes on: the car is told again, and until then nothing is claimed."""
+    """Require that control sends the stop again, and claims nothing before. Silence contradicts no running stop."""
     true, end = pair.car.truth.mode, pair.now + LONG_S
     while pair.car.truth.mode is true and pair.now < end:
         assert pair.control.model.mode.verdict is not Verdict.CONFIRMED
@@ -147,7 +146,7 @@ def told_again(pair: Pair, world: str) -> None:
         if row["asked"] == row["true"]
         for before in (tuple(Mode)[1:] if row["asked"] == Mode.MANUAL else (Mode.MANUAL,))
         for world in WORLDS
-        if (before, world) != (Mode.OBSTACLE_AVOIDANCE, "no-echo")  # where it is deaf for ever
+        if (before, world) != (Mode.OBSTACLE_AVOIDANCE, "no-echo")  # where the car is deaf for ever
     ],
     ids=lambda value: names(value) if isinstance(value, dict) else str(value),
 )

@@ -1,4 +1,4 @@
-"""What is published as measured, against the simulated car: filler never is, whatever mode the car is in or leaves."""
+"""The gateway never publishes filler as measured, whatever mode the car is in or leaves. The simulated car judges."""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -22,11 +22,12 @@ MEASURED = {
     Mode.LIGHT_SEEKING: frozenset({"light"}),
     Mode.FOLLOWING: frozenset({"obstacle"}),
 }
-"""docs/reference/protocol.md#placeholders; of mode 0 of a raspberry_pi car battery and grayscale are constants."""
+"""Measured fields by mode (docs/reference/protocol.md#placeholders). A raspberry_pi car sends constants for battery and
+grayscale."""
 
 
 class Sent(NamedTuple):
-    """A frame as the car made it, and what its program had read last."""
+    """A frame as the car made it, with the sensor values that its program had read last."""
 
     text: bytes
     mode: Mode
@@ -36,7 +37,7 @@ class Sent(NamedTuple):
 
 
 class Source:
-    """Notes which mode each frame came from, and what a gateway publishes of each."""
+    """Records the true mode of each frame, and the fields of each frame that a gateway publishes."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair
@@ -61,7 +62,7 @@ class Source:
         pair.control.on_event = publishing  # type: ignore[method-assign]  # where car.py publishes it
 
     def _noted(self, name: str) -> deque[Any]:
-        """What the program has read of one sensor last."""
+        """Record the reads of one sensor. Return a queue with the last value."""
         last: deque[Any] = deque(maxlen=1)
         read = getattr(self.pair.car._body, name)
 
@@ -73,12 +74,12 @@ class Source:
         return last
 
     def origin(self, event: Sensors) -> Sent:
-        """The newest frame with that text."""
+        """Return the newest frame that has the text of the event."""
         text = event.raw.rstrip(b"#")
         return next(sent for sent in reversed(self.sent) if sent.text == text)
 
     def check(self) -> None:
-        """Nothing but what was measured was published, with the sense that it has."""
+        """Require that all published fields were measured, and have the values that the program read."""
         constants = {"battery", "grayscale"} if self.pair.control.model.profile.kind == "raspberry_pi" else set()
         for event, measured, obstacle in self.published:
             sent = self.origin(event)
@@ -154,7 +155,7 @@ def test_no_echo_is_said_and_is_no_distance() -> None:
 @pytest.mark.parametrize("mode", [mode for mode in MEASURED if mode is not Mode.MANUAL])
 @given(data=st.data())
 def test_a_damaged_frame_publishes_no_filler_while_its_mode_is_confirmed(mode: Mode, data: st.DataObject) -> None:
-    """One byte is another, or lost; there is no checksum, and the text may become that of mode 0."""
+    """One byte is wrong or lost. Without a checksum the frame may look like one of mode 0."""
     texts = {
         Mode.TRACKING: b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00",
         Mode.LIGHT_SEEKING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM10",

@@ -1,4 +1,4 @@
-"""A car that is not what was told, or whose fan silences it: it is stopped all the same, and can be used again."""
+"""The gateway stops a car of another platform than configured, or with its fan on, and the car can be used again."""
 
 import pytest
 
@@ -51,7 +51,7 @@ def test_a_car_told_to_know_no_modes_that_tracks_is_stopped(platform: str) -> No
 
 @pytest.mark.parametrize("platform", ["arduino", "stm32"])
 def test_a_fan_that_runs_over_a_cut_link_can_be_toggled_and_the_car_used_again(platform: str) -> None:
-    """A car whose fan runs reports nothing (docs/reference/protocol.md#hazards): its recovery goes on."""
+    """A car whose fan runs reports nothing (docs/reference/protocol.md#hazards), so its recovery goes on."""
     pair = Pair(platform, start_s=2.0).ready()
     pair.ask(Fan(), identity="on")
     pair.until(lambda: pair.car.truth.fan, 3.0)

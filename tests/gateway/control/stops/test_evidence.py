@@ -1,4 +1,4 @@
-"""What shows that a stop arrived, as tables, and what never does, as properties: each row of EVIDENCE is here."""
+"""Tests which readings show a stop, as tables, and which never do, as properties. Each row of EVIDENCE has a test."""
 
 from collections.abc import Callable
 
@@ -48,22 +48,22 @@ def event(frame: bytes, at: float) -> Sensors:
 
 
 class EvidenceWatch:
-    """Evidence, told what is written and heard in the order of a story."""
+    """A `StopEvidence` that receives written frames and readings in the order of a test."""
 
     def __init__(self) -> None:
         self.evidence = StopEvidence()
         self.evidence.begin_link()
 
     def reports(self, *times: float, frame: bytes = ECHO) -> list[Finding]:
-        """Hear reports of mode 0."""
+        """Feed reports of mode 0. Return the findings."""
         return [self.evidence.on_reading(event(frame, at)) for at in times]
 
     def closed(self, at: float, *, awake: bool = True) -> None:
-        """`MODE00` is written."""
+        """Record that `MODE00` was written."""
         self.evidence.closed(at, awake=awake)
 
     def pause(self, at: float) -> Finding:
-        """A report, a `MODE00` after `at`, and the report after its pause."""
+        """Feed a report at `at`, a `MODE00`, and the report after its pause. Return the finding."""
         self.reports(at)
         self.closed(at + 0.5)
         found = self.reports(at + 1.95)[-1]
@@ -83,12 +83,12 @@ class EvidenceWatch:
         ([9.5, 10.5, 11.5], [NOTHING, LOST]),
         ([9.98, 10.98], [LOST]),
         ([9.1, 10.1, 11.1], [NOTHING, LOST]),
-        ([9.4, 10.4, 12.35], [NOTHING, PAUSE]),  # a slow link: what was sent before it came
+        ([9.4, 10.4, 12.35], [NOTHING, PAUSE]),  # a slow link: the car sent the second one before MODE00 came
         ([9.4, 10.4, 11.95], [NOTHING, REPORT]),  # another block, of a servo, lies between
-        ([9.1, 10.6, 11.1], [NOTHING, NOTHING]),  # a report that a link held up: the next one is too close
+        ([9.1, 10.6, 11.1], [NOTHING, NOTHING]),  # the link delayed a report, so the next one is too close
         ([9.4, 10.4, 13.4], [NOTHING, REPORT]),  # a report was lost
         ([10.5, 11.5], [NOTHING, LOST]),
-        ([11.5], [REPORT]),  # of what was before it nothing is known
+        ([11.5], [REPORT]),  # nothing is known about the time before this report
         ([], []),
     ],
 )
@@ -117,9 +117,9 @@ def test_two_pauses_show_a_stop_and_one_does_not() -> None:
         ((9.0, 10.0, 12.0, 14.0 + MATCH_S + 0.01, 16.2), (), [PAUSE, PAUSE, SETTLING]),
         ((9.0, 10.0, 12.0 + MATCH_S + 0.01, 14.2, 16.2), (), [PAUSE, PAUSE, SETTLING]),
         ((8.9, 10.0, 11.97, 14.0), (), [PAUSE, PAUSE]),
-        ((10.0, 12.2, 14.4), (), [PAUSE, SETTLING]),  # nothing is known of this car yet: the first pause is the measure
+        ((10.0, 12.2, 14.4), (), [PAUSE, SETTLING]),  # no interval is known yet: the first pause is the measure
         ((10.0, 12.2, 14.2, 16.3), (), [PAUSE, PAUSE, SETTLING]),
-        ((9.0, 10.3, 12.3, 14.3), (9.5,), [PAUSE, SETTLING]),  # a whistle makes an interval longer: it does not count
+        ((9.0, 10.3, 12.3, 14.3), (9.5,), [PAUSE, SETTLING]),  # an interval with a whistle is longer and does not count
         ((9.0, 10.0, 12.3, 14.3), (10.2,), [PAUSE, SETTLING]),
         ((9.0, 10.0, 12.3 + MATCH_S + 0.01, 14.4), (10.2,), [PAUSE, PAUSE]),
     ],
@@ -127,7 +127,7 @@ def test_two_pauses_show_a_stop_and_one_does_not() -> None:
 def test_three_pauses_are_needed_if_one_is_not_as_long_as_mode00_makes_it(
     reports: tuple[float, ...], acts: tuple[float, ...], found: list[Finding]
 ) -> None:
-    """A link that held a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like pauses."""
+    """A link that delays a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like pauses."""
     watch, results = EvidenceWatch(), []
     for at in sorted({*reports, *acts}):
         if at in acts:
@@ -140,7 +140,7 @@ def test_three_pauses_are_needed_if_one_is_not_as_long_as_mode00_makes_it(
 
 
 def test_after_a_lost_mode00_the_interval_is_still_known() -> None:
-    """The stop is sent again at once. Then a report is held for 0.9 s, and a damaged frame opens mode 0 for 2.3 s."""
+    """After a lost `MODE00`, the link delays a report for 0.9 s, and a damaged frame opens mode 0 for 2.3 s."""
     watch = EvidenceWatch()
     watch.reports(9.0, 10.0)
     watch.closed(10.1)
@@ -163,7 +163,7 @@ def test_two_pauses_are_needed_after_a_shown_stop_too() -> None:
 
 
 def test_a_lost_report_makes_the_same_gap_as_a_pause_and_is_not_enough() -> None:
-    """The link swallows `MODE00` and the report after it; the next `MODE00` arrives nowhere either."""
+    """The link loses `MODE00`, the report after it, and the next `MODE00`."""
     watch = EvidenceWatch()
     watch.reports(10.0)
     watch.closed(10.5)
@@ -181,7 +181,7 @@ def test_a_lost_report_makes_the_same_gap_as_a_pause_and_is_not_enough() -> None
 def test_a_car_that_hears_nothing_shows_nothing_also_where_one_report_is_lost(
     gaps: list[float], lost: int, closings: list[tuple[int, float]]
 ) -> None:
-    """`MODE00` is written whenever somebody likes, and its reports come on."""
+    """The gateway writes `MODE00` at any times, and the car keeps reporting."""
     watch, at = EvidenceWatch(), 10.0
     for number, gap_s in enumerate(gaps):
         for _, after_s in sorted(each for each in closings if each[0] == number):
@@ -193,7 +193,7 @@ def test_a_car_that_hears_nothing_shows_nothing_also_where_one_report_is_lost(
 
 @given(st.lists(st.floats(0.01, BUNCHED_S - 0.02), min_size=1, max_size=10))
 def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
-    """What a stuck link delivers at once says nothing of when it was sent."""
+    """The times of reports that a stuck link delivers at once do not show when the car sent them."""
     watch = EvidenceWatch()
     assert watch.pause(10.0) is PAUSE
     at = 11.95
@@ -269,7 +269,7 @@ def test_a_ranging_without_echo_takes_a_second_and_shows_nothing(without: int) -
 
 
 def tracking(until: float) -> EvidenceWatch:
-    """A car that is seen in tracking."""
+    """Return the evidence of a car that reports in tracking."""
     watch = EvidenceWatch()
     watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     for number in range(40):
@@ -278,7 +278,7 @@ def tracking(until: float) -> EvidenceWatch:
 
 
 def silent(*, shown: bool = True) -> EvidenceWatch:
-    """A car that was brought to color LED mode at 5.0."""
+    """Return the evidence of a car with color LED mode opened at 5.0."""
     watch = EvidenceWatch()
     watch.reports(4.9)
     watch.evidence.opened(Mode.COLOR_LED, 5.0, silent=True, shown=shown)
@@ -361,7 +361,7 @@ def test_a_silent_mode_that_was_opened_from_a_rest_that_nothing_had_shown() -> N
 
 @given(st.floats(0.0, 4.0))
 def test_older_reports_of_a_slow_link_do_not_show_that_a_silent_mode_was_left(delay_s: float) -> None:
-    """They were sent before the mode was opened at 5.0, once a second, and come until `delay_s` later."""
+    """The car sent these reports once a second before its mode opened at 5.0. They come until `delay_s` later."""
     watch = silent()
     closed_at = 5.0 + delay_s - 1.0
     times = [4.95 + number for number in range(1, 5) if 4.95 + number <= 5.0 + delay_s]
@@ -436,7 +436,7 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
 
 
 def test_a_soft_stop_shows_nothing() -> None:
-    """The row `soft`: the drive's own end is complete, and the rest after it is only sent."""
+    """The row `soft`: the release of a drive, and the rest after it, are only sent."""
     pair = driven()
     assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
     assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT)
@@ -460,7 +460,7 @@ assert NORMAL_MAX_S < PAUSE_MIN_S
 
 
 def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/reference/protocol.md#framing: CR and LF after `#` are junk that happens."""
+    """CR and LF may follow `#` (docs/reference/protocol.md#framing)."""
     desk = Workbench().ready()
     hear = desk.hear
 

@@ -1,6 +1,6 @@
-"""`stop` through control, at random moments in every mode and load; the judge is the simulated car's motors.
+"""Tests of `stop` through control, at random moments in every mode and load. The simulated car's motors are the judge.
 
-What is played is in tests/support/stops.py; 200 moments of each, and the distribution, are in tests/soak.
+tests/support/stops.py has the cases. tests/soak plays 200 moments of each, and checks the distribution.
 """
 
 import random
@@ -26,15 +26,15 @@ MOMENTS = 4
 
 
 def judge(seen: Seen) -> None:
-    """Motors off, and off for good, within the announced worst case; and the state says so."""
+    """Require that the motors are off for good within the announced worst case, and that the state says so."""
     assert seen.motors_off_s <= seen.announced_s, seen
-    assert seen.settled_s <= seen.announced_s + 0.002, seen  # it is looked at every millisecond
+    assert seen.settled_s <= seen.announced_s + 0.002, seen  # the test looks every millisecond
     if "fan" in seen.case and "told-unknown" in seen.case and seen.phase is Phase.FAILED:
-        return  # no reading comes, so whether a car of an unknown platform has obeyed is never known
+        return  # without a reading a car of an unknown platform never shows that it obeyed
     if "flickering" in seen.case and seen.phase is Phase.FAILED:
-        return  # every second ranging has no echo, so neither two pauses nor two reports without one need follow
+        return  # every second ranging has no echo: two pauses, or two reports without one, may never follow each other
     if "lossy" in seen.case and "told-unknown" in seen.case and seen.phase is Phase.FAILED:
-        return  # the link is mute for 2 s, and the recipe for an unknown platform takes 4.8 s: not shown in time
+        return  # the link is mute for 2 s, and the recipe for an unknown platform takes 4.8 s, so time runs out
     assert (seen.motors, seen.basis) == ("off", seen.phase_basis), seen
     assert seen.motors_off_s <= seen.complete_s < ENDS_S, seen
     if can_show(seen):
@@ -54,7 +54,7 @@ def can_show(seen: Seen) -> bool:
     """Return True for a car that shows each stop: its platform does, it has an echo, and its fan is off."""
     without = ("raspberry_pi", "no-echo", "flickering", "fan-on")
     if "told-unknown" in seen.case and ("restored" in seen.case or "lossy" in seen.case):
-        return False  # it looks like a Raspberry Pi that reports on, see EVIDENCE
+        return False  # the car looks like a Raspberry Pi that keeps reporting, see EVIDENCE
     return not any(words in seen.case for words in without) and not seen.case.startswith("arduino-fan")
 
 
@@ -87,10 +87,10 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
 
 @pytest.mark.xfail(reason="docs/reference/protocol.md#hazards: no frame of recovery clears this string")
 def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
-    """A half frame, and the ranging ends when of recovery's `MODE00` only the `$` has come.
+    """The car has half a frame, and its ranging ends when only the `$` of recovery's `MODE00` has come.
 
-    The `$` goes with the half frame's string, and `4WD,MODE00#` stays: not at its place for a MODE frame, unknown as
-    any other, never cleared, and whatever follows is added to it. The car reports as always, so nothing is noticed.
+    The `$` goes with the string of the half frame, and `4WD,MODE00#` stays. The car knows it neither as a MODE frame
+    nor as any other frame, never clears it, and appends all later bytes. The car reports as always, so nothing shows.
     """
     pair = Pair(world=World.open_field(), start_s=2.0).ready()
     pair.until(lambda: not pair.car.truth.blocked, 3.0)
@@ -108,7 +108,10 @@ def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
 def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callable[[], World]) -> None:
-    """Soft: 0.02 s; no echo up to 1.0 s, a frame of ours in the buffer 1.1 s (docs/reference/protocol.md#stops)."""
+    """A soft stop takes 0.02 s, up to 1.0 s without an echo, and 1.1 s with a frame of ours in the buffer.
+
+    The source is docs/reference/protocol.md#stops.
+    """
     bound = 0.1 if world is World.room else 1.0 + 1.1 + 0.1
     for seed in range(MOMENTS):
         moments = random.Random(seed)
@@ -135,7 +138,7 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
         pair.until(lambda pair=pair: Phase.SENT in pair.phases("mode"), OPENS_S)
         assert pair.sent[-1][1] == b"$4WD,MODE41#"
         opened_at = pair.sent[-1][0]
-        pair.until(lambda pair=pair: pair.car.truth.mode is Mode.COLOR_LED, 0.06)  # the car was awake: read at once
+        pair.until(lambda pair=pair: pair.car.truth.mode is Mode.COLOR_LED, 0.06)  # the car is awake and reads at once
         pair.run(10.0)
         assert pair.off_for_good_at() < opened_at, f"seed {seed}: {pair.sent}"
 
@@ -144,7 +147,7 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 
 
 def situations() -> list[stopping.StopContext]:
-    """The whole product of what the choice looks at."""
+    """Return all combinations of the inputs of the choice."""
     return [
         stopping.StopContext(parse_platform(platform), known, mode, *flags)
         for platform, known, mode, *flags in product(
@@ -154,11 +157,11 @@ def situations() -> list[stopping.StopContext]:
 
 
 def certain(situation: stopping.StopContext) -> bool:
-    """Known to be in mode 0, where general frames are obeyed."""
+    """Return True if the car is known to be in mode 0, where it obeys general frames."""
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
-# The first row that fits (docs/reference/protocol.md#stops).
+# The first matching row counts (docs/reference/protocol.md#stops).
 FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence], ...] = (
     (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), sequences.UNKNOWN_MANUAL),
     (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, sequences.UNKNOWN),
@@ -193,7 +196,7 @@ def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
 
 
 def test_every_recipe_ends_alone_in_the_buffer() -> None:
-    """The last frame of each is certain: 1.1 s after the one before it, or waiting for that to be read."""
+    """The last frame comes 1.1 s after the frame before it, or waits until the car has read that frame."""
     for situation in situations():
         for recipe in (stopping.full(situation), stopping.soft(situation)):
             last = recipe.steps[-1]
