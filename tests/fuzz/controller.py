@@ -207,7 +207,7 @@ class Wild:
     def _ask(self, what: Action) -> None:
         answer = self.control.command(self._command(what), self.now)
         assert answer.status in (Phase.SENT, Phase.QUEUED, Phase.REJECTED)
-        # Control carries out a resume that ends only some of the stops. Its reason says what still stops the car.
+        # Control carries out a resume that ends only some e-stops or holds. Its reason says that others remain.
         half = isinstance(what, Resume) and answer.reason in (Reason.ESTOPPED, Reason.HELD)
         assert half or (answer.reason is not None) == (answer.status is Phase.REJECTED)
         if answer.status is Phase.QUEUED:

@@ -126,7 +126,7 @@ class EpisodePlan:
     """True if `load_s` counts from the frame that opens the mode. If not, it counts from the open mode."""
     report_every_s: float = 0.9
     again_s: float = 0.0
-    """Time from the first stop to a second one. 0 for none."""
+    """Time from the first stop to a second stop. 0 for none."""
     drive_again_s: float = 0.0
     """Time from the last stop to another drive, which a stop ends. 0 for none."""
     early: bool = False

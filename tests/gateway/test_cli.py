@@ -23,7 +23,7 @@ def test_the_help_names_every_command(command: Command) -> None:
 def test_a_help_that_cannot_be_written_fails(
     words: str, unbuffered: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A buffered write fails at the end. An unbuffered one (`python -u`) fails at once, with only one error."""
+    """A buffered write fails at the end. An unbuffered write (`python -u`) fails at once, with only one error."""
     with (
         Path("/dev/full").open("wb", buffering=0 if unbuffered else -1) as raw,
         io.TextIOWrapper(raw, write_through=unbuffered) as full,

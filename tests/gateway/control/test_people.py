@@ -124,7 +124,10 @@ def refused(what: Action, sender: Sender, at: CommandContext) -> tuple[Reason | 
 @pytest.mark.parametrize("table", TABLES)
 @pytest.mark.parametrize("who", SENDERS)
 def test_every_rank_every_action_every_state(who: str, table: str) -> None:
-    """The car is free, or leased, held, e-stopped or paused by each rank, or lent. Some senders may not drive it."""
+    """The car is free, or leased, held, e-stopped or paused by each rank, or lent to the sender or to others.
+
+    Some senders may not drive it.
+    """
     listed = TABLES[table]
     people = NO_PEOPLE if listed is None else People.parse(":".join(filter(None, each)) for each in listed.items())
     sender = people.ranked(SENDERS[who])

@@ -102,7 +102,7 @@ def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
 
 
 def test_a_gateway_without_people_learns_that_a_lead_did_an_e_stop() -> None:
-    """The e-stop of a lead reaches each gateway directly. One without people latches it as a person's."""
+    """The e-stop of a lead reaches each gateway directly. A gateway without people latches it as a person's."""
     own = estop("a")
     lead = replace(own, rank=SenderKind.LEAD)
     safety = Safety()

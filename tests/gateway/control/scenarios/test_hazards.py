@@ -68,7 +68,7 @@ def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
 
 
 def blocked(pair: Pair, by: OneShot | Fan) -> None:
-    """Block the car with a frame that it has read."""
+    """Block the car with a frame, and wait until the block begins."""
     pair.ask(by)
     pair.until(lambda: pair.car.truth.blocked, 3.0)
 

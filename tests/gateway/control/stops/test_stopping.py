@@ -90,7 +90,7 @@ def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
     """The car has half a frame, and its ranging ends when only the `$` of recovery's `MODE00` has come.
 
     The `$` goes with the string of the half frame, and `4WD,MODE00#` stays. The car knows it neither as a MODE frame
-    nor as any other frame, never clears it, and appends all later bytes. The car reports as always, so nothing shows.
+    nor as any other frame, never clears it, and appends all later bytes. Its reports go on, so nobody notices.
     """
     pair = Pair(world=World.open_field(), start_s=2.0).ready()
     pair.until(lambda: not pair.car.truth.blocked, 3.0)
