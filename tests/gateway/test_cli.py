@@ -98,5 +98,5 @@ def test_run_imports_none_of_the_other_commands() -> None:
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     imported = set(done.stdout.split())
     assert "gateway.link" in imported
-    assert not imported & {f"gateway.{name}" for name in ("sim", "scan", "monitor", "send", "desk", "capture", "heard")}
+    assert not [name for name in imported if name.startswith(("gateway.sim", "gateway.capture", "gateway.tools"))]
     assert not imported & {"asyncio", "bleak", "serial"}
