@@ -1,4 +1,4 @@
-"""An operator that publishes drives as fast as it is told: kind, publications a second, seconds. Says how many."""
+"""An operator that publishes drives. Arguments: kind, publications a second, seconds. It prints their number."""
 
 import json
 import sys
@@ -18,5 +18,5 @@ with bus.Bus.open() as opened:
         while number < min(now, seconds) * rate:
             opened.put_command(key, drives[number % 4], messages.JSON, number)
             number += 1
-        time.sleep(0.002)  # in bursts, as a busy machine would make them
+        time.sleep(0.002)  # in bursts, as on a busy machine
     sys.stdout.write(f"{number}\n")

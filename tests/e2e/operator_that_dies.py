@@ -1,6 +1,6 @@
-"""An operator for one car until it is killed: drives by `stream` or by `command`, watched by its token or not.
+"""An operator that drives one car by `stream` or by `command`, with a token or without, until it is killed.
 
-Arguments: car, how, `token` or `-`, duration_s of each drive; a verb and its JSON, to be asked once it drives.
+Arguments: car, how, `token` or `-`, duration_s of each drive, and a verb with its JSON for a command during the drive.
 """
 
 import json
@@ -13,7 +13,7 @@ car, how, watched, duration_s, *also = sys.argv[1:]
 
 
 def ask(opened: bus.Bus, verb: str, payload: bytes) -> None:
-    """Give a command, and show the answer."""
+    """Send a command, and print the answer."""
     key = keys.command_key("fleet", car, verb)
     for answer in opened.query(key, payload=payload, encoding=messages.JSON, timeout_s=20.0):
         sys.stdout.write(json.dumps(json.loads(answer.payload)) + "\n")
@@ -23,7 +23,7 @@ def ask(opened: bus.Bus, verb: str, payload: bytes) -> None:
 with bus.Bus.open() as opened:
     if watched == "token":
         opened.token(keys.operator_token("fleet", f"stick-{car}"))
-        time.sleep(0.3)  # what it does after this is watched
+        time.sleep(0.3)  # until the gateway has the token
     who = {"sender": f"stick-{car}", "kind": "person"}
     drive = json.dumps({"motion": "forward", "duration_s": float(duration_s)} | who).encode()
     for number in range(1, 100_000):

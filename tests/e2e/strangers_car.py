@@ -29,7 +29,7 @@ CLOCK_S = 1e-5
 MANUAL, REMOTE, TRACKING, AVOIDANCE, COLOR_LED, LIGHT_SEEKING, FOLLOWING = range(7)
 DELAY, IDLE = "delay", "idle"
 Waits = Iterator[tuple[str, float]]
-"""What the program waits for: `DELAY` sees no byte, `IDLE` ends with the next byte. Until when: s of its clock."""
+"""Waits of the program: kind and end, s of its clock. `DELAY` sees no byte, `IDLE` ends with the next byte."""
 
 
 class Uart:
@@ -41,7 +41,7 @@ class Uart:
         self._leaving: deque[tuple[float, bytes]] = deque()
 
     def bring(self, data: bytes, now: float) -> None:
-        """Take what the carrier brought, at the pace of the wire."""
+        """Take bytes of the carrier, at the pace of the wire."""
         for byte in data:
             self._last_in_at = max(now, self._last_in_at) + BYTE_S
             self._coming.append((self._last_in_at, byte))
@@ -50,14 +50,14 @@ class Uart:
         return self._coming[0][0] if self._coming else float("inf")
 
     def read(self, now: float) -> str:
-        """Return what lies in the buffer. What came while it was full is lost."""
+        """Return the bytes in the buffer. Bytes that came while it was full are lost."""
         found = []
         while self._coming and self._coming[0][0] <= now:
             found.append(chr(self._coming.popleft()[1]))
         return "".join(found[:BUFFER_BYTES])
 
     def print(self, text: str, now: float) -> float:
-        """Send. Return how long that blocks: until the rest fits in the buffer."""
+        """Send a text. Return how long the call blocks: until the rest fits in the buffer."""
         for start in range(0, len(text), PIECE_BYTES):
             piece = text[start : start + PIECE_BYTES].encode()
             self._last_out_at = max(now, self._last_out_at) + len(piece) * BYTE_S
@@ -68,7 +68,7 @@ class Uart:
         return self._leaving[0][0] if self._leaving else float("inf")
 
     def take(self, now: float) -> bytes:
-        """Return the pieces that are out."""
+        """Return the pieces that have left the port."""
         found = b""
         while self._leaving and self._leaving[0][0] <= now:
             found += self._leaving.popleft()[1]
@@ -76,21 +76,21 @@ class Uart:
 
 
 class Program:
-    """What the car's processor runs."""
+    """The program of the car's processor."""
 
     def __init__(self, uart: Uart, seed: int, began: float) -> None:
         self.now = began
         self.motors = False
         self.mode = MANUAL
         self.truths: list[dict[str, object]] = []
-        """What has become true; the caller empties it."""
+        """New true states. The caller empties the list."""
         self._uart = uart
         self._chance = random.Random(seed)
         self._string = ""
         self._complete = False
         self._fan = False
         self._report_in = REPORT_S * self._chance.random()
-        """Turns of the loop are counted to the next report, so time in which the car is blocked does not count."""
+        """Time to the next report. The program counts turns of the loop, so time in a block does not count."""
         self._obstacle_in = 3.0
         self._range_cm = 60.0
         self._main = self._loop()
@@ -153,7 +153,7 @@ class Program:
         elif "4WD" not in text:
             self._string = ""
             yield from self._obey(text)
-        # What is left is a named frame that it does not know, or half of one: it stays for ever.
+        # The rest is an unknown named frame, or half a frame. It stays in the buffer.
 
     def _change_mode(self, which: str, opens: str) -> Waits:
         if opens == "0":
@@ -225,7 +225,7 @@ class Program:
             self._set(motors=True)
             yield from self._delay(0.1)
             return
-        # It brakes, looks left and right, and spins to where there is room: 4.3 s in which it reads nothing.
+        # The car brakes, looks left and right, and spins to the free side: 4.3 s in which it reads no byte.
         self._obstacle_in = self._chance.uniform(1.0, 6.0)
         self._set(motors=False)
         yield from self._delay(3.3)
@@ -240,7 +240,7 @@ class Program:
 
 
 class Carrier:
-    """The TCP server: one connection at a time; a second one has to wait."""
+    """The TCP server. It serves one connection at a time, and a second one has to wait."""
 
     def __init__(self) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -248,7 +248,7 @@ class Carrier:
         self._peer: socket.socket | None = None
 
     def wait(self, seconds: float) -> bytes:
-        """Return what came within this time, as soon as something does."""
+        """Wait for bytes within this time, and return them."""
         (ready, _, _) = select.select([self._peer or self._listener], [], [], max(0.0, seconds))
         if not ready:
             return b""
@@ -265,7 +265,7 @@ class Carrier:
         return data
 
     def send(self, data: bytes) -> None:
-        """Send, if somebody is there: a UART does not know."""
+        """Send bytes if there is a connection. A UART sends in any case."""
         if self._peer is not None and data:
             try:
                 self._peer.sendall(data)

@@ -36,7 +36,7 @@ def test_a_fleet_wide_e_stop_and_a_pause_asked_of_one_car_stop_all_and_outlive_e
     )
     wait_for(lambda: pauses(fleet, "blue") == ["p1"], "blue has the pause from red")
 
-    # Green was not there; blue is killed, and its next gateway has only the file.
+    # Green was absent. Blue's gateway is killed, and its next gateway has only the file.
     gateways[1].kill()
     _, (green,) = fleet.simulate("green:arduino:tcp")
     fleet.gateway(green, car="green")
@@ -45,7 +45,7 @@ def test_a_fleet_wide_e_stop_and_a_pause_asked_of_one_car_stop_all_and_outlive_e
     assert pauses(fleet, "green") == ["p1"]
     assert fleet.ask("drive", "green", motion="forward")["reason"] == "estopped"
 
-    # Both end while blue is away: blue comes back with it, and learns of its end.
+    # E-stop and pause end while blue is away. Blue's next gateway restores both from the file, and learns of their end.
     assert fleet.ask("resume", ids=["e1"], kind="person")["status"] == "sent"
     wait_for(lambda: estops(fleet, "green") == [], "green knows of its end")
     assert fleet.ask("drive", "green", motion="forward", sender="mia")["reason"] == "paused"
@@ -99,7 +99,7 @@ def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Flee
     for sender in ("mia-1", "mia-2", "mia-3"):
         with Client(fleet.endpoint, sender=sender, kind="person") as client:
             outcome = client.car("red").drive("forward", 0.2)
-            assert outcome.ok or "stalled" in outcome.words, outcome  # a machine that stood: it was taken nevertheless
+            assert outcome.ok or "stalled" in outcome.words, outcome  # the drive was taken
             wait_for(lambda sender=sender: sender in holders, "it has the lease")
         wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")
 

@@ -1,4 +1,4 @@
-"""What no car should send, at a real gateway: nothing dies, the memory is bounded, and the next good frame counts."""
+"""Invalid bytes at a real gateway: the gateway stays, its memory is bounded, and it reads the next good frame."""
 
 import itertools
 import os
@@ -18,14 +18,14 @@ RUN = b"$1,0,0,0,0,0,0,0,0#"
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 MEGABYTE = 1_000_000
 BOUND_MB = 25.0
-"""What a gateway may need for any amount of nonsense; measured 2 to 9."""
+"""Maximum growth of a gateway's memory by any amount of invalid bytes. Measured: 2 to 9 MB."""
 RANDOM = random.Random(7).randbytes(MEGABYTE)
 NEVER_ENDING = b"$" + b"9" * MEGABYTE
 NUMBERS = itertools.count(100)
 
 
 def good_frame_counts(fleet: FleetProcesses, send: Callable[[bytes], None]) -> None:
-    """The next good frame is a reading; one that is still in the nonsense need not be, so it is sent as a car would."""
+    """Check that the gateway reads a good frame. Repeat it: the first one may become part of the invalid bytes."""
     distance = next(NUMBERS)
     due = 0.0
 
@@ -70,7 +70,7 @@ def test_a_megabyte_of_nonsense(
 
 @pytest.mark.soak
 def test_a_link_that_takes_all_and_delivers_nothing(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
-    """It is said that the car is not heard, every drive is refused, and recovery goes on for ever."""
+    """The gateway reports that the car is silent, rejects every drive, and goes on with recovery."""
     gateway = fleet.gateway(tcp_car.link)
     wait_for(lambda: "silent since the stop began" in gateway.stderr, "it is said")
     assert fleet.state("safety").motors == "unknown"
@@ -108,14 +108,14 @@ def test_a_car_that_echoes_everything_says_nothing(fleet: FleetProcesses) -> Non
 
 
 def plugged_in(kept: list[int]) -> Path:
-    """Another device; which it is. Of numbers the lowest that is free is given: those before ours are kept."""
+    """Open another device; return its path. The system assigns the lowest free number, so keep the lower ones open."""
     master, slave = os.openpty()
     kept += (master, slave)
     return Path(os.ttyname(slave))
 
 
 def test_a_device_that_comes_back_as_another_number(fleet: FleetProcesses, tmp_path: Path) -> None:
-    """Its by-id path, a symlink, is what stays."""
+    """Its by-id path, a symlink, stays the same."""
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'by-id'}")
     fleet.gateway(link)
     fleet.ready()
@@ -150,16 +150,16 @@ main()
 
 
 def test_a_wall_clock_that_jumps_changes_no_motion(fleet: FleetProcesses) -> None:
-    """What moves and stops a car is counted on the monotonic clock; the wall clock only stamps, and dates commands."""
+    """Drives and stops use the monotonic clock. The wall clock only stamps messages and dates commands."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     gateway = fleet.start("-c", A_CLOCK_THAT_JUMPS, "run", "--car", "red", "--link", link, "--platform", "raspberry_pi")
     fleet.ready()
     for number in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGUSR2):
-        fleet.ready()  # the stop of the round before is complete
+        fleet.ready()  # wait for the stop of the round before
         stamp_s = fleet.state("health").stamp.seconds
         answer = fleet.ask("drive", motion="forward", duration_s=3.0)
         assert answer["status"] in TAKEN, answer
-        wait_for(lambda: driving(sim), "it drives")  # and still does when the clock jumps, though we be late
+        wait_for(lambda: driving(sim), "it drives")  # long enough to last until the clock jumps
         os.kill(gateway.pid, number)
         wait_for(
             lambda stamp_s=stamp_s: abs(fleet.state("health").stamp.seconds - stamp_s) > 80_000, "the clock has jumped"
@@ -171,7 +171,7 @@ def test_a_wall_clock_that_jumps_changes_no_motion(fleet: FleetProcesses) -> Non
         assert fleet.ask("stop", kind="person", **asked)["status"] in TAKEN, "a stop is never stale"
         wait_for(lambda: not driving(sim), "it stands")
     fleet.ready()
-    # A day behind the others: what they date is from the future, and never stale.
+    # This clock is a day behind the others. Their commands are from the future, and never stale.
     dated = {"asked": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
     assert fleet.ask("drive", motion="forward", **dated)["status"] in TAKEN
     for ahead_s in (-10_000, 80_000):

@@ -30,7 +30,7 @@ from tests.support.processes import FleetProcesses, wait_for
 pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
 
 TTL_S = 0.5
-"""A drive of the console lasts for so long without another one."""
+"""Duration of a drive of the console without another one."""
 BLOCK_S = 1.0
 """The longest block of a car in mode 0: a ranging without echo."""
 STOPPED_WITHIN_S = TTL_S + BLOCK_S + 0.5
@@ -50,7 +50,7 @@ def stage(stages: ConsoleStage) -> Iterator[ConsoleStage]:
 
 
 def drive_all(stage: ConsoleStage) -> None:
-    """Another person drives all cars."""
+    """Drive all cars as another person."""
     for car in CARS:
         stage.person.car(car).drive("forward", 10.0, wait=False).check()
     wait_for(lambda: all(stage.judges[car].driving for car in CARS), "all drive")
@@ -75,7 +75,7 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, ho
                 page.keyboard.press("Escape")
             case "space":
                 page.keyboard.press(" ")
-            case _:  # the socket is dead, and nobody has noticed
+            case _:  # the socket is dead, and neither side has noticed
                 page.evaluate("WebSocket.prototype.send = () => {}")
                 page.keyboard.press("Escape")
 
@@ -107,7 +107,7 @@ def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Cons
     page = stage.page()
     page.locator("#estop").click()
     page.locator("input[name=why]").fill("smoke")
-    page.locator("input[name=why]").press("Enter")  # as good as the button beside it
+    page.locator("input[name=why]").press("Enter")  # the same as the button beside the field
     card = page.locator("[data-car=red]")
     card.get_by_text("E-stop of the whole fleet by you: smoke").wait_for()
     refused = stage.person.car("red").drive("forward")
@@ -130,7 +130,7 @@ def test_a_pad_drives_while_it_is_held(stage: ConsoleStage, size: str) -> None:
         assert stage.judges["red"].driving
     stage.stands()
     assert not stage.judges["blue"].driving
-    report = stage.report(page, lambda: page.keyboard.press(" "))  # the button has not kept the focus
+    report = stage.report(page, lambda: page.keyboard.press(" "))  # the button has lost the focus
     report.locator("[data-stop=red].stop-shown").wait_for()
 
 
@@ -221,7 +221,7 @@ def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage:
         finally:
             for each in frozen:
                 each.resume()
-        # The finger is still down, for all that the page knows: nothing drives before it is lifted.
+        # For the page, the finger is still down: no car drives until the finger is lifted.
         page.locator(".pad.held").wait_for(state="detached")
         thawed_ns = time.time_ns()
         time.sleep(0.5)
@@ -350,7 +350,7 @@ def test_everything_works_by_keyboard_alone(stage: ConsoleStage) -> None:
 
 
 def unreachable(page: Page) -> list[str]:
-    """The controls of a page that Tab does not reach."""
+    """Return the controls of a page that Tab does not reach."""
     controls = "document.querySelectorAll('a[href], button, input, select, textarea, summary')"
     page.evaluate("document.activeElement.blur()")
     for _ in range(2 * page.evaluate(f"{controls}.length")):
@@ -417,7 +417,7 @@ def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: Co
     assert stage.judges["red"].driving
     page.get_by_role("button", name="Take over red").click()
     page.get_by_role("button", name="Give back red").wait_for()
-    time.sleep(2.5)  # longer than a lease: it is renewed
+    time.sleep(2.5)  # longer than a lease, which the page must renew
     refused = stage.person.car("red").drive("forward")
     assert refused.reason == "leased"
     page.get_by_role("button", name="Give back red").click()
@@ -440,7 +440,7 @@ def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> No
 
 
 def serious(page: Page) -> list[str]:
-    """The serious violations that axe-core finds."""
+    """Return the serious violations that axe-core finds."""
     found = Axe().run(page).response["violations"]
     return [
         f"{each['id']}: {[node['html'][:120] for node in each['nodes']]}"
@@ -500,7 +500,7 @@ def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: ConsoleSt
 
 
 def socket_of(stage: ConsoleStage, **headers: str) -> Any:
-    """A WebSocket to the console as its own page opens it, but for these headers."""
+    """Open a WebSocket to the console as its own page does, but with these headers."""
     hello = urllib.request.Request(f"{stage.console.address}/hello")
     with urllib.request.urlopen(hello) as answer:
         cookie = answer.headers["Set-Cookie"].partition(";")[0]

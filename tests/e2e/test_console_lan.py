@@ -19,7 +19,7 @@ pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
 
 
 def serious(page: Page) -> list[str]:
-    """The serious violations that axe-core finds."""
+    """Return the serious violations that axe-core finds."""
     found = Axe().run(page).response["violations"]
     return [f"{each['id']}: {each['nodes']}" for each in found if each["impact"] in ("serious", "critical")]
 
@@ -51,7 +51,7 @@ def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_p
         assert teacher.locator(".qr").evaluate("image => image.complete && image.naturalWidth > 0")
         assert serious(teacher) == []
 
-        # A phone sees the page that pairs, and nothing else. A wrong code says so.
+        # A phone gets only the page for pairing. The page reports a wrong code.
         phone = browser.new_context(ignore_https_errors=True, color_scheme="dark", **DESKTOP).new_page()
         phone.goto(f"https://127.0.0.1:{network_port(console)}/")
         expect(phone.get_by_role("heading", name="Pair this device")).to_be_visible()
@@ -128,7 +128,7 @@ def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Pat
         refused = ours.locator("[data-control=drive] .refused")
 
         def press_for_nothing() -> None:
-            """Hold the button of the pad for a second: no command reaches the car."""
+            """Hold the button of the pad for a second. Check that no command reaches the car."""
             frames = len(judges["red"].frames)
             ours.locator(FORWARD).hover()
             ours.mouse.down()

@@ -1,4 +1,4 @@
-"""The pages of a lead and of a group, in a real browser: who may what is shown before it is tried."""
+"""The pages of a lead and of a group, in a real browser. They show rights before a person tries an action."""
 
 from collections.abc import Iterator
 
@@ -66,7 +66,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     wait_for(lambda: not room.judge.driving, "anybody stops")
     ours.mouse.up()
 
-    # Only the lead pauses. Who holds the button loses the car, and holding on changes nothing.
+    # Only the lead pauses. A group that holds the button loses the car, and holding on does not bring it back.
     ours.locator("#pause").click()
     expect(ours.locator("[data-asking=pause] .danger")).to_be_disabled()
     expect(ours.locator("[data-asking=pause] .refused")).to_have_text("Only a lead may (teacher).")

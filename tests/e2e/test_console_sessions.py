@@ -1,4 +1,4 @@
-"""The page of sessions in a real browser: the recorder, marks, and what can be done with a recording."""
+"""The page of sessions in a real browser: the recorder, marks, and the actions on a recording."""
 
 import zipfile
 from collections.abc import Iterator

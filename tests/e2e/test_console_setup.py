@@ -1,4 +1,4 @@
-"""The set-up page in a real browser: a simulated car is looked for, blinks, and gets its name in the fleet file."""
+"""The set-up page in a real browser: it finds a simulated car, lets it blink, and writes its name to the fleet file."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A coordinator that wants a mode for ever never moves a car that a person has stopped, over restarts of both."""
+"""A coordinator never moves a car that a person has stopped, also after restarts of coordinator and gateway."""
 
 from pathlib import Path
 

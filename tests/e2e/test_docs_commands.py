@@ -1,7 +1,7 @@
-"""Commands and programs of docs/ run word for word: here; those of README and tutorials in test_newcomer, test_lesson.
+"""Runs the commands and programs of docs/ word for word. test_newcomer and test_lesson run README and tutorials.
 
-What reads recordings runs on made sessions, the rest on one simulated fleet that all pages share. NOT_RUN names what is
-not run, with the reason. tests/test_documented.py parses all of it.
+Commands for recordings run on generated sessions, the others on one simulated fleet of all pages. NOT_RUN has the
+exceptions with their reasons. tests/test_documented.py parses all commands.
 """
 
 import contextlib
@@ -46,12 +46,12 @@ NOT_RUN: Final = {
     r"fleet (keys|view).* --for \d\ds": "takes long",
     **{re.escape(command): why for command, why in NOT_TYPED.items() if not command.startswith("fleet up")},
 }
-"""Commands that are not run here, and why. Patterns of whole commands."""
+"""Patterns of commands that do not run here, with the reasons."""
 RUN: Final = (
     "fleet check",
     "fleet watch red/sensor/light --when left --count 1",
 )
-"""Commands that run, although a pattern has them."""
+"""Commands that run although a pattern of NOT_RUN matches."""
 OTHER_RESULTS: Final = {
     "fleet plan try latest plan.yaml": "now: ",
     "fleet plan try new.yaml": "now: ",
@@ -69,13 +69,13 @@ OTHER_RESULTS: Final = {
     "fleet sessions verify latest": "went back",
     "fleet sessions verify latest~1": "went back",
 }
-"""Commands that may exit with 1 or 2, with the words that they print then.
+"""Commands that may exit with 1 or 2, with the text that they print then.
 
-Another plan decides otherwise. Only a Raspberry Pi car has this servo. An e-stop is in force, and none has this id.
-Made sessions have no raw bytes, and their clocks jump.
+The recorded plan was another one. Only a Raspberry Pi car has this servo. An e-stop is in force, and none has this id.
+Generated sessions have no raw bytes, and their clocks jump.
 """
 FIRST: Final = ("fleet wait", "fleet watch")
-"""Commands before all others: red still has the wall ahead."""
+"""Commands before all others, while red has the wall ahead."""
 LAST: Final = (
     "fleet plan try",
     "fleet arm",
@@ -86,14 +86,14 @@ LAST: Final = (
     "fleet pause",
     "fleet unpause",
 )
-"""Commands after all others, in this order: with its fan on a car is silent, and an e-stop refuses the rest."""
+"""Commands after all others, in this order. A car with its fan on is silent, and an e-stop rejects the rest."""
 
 WORLD: Final = """
 boxes: [{x_m: 0.4, y_m: 0, width_m: 0.1, depth_m: 1}]
 cars: {red: {x_m: 0.1, y_m: 0}, green: {x_m: 0, y_m: 3}, blue: {x_m: 0, y_m: -3}}
 lamps: {beacon: {x_m: 0.6, y_m: 0.4, overhead: true}}
 """
-"""Red has a wall ahead and a lamp at its left: the conditions of the pages are true."""
+"""Red has a wall ahead and a lamp at its left, so that the conditions of the pages are true."""
 FLEET: Final = """
 groups: {a: [red, blue], b: [green]}
 world: world.yaml
@@ -134,7 +134,7 @@ def place_in_order(command: str) -> int:
 
 
 def of_sessions(command: str) -> bool:
-    """Return True for a tool of recordings, and for what needs no fleet at all."""
+    """Return True for a command that reads recordings or needs no fleet."""
     return command.startswith(
         ("fleet sessions", "fleet replay", "fleet example", "fleet schema", "fleet --version", "gateway", "fleet init")
     )
@@ -148,12 +148,12 @@ def quick() -> Iterator[str]:
 
 
 def gateway_command(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run `gateway` as a process: it is short."""
+    """Run `gateway` as a process, which is short."""
     return subprocess.run([sys.executable, "-m", "gateway", *arguments], capture_output=True, text=True, check=False)
 
 
 class Prompt:
-    """A person in a directory with files. Commands run in this process; what the shell does with them is done here."""
+    """A person in a directory with files. Commands run in this process, and `Prompt` does the work of the shell."""
 
     def __init__(self, place: Path) -> None:
         self.place = place
@@ -208,7 +208,7 @@ CTRL_C_S: Final = 10.0
 
 
 def interrupted(command: str, prompt: Prompt) -> tuple[int, str]:
-    """Press Ctrl-C after the first line of a command that stays. Return its exit code, and all that it printed."""
+    """Press Ctrl-C after the first line of a command that stays. Return its exit code and its output."""
     words = [sys.executable, "-u", "-m", "fleet.cli", *shlex.split(command)[1:]]
     with subprocess.Popen(
         words,
@@ -231,7 +231,7 @@ def interrupted(command: str, prompt: Prompt) -> tuple[int, str]:
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_each_command_that_stays_ends_with_ctrl_c(prompt: Prompt) -> None:
-    """Its exit code is 130, or 0 where Ctrl-C is the usual end. Pages say both."""
+    """Its exit code is 130, or 0 if Ctrl-C is the usual end. The pages name both."""
     stays = [
         command
         for command in LINES

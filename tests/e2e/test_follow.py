@@ -1,4 +1,4 @@
-"""A plan of ours finds the leader by light and lets the others follow, in the simulated world; judged by true poses."""
+"""A plan finds the leader by light, and the other cars follow it in the simulated world. The true poses judge."""
 
 from math import dist
 

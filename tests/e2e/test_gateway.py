@@ -1,4 +1,4 @@
-"""`gateway run` as a real process: what it publishes, writes, survives, refuses and leaves behind."""
+"""`gateway run` as a real process: its publications, frames, refusals, restarts and files."""
 
 import json
 import os
@@ -34,11 +34,11 @@ from tests.support.processes import (
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
 
 SHOWN_S = 3.75
-"""A driven car has shown its stop by then: two pauses of its reports, each around a `MODE00`."""
+"""Time until a driven car has shown its stop by two pauses of its reports, each around a `MODE00`."""
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 
-# What a car sent, and what of it are readings: docs/reference/protocol.md#readings.
+# Bytes of a car, and their readings: docs/reference/protocol.md#readings.
 LAST = b"$4WD,CSB33.00,PV7.25,GS7,LF0000,HW00,GM00#"
 RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     (b"BT-04 ready\r\n", {}),
@@ -58,7 +58,7 @@ RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
         b"$4WD,CSB0.00,PV6.5,GS1023,LF0000,HW10,GM01#",
         {
             "range": {"no_echo": True, "range_m": 0.0},
-            "battery": {"voltage_v": 6.5, "level": "ok"},  # one reading does not make a level
+            "battery": {"voltage_v": 6.5, "level": "ok"},  # a level needs several readings
             "grayscale": {"raw": 1023},
             "line": {"left_outer": False},
             "obstacle": {"left": True, "right": False},
@@ -67,7 +67,7 @@ RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     ),
     (b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#", {"line": {"left_outer": True, "left_inner": False}}),  # tracking
     (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM10#", {"light": {"left": True, "right": False}}),  # light seeking
-    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00", {}),  # following, of which mode 0 was confirmed: a damaged byte?
+    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00", {}),  # of mode following, while mode 0 is confirmed
     (
         b"$4WD,CSB2000,PV7.91,GS5,LF0201,HW00,GM11#",  # two of its fields are out of range
         {
@@ -147,7 +147,7 @@ def test_a_tcp_server_that_knows_nothing_of_us(
     assert tcp_car.received[: len(connected)] == connected
 
     whole = b"".join(data for data, _ in recording)
-    # What other modes send is one piece: what it measures depends on the mode's verdict, weighed five times a second.
+    # A frame of another mode is one piece: its readings depend on the mode's verdict, computed five times a second.
     others = b"".join(data for data, _ in recording if data in OF_OTHER_MODES)
     before, _, after = whole.partition(others) if others else (whole, b"", b"")
     cuts = random.Random(5)
@@ -193,7 +193,7 @@ def test_a_tcp_server_that_knows_nothing_of_us(
 
 
 def pieces(data: bytes, cuts: random.Random) -> Iterator[bytes]:
-    """It, cut anywhere."""
+    """Yield the data in pieces, cut at random places."""
     while data:
         size = cuts.choice([1, 1, 2, 5, 20, 20, 60])
         yield data[:size]
@@ -201,7 +201,7 @@ def pieces(data: bytes, cuts: random.Random) -> Iterator[bytes]:
 
 
 def frames_of(why: str, told: list[Any]) -> list[bytes]:
-    """What was written for a reason, in order."""
+    """Return the frames that were written for a reason, in order."""
     return [frame.data for frame in told if frame.why == why]
 
 
@@ -210,7 +210,7 @@ def plain(value: Any) -> Any:
 
 
 def strip(data: bytes | bytearray) -> bytes:
-    """Without the separators, which are in no frame."""
+    """Return the data without separators, which belong to no frame."""
     return bytes(data).translate(None, b"\r\n \t")
 
 
@@ -344,7 +344,7 @@ gateway.cli.main()
 
 
 def test_of_two_that_start_at_the_same_moment_one_remains(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
-    """Whether neither sees the other in time is luck, two times in three: again until it was so, for a while."""
+    """In two of three rounds, neither gateway sees the other in time. Repeat until it happens, for a while."""
     tcp_car.obey(PI_REPORT)
     arguments = ("run", "--car", "red", "--link", tcp_car.link, "--platform", "raspberry_pi")
     for attempt in range(1, 6):
@@ -399,7 +399,7 @@ FOUR = ("red:arduino:pty", "green:arduino:tcp", "blue:raspberry_pi:tcp", "white:
 
 @dataclass
 class Four:
-    """Four cars with their gateways."""
+    """Start four cars with their gateways."""
 
     fleet: FleetProcesses
     sim: GatewayProcess
@@ -446,7 +446,7 @@ def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None
 
 
 def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: FleetProcesses) -> None:
-    """Nothing stops the car then but a person, who would be told when the drive is over."""
+    """Only a person can stop the car then, and must learn of the kill before the end of the drive."""
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     gateway = fleet.gateway(link)
     fleet.ready()
@@ -459,7 +459,7 @@ def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: FleetProc
 
 
 def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
-    """A stream of drives by a sender with a token, killed: the car stops long before the last drive is over."""
+    """Kill a sender with a token that streams drives. The car stops long before the end of the last drive."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     fleet.gateway(link, platform="raspberry_pi")
     fleet.ready()
@@ -473,8 +473,8 @@ def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
     joystick.end(signal.SIGKILL)
     wait_for(lambda: not driving(sim), "it stops", 8.0)
     wait_for(lambda: records[-1].words == "its sender stick disconnected", "it is said")
-    # A gateway that stood for half a second has stopped the car before, and taken the stream anew. It refuses a drive
-    # that was on its way for longer.
+    # After a stall of half a second, the gateway stops the car and accepts the stream again. It rejects a drive that
+    # was in transit for longer.
     taken = [record for record in records if record.reason != "stale"]
     assert [record.phase for record in taken[-3:]] == ["queued", "sent", "expired"]
     assert len(taken) % 3 == 0
@@ -537,7 +537,7 @@ def test_a_link_that_drops_comes_back_by_itself(fleet: FleetProcesses, tmp_path:
 
 
 def test_a_link_that_opens_and_dies_at_once_is_not_opened_many_times_a_second(fleet: FleetProcesses) -> None:
-    """Each opening of a real port may reset the car's board; and a log that says it each time says nothing else."""
+    """Each opening of a real port may reset the car's board. A log line for each opening would flood the log."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(PATIENCE_S)
         gateway = fleet.gateway(f"tcp://127.0.0.1:{server.getsockname()[1]}")
@@ -565,7 +565,7 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: FleetPr
     assert wait_for(lambda: fleet.bus.tokens("fleet/*") == ["fleet/blue", "fleet/red"], "both are back")
     for car in ("red", "blue"):
 
-        def drives(car: str = car) -> bool:  # a gateway that stalled stops its car: asked again
+        def drives(car: str = car) -> bool:  # after a stall, the gateway stops its car: send the drive again
             return fleet.ask("drive", car, motion="forward", duration_s=5)["status"] in TAKEN and driving(sim, car)
 
         wait_for(drives, f"{car} drives")
@@ -575,7 +575,7 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: FleetPr
 
 @pytest.fixture(scope="module")
 def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
-    """A hub for gateways that do not get as far as a car."""
+    """Start a hub for gateways that never open a link."""
     started = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("hub"))
     assert started.bus.connected, "a hub without a client ends by itself"
     yield started
@@ -661,7 +661,7 @@ def test_it_imports_nothing_that_it_does_not_need(fleet: FleetProcesses, tcp_car
 
 
 def test_a_gateway_ends_with_its_starter(fleet: FleetProcesses) -> None:
-    """Killed without a word, a supervisor leaves gateways that stop their cars and end."""
+    """If the supervisor is killed, its gateways stop their cars and end."""
     sim, (link,) = fleet.simulate("red:arduino:pty")
     arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino"]
     starter = fleet.start(

@@ -1,6 +1,6 @@
-"""SIGKILL of a gateway, or its link cut, while its car drives: what is known meanwhile, and how it is stopped.
+"""SIGKILL of a gateway, or its link cut, while its car drives: the claims meanwhile, and the stop of the car.
 
-The simulator's truth is the judge, with its own stamps. Many times over, and strictly: tests/soak/test_kills.py.
+The simulator's truth is the judge, with its own stamps. tests/soak/test_kills.py repeats it with strict limits.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ def test_a_cut_link_that_is_back_stops_the_car_at_once(fleet: FleetProcesses, tm
 
 
 def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fleet: FleetProcesses) -> None:
-    """Its program dies with its client: nobody can stop it, and nobody says that it stands.
+    """The car's program dies with its client. No gateway can stop the car, and none claims that it stands.
 
     See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
     """

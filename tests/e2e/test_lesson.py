@@ -1,6 +1,6 @@
 """A lesson with six cars and three groups: a lead pauses, takes a car, gives it back and lends one.
 
-The file, the options of the gateways and the commands are those of a class. The simulated cars judge who moved what.
+The file, the options of the gateways and the commands are those of a class. The simulated cars judge.
 """
 
 import json
@@ -27,7 +27,7 @@ LONG_S = 10.0
 
 
 class Lesson:
-    """Six simulated cars with their gateways, started as `fleet up` starts them, and what people type."""
+    """Six simulated cars with their gateways, started as `fleet up` starts them, and people who type commands."""
 
     def __init__(self, fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
         self.fleet = fleet
@@ -47,19 +47,19 @@ class Lesson:
         return self.fleet.gateway(*self._arguments[car], car=car)
 
     def type(self, person: str, *words: str) -> str:
-        """Type a command as a person; what it says, which is carried out."""
+        """Type a command as a person, and check that it succeeds. Return its output."""
         done = in_process.fleet(*words, "--as", person)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def refused(self, person: str, *words: str) -> str:
-        """Type a command that is refused; its words."""
+        """Type a command that the gateway rejects. Return the message."""
         done = in_process.fleet(*words, "--as", person)
         assert done.returncode == 1, done.stdout
         return done.stderr
 
     def hold_down(self, person: str, car: str) -> None:
-        """Begin a long drive, and see the car drive. Who drove before a stop must pause for half a second."""
+        """Begin a long drive, and wait until the car drives. After a stop, a sender must pause for half a second."""
         if person not in self._people:
             self._people[person] = Fleet(self.fleet.endpoint, person=person, kind="person")
         driver = self._people[person].car(car)
@@ -71,11 +71,11 @@ class Lesson:
         wait_for(lambda: driving(self.sim, car), f"{car} drives")
 
     def moving(self) -> set[str]:
-        """The cars whose motors are on, say the cars."""
+        """Return the cars whose motors are on, by the cars' own answers."""
         return {car for car in CARS if driving(self.sim, car)}
 
     def close(self) -> None:
-        """Let all people go home."""
+        """Close the clients of all people."""
         for person in self._people.values():
             person.close()
 
@@ -89,7 +89,7 @@ def lesson(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
 
 @pytest.mark.soak
 def test_a_lesson_with_six_cars(lesson: Lesson) -> None:
-    # Each group drives its own cars; all may stop all.
+    # Each group drives its own cars. Everyone may stop all cars.
     lesson.hold_down("group_a", "red")
     words = lesson.refused("group_b", "drive", "red", "forward")
     assert "group_b may not drive red" in words
@@ -162,12 +162,12 @@ TUTORIAL = Path(__file__).parents[2] / "docs/tutorials/5-a-lesson-with-six-cars.
 @pytest.mark.soak
 @pytest.mark.timeout(400)
 def test_the_tutorial_word_for_word(tmp_path: Path) -> None:
-    """Each command does what the page says; `# refused` stands behind those that exit with 1."""
+    """Each command does what the page says. Commands with `# refused` exit with 1."""
     programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     variables = {"PATH": programs, "FLEET_ENDPOINT": free_endpoint(), "FLEET_STATE_DIR": str(tmp_path / "state")}
     student = Newcomer(tmp_path, os.environ | variables)
     lines = [line for language, _, body in blocks(TUTORIAL) if language == "sh" for line in body.splitlines()]
-    lines.remove("fleet console --as teacher --open")  # it stays; tests/e2e/test_console_people.py opens it
+    lines.remove("fleet console --as teacher --open")  # stays: test_console_people.py opens it
     down = lines.pop()
     try:
         for line in lines:

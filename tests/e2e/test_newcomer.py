@@ -1,7 +1,7 @@
 """A newcomer's path: the commands and programs of the README and the tutorials, word for word, on one running fleet.
 
-What is not run stands in NOT_RUN with its reason. The tutorials share one fleet of three simulated cars: each process
-that starts takes seconds.
+NOT_RUN has the commands that do not run, with their reasons. The tutorials share one fleet of three simulated cars,
+because each start of a process takes seconds.
 """
 
 import ast
@@ -46,10 +46,10 @@ NOT_RUN: Final = {
     "fleet up --sim 2 --plan plan.yaml --detach": "likewise",
     "fleet replay latest": "opens a window; here it writes a file",
 }
-"""Commands of README and tutorials that this test does not run, and why."""
+"""Commands of README and tutorials that this test does not run, with the reasons."""
 
 DIFFERENCES: Final = {"fleet plan try latest plan.yaml": 1}
-"""Commands with a second exit code: the plan of the tutorial may decide otherwise than those before it."""
+"""Commands with a second exit code. The tutorial's plan may decide differently from the recorded plans."""
 
 Block = tuple[str, str, str]
 """A block of code: its language, its title and its text."""
@@ -137,7 +137,7 @@ def until(of: list[Block], word: str) -> tuple[list[Block], list[Block]]:
 
 @pytest.mark.timeout(600)
 def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
-    """From the wheel with all its extras, outside the clone."""
+    """The commands run from the wheel with all its extras, outside the clone."""
     here = Environment(tmp_path)
     for extra in ("view", "ble", "analysis"):
         here.install(extra)
@@ -186,7 +186,7 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
 
 
 def test_each_program_of_the_docs_is_run_or_at_least_python() -> None:
-    """A program with a name is run above; what has none is a fragment."""
+    """Programs with a name run above. Programs without a name are fragments."""
     for page in (README, *(ROOT / "docs").rglob("*.md")):
         for language, title, body in blocks(page):
             if language == "python":
@@ -197,7 +197,7 @@ def test_each_program_of_the_docs_is_run_or_at_least_python() -> None:
 @pytest.mark.soak
 @pytest.mark.timeout(900)
 def test_make_demo_on_a_machine_that_has_nothing(tmp_path: Path) -> None:
-    """Its first command sets everything up."""
+    """`make demo` installs everything with its first command."""
     clone = tmp_path / "zenoh-car-fleet"
     shutil.copytree(ROOT, clone, ignore=shutil.ignore_patterns(*LEFT_OUT))
     done = subprocess.run(["make", "demo"], cwd=clone, capture_output=True, text=True, timeout=800, check=False)

@@ -1,6 +1,6 @@
-"""SIGKILL of whoever drives: the car stops within its time to live + the rest of the running block + 0.3 s.
+"""SIGKILL of the driving process: the car stops within the time to live + the rest of the running block + 0.3 s.
 
-And + 1 s where only its token told (issue 4, "Done when"). The simulator's truth is the judge, with its own stamps.
+If only the lost token shows the kill, 1 s is added (issue 4, "Done when"). The simulator's truth is the judge.
 """
 
 from tests.support.kills import BUSY_S, kill_operators

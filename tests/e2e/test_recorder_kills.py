@@ -1,4 +1,4 @@
-"""A hub and a recorder that are killed under load: what is lost, what is there twice, what is said of it.
+"""Kills hub and recorder under load: no message is lost without a report, and none is recorded twice.
 
 `make soak` does the same twenty and fifty times, with more cars.
 """
@@ -14,14 +14,14 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses
 
 RARELY_HZ = 5.0
-"""So that publishers hold fifty seconds: on a busy machine a hub alone may take ten to start."""
+"""Rate at which publishers cache fifty seconds. On a busy machine, a hub alone may take ten seconds to start."""
 
 
 @pytest.mark.timeout(240)
 def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
-        for attempt in range(4):  # a hub may die between two publications, which tries nothing
+        for attempt in range(4):  # a kill between two publications tests nothing
             out = tmp_path / f"sessions{attempt}"
             if hub_killed(fleet, out, cars=10, times=3, chance=random.Random(6), rate_hz=RARELY_HZ).recovered:
                 return

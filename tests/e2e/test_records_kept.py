@@ -1,4 +1,4 @@
-"""What explains afterwards what happened is not lost because the bus was away when it happened."""
+"""Records of commands and events are not lost if the bus is away at that time."""
 
 import signal
 import threading
@@ -32,7 +32,7 @@ class Records:
         return [event.phase for event in self.events if event.id == identity]
 
     def recall(self, fleet: FleetProcesses) -> None:
-        """As whoever came back to the bus later than the gateway: ask for what was told."""
+        """Query the cached records, as a subscriber does that returns to the bus later than the gateway."""
         for sample in fleet.bus.recall("fleet/red/event/log", 30.0):
             self.logs.append(bus.sample_of(sample).message())
 
@@ -52,7 +52,7 @@ def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet
     gateway.popen.send_signal(signal.SIGCONT)
     wait_for(lambda: "stalled" in records.codes(), "it says that it slept")
     wait_for(lambda: records.phases("drive")[-1:] == ["expired"], "and what became of the drive")
-    wait_for(lambda: not judge.driving, "it stands")  # the car's own word comes another way
+    wait_for(lambda: not judge.driving, "it stands")  # the car's own answer does not need the bus
 
 
 def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(fleet: FleetProcesses) -> None:
@@ -62,7 +62,7 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
         fleet.gateway(tap.link)
         fleet.ready()
         records = Records(fleet)
-        freeze(fleet.hub.popen.pid)  # nothing is delivered, and no new hub can begin at its port
+        freeze(fleet.hub.popen.pid)  # the hub delivers no message, and no new hub can use its port
         tap.reset()
         fleet.hub.popen.send_signal(signal.SIGKILL)
         wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")
@@ -77,7 +77,7 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
 def test_a_hub_that_stands_when_a_recording_ends_costs_no_message(
     fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end would wait for the hub, too
+    monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end waits for the hub, too
     key = "fleet/red/sensor/range"
     with bus.Bus.open(fleet.endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)

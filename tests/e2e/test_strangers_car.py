@@ -1,6 +1,6 @@
-"""Stops of a stranger's car, behind a wire that swallows bytes around them: no false claim, and the car stands.
+"""Stops of a foreign car behind a wire that loses bytes around them: no claim is false, and the car stands.
 
-The car's own program judges (strangers_car.py). Many more gaps: tests/soak/test_strangers_car.py.
+The car's own program judges (strangers_car.py). tests/soak/test_strangers_car.py has many more gaps.
 """
 
 import json
@@ -37,7 +37,7 @@ def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: ForeignLot) ->
 
 @pytest.mark.timeout(240)
 def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_not(lot: ForeignLot) -> None:
-    """One wire is broken for good; the others have gaps."""
+    """One wire is broken for good, and the others have gaps."""
     wanted = gaps(MODES, 20) | {"light_seeking": ByteGap(GapDirection.BOTH, 3600.0)}
     lot.cars.enter_modes(lot.fleet)
     lot.cars.arm(wanted)
@@ -66,9 +66,9 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
 def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_stand_or_a_second_ctrl_c(
     tmp_path: Path, fleet: FleetProcesses
 ) -> None:
-    """The wires pass what the cars send, and lose all that is written: red's for some seconds, blue's for good.
+    """The wires pass the cars' readings and lose all frames to the cars: red's for some seconds, blue's for good.
 
-    That `fleet up` ends by itself when the last car stands is shown in test_up.py.
+    test_up.py tests that `fleet up` ends by itself when the last car stands.
     """
     cars = start(fleet, ["obstacle_avoidance"] * 2, seed=50)
     by_name = dict(zip(("red", "blue"), cars, strict=True))

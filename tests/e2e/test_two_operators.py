@@ -1,6 +1,6 @@
-"""Two operators, one car: who drives is never in doubt, on the command line, in the SDK and in the record.
+"""Two operators, one car: command line, SDK and record always name the one that drives.
 
-Each operator is a process of its own; the simulated car says what it truly does.
+Each operator is a process of its own. The simulated car reports its true state.
 """
 
 import json
@@ -33,7 +33,7 @@ LONG = f"{LONG_S:g}s"
 
 
 class Record:
-    """What is published of commands and events while a test runs."""
+    """The published command events and logs of a test."""
 
     def __init__(self, fleet: FleetProcesses) -> None:
         self._lock = threading.Lock()
@@ -47,7 +47,7 @@ class Record:
             kept.append(message)
 
     def of(self, sender: str, verb: str = "drive") -> list[tuple[str, str, str]]:
-        """Phase, reason and words of what one sender asked with a verb."""
+        """Return phase, reason and text of each event of a sender's commands with a verb."""
         with self._lock:
             return [
                 (event.phase, event.reason, event.words)
@@ -56,7 +56,7 @@ class Record:
             ]
 
     def taken(self) -> list[str]:
-        """Each change of hands, in words."""
+        """Return the messages about takeovers."""
         with self._lock:
             return [log.message for log in self._logs if log.name.endswith("lease_taken")]
 
@@ -70,19 +70,19 @@ def sim(fleet: FleetProcesses) -> GatewayProcess:
 
 
 def operator(fleet: FleetProcesses, who: str, *arguments: str) -> GatewayProcess:
-    """A person's command line."""
+    """Run a command as a person."""
     fleet.environment["LOGNAME"] = who
     return fleet.start("-m", "fleet.cli", *arguments)
 
 
 def ended(process: GatewayProcess) -> tuple[int, str]:
-    """Its exit code and what it said of it; a success says it on stdout."""
+    """Wait for the end. Return the exit code and the output: stderr, or stdout after a success."""
     code = process.wait()
     return code, (process.stderr or "\n".join(process.lines())).strip()
 
 
 def listed(fleet: FleetProcesses) -> dict[str, Any]:
-    """The car as `fleet list --json` shows it."""
+    """Return the car's row of `fleet list --json`."""
     process = operator(fleet, "eve", "list", "--json")
     assert process.wait() == 0, process.stderr
     row: dict[str, Any] = json.loads(process.lines()[0])
@@ -90,7 +90,7 @@ def listed(fleet: FleetProcesses) -> dict[str, Any]:
 
 
 def drives(fleet: FleetProcesses, who: str, car: str = "red") -> bool:
-    """Return True if the gateway says that the motion is theirs."""
+    """Return True if the gateway names this person as the owner of the motion."""
     motion = fleet.state("motion", car)
     return motion is not None and motion.owner.startswith(who)
 
@@ -141,7 +141,7 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
 
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
-    """Three cars, one for each thing that moves a car."""
+    """Start three cars, one for each kind of command that moves a car."""
     fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("several"))
     try:
         names = ("red", "green", "blue")
@@ -176,7 +176,7 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
 
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     assert script.wait() == 1
-    # The gateway ends the lease, or refuses its next renewal: which of the two the script sees first is a race.
+    # The gateway ends the lease, or rejects its renewal. The script may see either of the two first.
     assert script.stderr.startswith(("lost: red was taken by ann@", "lost: red is driven by ann@")), script.stderr
     wait_for(lambda: driving(sim), "ann's frame is obeyed")
     assert drives(fleet, "ann@"), "the script that went stopped what ann drives"

@@ -1,4 +1,4 @@
-"""`fleet up` with real processes: what dies or hangs is started again, what is off is not, and the end is orderly."""
+"""`fleet up` with real processes: it restarts crashed and hanging processes, not absent cars, and ends in order."""
 
 import json
 import os
@@ -24,15 +24,16 @@ from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, 
 from tests.support.up import Up, fleet_command
 
 IN_ITS_PLACE_S = 9.5
-"""A gateway that hangs has its time to end, 7 s, is killed, and another stops the car: nothing else does, it has no
-dead-man."""
+"""Maximum time until a new gateway stops the car of a hanging one, which is killed after 7 s.
+
+The car has no dead-man timer, so only a gateway stops it."""
 STARTS_S = 10.0
-"""What a machine that runs other tests may add to that: so long the start of a process takes there."""
+"""Time that the start of a process may add on a machine that runs other tests."""
 
 
 @pytest.fixture(scope="module")
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
-    """Two simulated cars, which need nothing but the clone."""
+    """Start two simulated cars without a file."""
     port = free_port()
     page = ("--console-port", str(port))
     with Up(tmp_path_factory.mktemp("up"), free_endpoint(), "--sim", "2", *page) as started:
@@ -44,21 +45,21 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
 
 @pytest.fixture(scope="module")
 def jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
-    """Two simulated cars of a file, with a plan: `_job`."""
+    """Start two simulated cars of a file, with a plan (`_job`)."""
     directory = tmp_path_factory.mktemp("job")
     with Up(directory, free_endpoint(), str(_job(directory)), "--no-record") as started:
         yield started
 
 
 def get_page(port: int) -> int:
-    """The status of the console's page."""
+    """Return the HTTP status of the console's page."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
         return int(answer.status)
 
 
 @pytest.fixture
 def job(jobs: Up) -> Up:
-    """Restore files and plan, whatever the test before has made of them."""
+    """Restore files and plan of the test before."""
     jobs.running("@coordinator")
     _job(jobs.directory)
     restored = wait_for(lambda: (done := jobs.fleet("reload")).returncode == 0 and done, "reload")
@@ -68,7 +69,7 @@ def job(jobs: Up) -> Up:
     return jobs
 
 
-# The hub comes last: gateways may start one in its place, and ours then ends once more.
+# The hub comes last: gateways may start one in its place, and ours then ends again.
 @pytest.mark.parametrize("name", ["@recorder", "@simulator", "@console", "red", "@hub"])
 def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) -> None:
     before = {each.name: each.pid for each in up.processes()}
@@ -95,13 +96,13 @@ def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
 
 @pytest.mark.parametrize("token_is_gone", [True, False])
 def test_a_stop_of_all_reaches_the_new_gateway_of_one_that_hangs(up: Up, token_is_gone: bool) -> None:
-    """Its token is gone 2 s later, the supervisor replaces it after 4 s: it was left out meanwhile, and had no hold."""
+    """Its token ends after 2 s, and the supervisor replaces it after 4 s. A stop in between must reach the car."""
     pid = up.running("green")
     freeze(pid)
     if token_is_gone:
         wait_for(lambda: not up.bus.tokens(keys.car_token("fleet", "green")), "its token is gone")
     done = up.fleet("stop")
-    # The new gateway may not have opened the link yet: it stops the car when it has.
+    # The new gateway may not have opened the link yet. It stops the car after that.
     ended = re.search(
         r"^green: (stopped|stop sent|NOT STOPPED: .*\[link_down\])", done.stdout + done.stderr, re.MULTILINE
     )
@@ -232,9 +233,9 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
     endpoint = free_endpoint()
     environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state"), "TERM": "xterm"}
     master, slave = pty.openpty()
-    termios.tcsetwinsize(slave, (40, 400))  # no line is broken, however long the path of the session
+    termios.tcsetwinsize(slave, (40, 400))  # wide enough for any path of a session without a line break
     command = [sys.executable, "-m", "fleet.cli", "up", "--sim", "2", "--sessions", str(tmp_path / "sessions")]
-    # A session of its own, whose terminal the pty becomes: Ctrl-C is typed, and comes to its foreground group.
+    # A session of its own with the PTY as its terminal: a typed Ctrl-C reaches the foreground group.
     program = f"import os, fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv({command[0]!r}, {command!r})"
     process = subprocess.Popen(
         [sys.executable, "-c", program],
@@ -261,7 +262,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             wait_for(lambda: "red" in truths and truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
             (status,) = wait_for(lambda: ask_status(client, "fleet"), "it says what runs")
             (waited_for,) = (each.pid for each in status.processes if each.name == "green")
-            freeze(waited_for)  # or it may have ended before the second is typed
+            freeze(waited_for)  # otherwise it may end before the second Ctrl-C
             os.write(master, b"\x03")
             wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
             os.write(master, b"\x03")
@@ -520,7 +521,7 @@ def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(job: Up) ->
 
 
 def test_reload_on_a_full_disk_changes_nothing(job: Up) -> None:
-    """A run's directory that takes no more file is as a full disk, also for root: it is away."""
+    """The run's directory is moved away, so that no file can be written, not even by root."""
     file = job.directory / "fleet.yaml"
     (run,) = (job.directory / "state" / "buses").glob("*/runs/fleet/*")
     run.rename(run.with_name("away"))
@@ -586,7 +587,7 @@ def _text(**links: str) -> str:
 
 
 def _job(directory: Path, link: str = "link: sim, ", ann: str = "follow", bob: str = "seek") -> Path:
-    """Two simulated cars with a plan; the role that each may take."""
+    """Write a file of two simulated cars and a plan, with the role that each car may take."""
     (directory / "plan.yaml").write_text("roles: {follow: {mode: tracking}, seek: {mode: light_seeking}}\n")
     path = directory / "fleet.yaml"
     cars = "".join(f"  {car}: {{{link}roles: [{role}]}}\n" for car, role in (("ann", ann), ("bob", bob)))
@@ -598,7 +599,7 @@ OTHER_JOB = "roles: {follow: {mode: obstacle_avoidance}, seek: {mode: light_seek
 
 
 def _given_another_job(started: Up) -> int:
-    """Give the coordinator that does the files' job another one over the bus; which process it is."""
+    """Set another plan over the bus. Return the process id of the coordinator."""
     pid = started.running("@coordinator")
     wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
     (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
@@ -620,7 +621,7 @@ def _exists(pid: int) -> bool:
 
 
 def _known(client: bus.Bus) -> int:
-    """How many cars were brought to a known state."""
+    """Return the number of cars that were brought to a known state."""
     answers = [each for each in client.query("fleet/*/state/safety") if isinstance(each, bus.Sample)]
     return sum(answer.message().motors == "off" for answer in answers)  # type: ignore[attr-defined]
 
@@ -629,7 +630,7 @@ def _read(master: int, shown: bytearray) -> None:
     while True:
         try:
             data = os.read(master, 4096)
-        except OSError:  # the other end is closed
+        except OSError:  # the other end has closed
             break
         if not data:
             break

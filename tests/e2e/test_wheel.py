@@ -20,7 +20,7 @@ BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(s
 
 
 def wheel(directory: Path) -> Path:
-    """Build the wheel from a copy of what is in the clone."""
+    """Build the wheel from a copy of the clone."""
     source = directory / "source"
     for name in ("fleet", "gateway", "schemas"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -32,7 +32,7 @@ def wheel(directory: Path) -> Path:
 
 
 def required(requirements: list[str], extra: str = "") -> Iterator[metadata.Distribution]:
-    """Yield what has to be installed for these requirements, and for theirs."""
+    """Yield the distributions that these requirements need, directly or not."""
     for requirement in map(Requirement, requirements):
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
@@ -43,7 +43,7 @@ def required(requirements: list[str], extra: str = "") -> Iterator[metadata.Dist
 
 
 class Environment:
-    """A virtual environment with the wheel, and links to the installed packages that the wheel says it needs."""
+    """A virtual environment with the wheel, and with links to the installed packages that the wheel requires."""
 
     def __init__(self, directory: Path) -> None:
         self._bin = directory / "venv" / "bin"
@@ -65,7 +65,7 @@ class Environment:
         }
 
     def install(self, extra: str = "") -> None:
-        """Make importable what the wheel needs, with this extra."""
+        """Make the requirements of the wheel with this extra importable."""
         for each in required(metadata.PathDistribution(self.metadata).requires or [], extra):
             for name in {file.parts[0] for file in each.files or ()} - {"..", "__pycache__"}:
                 if not (self.packages / name).exists():
@@ -78,13 +78,13 @@ class Environment:
         )
 
     def succeeds(self, command: str) -> str:
-        """Run a command that must succeed without a word on stderr; return what it printed."""
+        """Run a command that must succeed with an empty stderr. Return its stdout."""
         done = self.run(command)
         assert (done.returncode, done.stderr) == (0, ""), (command, done.stdout, done.stderr)
         return done.stdout
 
     def served(self, *paths: str) -> list[bytes]:
-        """Serve the console for as long as it takes to read these paths of it; what they are."""
+        """Start the console, read these paths of it, and end it. Return their contents."""
         words = ["fleet", "console", "--port", "0"]
         with subprocess.Popen(words, cwd=self.home, env=self.variables, stdout=subprocess.PIPE) as console:
             try:

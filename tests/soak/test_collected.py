@@ -1,4 +1,4 @@
-"""Each soak can be collected: `make soak` runs too seldom to show that an import broke."""
+"""Tests that pytest collects each soak. `make soak` runs too seldom to find a broken import."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ MARK = "pytest.mark." + "soak"
 
 
 def test_each_soak_is_collected() -> None:
-    # Only files that name the mark are given to pytest: collecting all others takes half a minute on a busy machine.
+    # pytest gets only the files with the mark: collecting all others takes half a minute on a busy machine.
     marked = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if MARK in path.read_text())
     words: list[str | Path] = [*marked, "-m", "soak", "--collect-only", "-q", "-p", "no:cacheprovider"]
     listed = subprocess.run(

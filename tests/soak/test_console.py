@@ -1,4 +1,4 @@
-"""The console with twenty cars streaming: from the finger on STOP to the bytes at the cars, plots, and a slow phone.
+"""The console with twenty cars that stream: time from STOP to the bytes at the cars, plots, and a slow phone.
 
 `CONSOLE_PRESSES`, `CONSOLE_PHONE_PRESSES` and `CONSOLE_PLOT_S` make it shorter.
 """
@@ -35,13 +35,13 @@ WIRE_P95_S = 0.1
 PHONE_P99_S = 0.15
 THROTTLE = 4
 MAX_SHARE = 0.3
-"""Maximum share of a core that the server needs, with one page."""
+"""Maximum share of a core for the server, with one page."""
 MAX_GROWTH_MB = 10.0
 MAX_TASK_MS = 200.0
 """Maximum time of one task in the page."""
 STREAM_READINGS = 4
 MIN_RATE_HZ = 10
-"""Of the 25 readings a second, what a busy machine still makes."""
+"""Minimum readings a second on a busy machine, of 25."""
 PROBE_INTERVAL_S = 1.0
 START_S = 300.0
 """Time for twenty gateways to start on a busy machine."""
@@ -57,12 +57,12 @@ new PerformanceObserver((list) => window.tasks.push(...list.getEntries().map((ea
 
 @dataclass
 class StopTimes:
-    """From the finger to the first bytes of the STOP at each car, s."""
+    """Times from the press to the first bytes of the STOP at each car, s."""
 
     free: list[float]
-    """Of the cars whose program ran no block meanwhile."""
+    """Times of the cars whose program ran no block meanwhile."""
     blocked: int = 0
-    """How many cars a block delayed."""
+    """Number of cars that a block delayed."""
 
     def __str__(self) -> str:
         p50, p95, p99 = (round(share(self.free, part) * 1e3) for part in (0.5, 0.95, 0.99))
@@ -116,13 +116,13 @@ class TwentyCars:
         return len(times) == STREAM_READINGS and time.monotonic() - times[0] < lasts_s
 
     def rate_hz(self) -> float:
-        """The readings of a car in a second."""
+        """Return the readings of a car in a second."""
         begun, began = self._readings, time.monotonic()
         time.sleep(0.5)
         return (self._readings - begun) / (time.monotonic() - began) / len(CARS)
 
     def track(self) -> None:
-        """Bring all cars into a mode in which they report fast, and wait until all do and none is blocked by that."""
+        """Bring all cars into a mode with fast reports. Wait until all report, and none is in a block."""
         wait_for(lambda: all(each.ok for each in self.person.ask(mode_request("tracking"), CARS)), "all track")
 
         def ready() -> bool:
@@ -132,15 +132,15 @@ class TwentyCars:
         wait_for(ready, "all report fast")
 
     def cpu_s(self) -> float:
-        """The time of a processor that the console has used."""
+        """Return the CPU time of the console."""
         return float(sum(self.process.cpu_times()[:2]))
 
     def rss_mb(self) -> float:
-        """The memory of the console."""
+        """Return the memory of the console."""
         return float(self.process.memory_info().rss / 1e6)
 
     def stop(self, page: Page, times: StopTimes) -> None:
-        """Press STOP while all cars stream, and add the times to the bytes at the cars."""
+        """Press STOP while all cars stream. Add the times until the bytes reach the cars."""
         self.track()
         page.locator("#stop").hover()
         before = page.locator("[data-report]")
@@ -183,7 +183,7 @@ def twenty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwentyCars]:
 
 
 def share(values: list[float], part: float) -> float:
-    """The value below which this part lies."""
+    """Return the value below which this part of the values lies."""
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
 
@@ -228,7 +228,7 @@ def test_every_stop_of_a_slow_phone_arrives(twenty: TwentyCars) -> None:
 
 
 def probe(twenty: TwentyCars) -> list[float]:
-    """Another operator leases and releases cars; the time of each command, s."""
+    """Lease and release cars as another operator. Return the time of each command, s."""
     took = []
     for car in CARS[:5]:
         for release in (False, True):
@@ -250,7 +250,7 @@ def test_four_plots_of_twenty_cars_run_flat_and_harm_nobody(twenty: TwentyCars) 
         page.locator(".selection select").select_option("600")
         values = page.locator("[data-plot='3'] .newest", has_text=f"{CARS[-1]} ")
         values.wait_for()
-        time.sleep(min(30.0, PLOT_S / 4))  # the history of ten minutes has come
+        time.sleep(min(30.0, PLOT_S / 4))  # until the history of ten minutes has arrived
         page.evaluate(NOTE_TASKS)
         began, used, memory, during = time.monotonic(), twenty.cpu_s(), [twenty.rss_mb()], []
         while (passed_s := time.monotonic() - began) < PLOT_S:

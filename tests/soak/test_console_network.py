@@ -48,7 +48,7 @@ def ip(*words: str) -> None:
 
 @pytest.fixture
 def namespace() -> Iterator[str]:
-    """Another computer: a network namespace at the other end of a wire."""
+    """Yield the name of a network namespace, connected as another computer is."""
     name = f"fleet-{os.getpid()}"
     ip("netns", "add", name)
     try:
@@ -60,7 +60,7 @@ def namespace() -> Iterator[str]:
         ip("-n", name, "link", "set", "lo", "up")
         yield name
     finally:
-        ip("netns", "del", name)  # the wire goes with it
+        ip("netns", "del", name)  # this also deletes the connection
         with contextlib.suppress(subprocess.CalledProcessError):
             ip("link", "del", "fleet-here")
 
@@ -73,7 +73,7 @@ class Visitor:
         self._popen = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
     def ask(self, verb: str, path: str, body: str | None = None, cookie: str | None = None) -> tuple[int, str, str]:
-        """Ask the console; status (0: no connection), text and the cookie that it now has."""
+        """Send a request. Return status (0: no connection), text and the new cookie."""
         assert self._popen.stdin is not None
         assert self._popen.stdout is not None
         print(json.dumps([verb, path, body, cookie]), file=self._popen.stdin, flush=True)
@@ -81,7 +81,7 @@ class Visitor:
         return status, text, cookie_now
 
     def close(self) -> None:
-        """End it."""
+        """End the device's process."""
         assert self._popen.stdin is not None
         assert self._popen.stdout is not None
         self._popen.stdin.close()
@@ -90,11 +90,11 @@ class Visitor:
 
 
 class Eavesdropper:
-    """Somebody in the network who passes each byte on and writes it down."""
+    """An attacker in the network who passes each byte on and records it."""
 
     def __init__(self, host: str, port: int) -> None:
         self.sent: list[bytes] = []
-        """What each client has sent, by connection."""
+        """Bytes of each client, by connection."""
         self._target = host, port
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._sockets = [self._listener]
@@ -122,7 +122,7 @@ class Eavesdropper:
                 each.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """End everything."""
+        """Close all connections."""
         for each in self._sockets:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
@@ -130,7 +130,7 @@ class Eavesdropper:
 
 
 def replay(host: str, port: int, recorded: bytes) -> bytes:
-    """Send recorded bytes again; what comes back until the console ends it."""
+    """Send recorded bytes again. Return the console's bytes until it closes the connection."""
     answer = b""
     with socket.create_connection((host, port), timeout=PATIENCE_S) as again, contextlib.suppress(OSError):
         again.sendall(recorded)
@@ -154,13 +154,13 @@ def test_from_another_computer_nothing_is_served_without_pairing(namespace: str,
             assert stranger.ask("GET", path)[0] == 403, path
         for path in ("/stop", "/plan/set", "/people"):
             assert stranger.ask("POST", path, "{}")[0] == 403, path
-        # The right one pairs, from the other computer.
+        # The right code pairs, from the other computer.
         assert json.loads(stranger.ask("POST", "/pair", "AAAA-AAAA")[1])["ok"] is False
         status, _, cookie = stranger.ask("POST", "/pair", code)
         assert (status, cookie != "") == (200, True)
         assert stranger.ask("GET", "/hello")[0] == 200
         assert stranger.ask("POST", "/stop")[0] == 204
-        # Another one comes with the same code.
+        # Another device sends the same code.
         opened.append(second := Visitor(namespace, HERE, port))
         assert json.loads(second.ask("POST", "/pair", code)[1])["ok"] is False
         assert second.ask("GET", "/hello")[0] == 403
@@ -168,7 +168,7 @@ def test_from_another_computer_nothing_is_served_without_pairing(namespace: str,
         # A whole recorded exchange, byte by byte: its pairing, then its STOP.
         opened.append(wire := Eavesdropper("127.0.0.1", port))
         victim = NetworkDevice(wire.port)
-        # The browser believes that it speaks to the console's own port.
+        # The browser takes the attacker's port for the console's own.
         victim.origin = f"https://127.0.0.1:{port}"
         environment = fleet.environment | os.environ
         words = [sys.executable, "-m", "fleet.cli", "console", "pair", "victim"]
@@ -176,7 +176,7 @@ def test_from_another_computer_nothing_is_served_without_pairing(namespace: str,
         fresh = made.split(" type ")[1][:9]
         assert victim.ask("POST", "/pair", fresh, Host=f"127.0.0.1:{port}")[0] == 200
         assert victim.ask("POST", "/stop", Host=f"127.0.0.1:{port}")[0] == 204
-        time.sleep(0.2)  # the last bytes of the closed connections
+        time.sleep(0.2)  # until the last bytes of the closed connections have passed
         before = console.process.stderr
         assert len(wire.sent) == 2
         for recorded in wire.sent:

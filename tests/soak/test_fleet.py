@@ -1,6 +1,6 @@
-"""Ten minutes of faults in random order, nothing added for a busy machine: `make soak` runs alone.
+"""Ten minutes of faults in random order, with strict limits: `make soak` runs alone.
 
-`FLEET_SOAK_S=120` plays for a shorter time, `FLEET_SOAK_SEED=7` the same choices again.
+`FLEET_SOAK_S=120` plays for a shorter time, `FLEET_SOAK_SEED=7` repeats the choices of a run.
 """
 
 import os
@@ -56,7 +56,7 @@ def test_ten_minutes_of_links_that_fail_around_stops(tmp_path: Path) -> None:
     plan.write_text(PLAN)
     with Up(tmp_path, free_endpoint(), "--sim", "8", "--plan", str(plan)) as up:
         claims = Claims.follow(up.bus)
-        for car in CARS:  # the plan may drive it as soon as it is known
+        for car in CARS:  # the plan may drive a car as soon as its state is known
             wait_for(
                 lambda car=car: (
                     (safety := up.get(f"{car}/state/safety")) and safety.trust not in ("unknown", "recovering")

@@ -1,6 +1,6 @@
 """Ten million steps of fuzzing: decoder, controller with its arbiter, and controller with a simulated car.
 
-New seeds each day (FUZZ_SEED repeats a run): what fails names its seed and step.
+The seeds change each day, and FUZZ_SEED repeats a run. A failure names its seed and step.
 """
 
 import os
@@ -19,7 +19,7 @@ PARTS = 50
 
 
 def every(run: Callable[..., Any], steps: int) -> list[Any]:
-    """A part of the steps with each seed, on all processors."""
+    """Run a part of the steps with each seed, on all processors."""
     with ProcessPoolExecutor() as pool:
         return list(pool.map(run, range(SEED, SEED + PARTS), [steps // PARTS] * PARTS))
 

@@ -1,4 +1,4 @@
-"""A hundred simulated cars on this machine: nobody restarts a gateway because the machine is busy or stood still."""
+"""A hundred simulated cars: the supervisor restarts no gateway because the machine is busy or stalls."""
 
 import os
 import re
@@ -20,15 +20,15 @@ from tests.support.up import Up
 
 CARS = 100
 QUIET_S, BUSY_S = 60.0, 120.0
-"""Until all cars are at rest: on two processors, and beside a process that takes one of them."""
+"""Maximum time until all cars are at rest: on two processors, and beside a process that takes one of them."""
 STANDS_S = 6.0
 SETTLED_S = 15.0
-"""A gateway that was to be killed would have been."""
+"""Time after which the supervisor would have killed a gateway."""
 
 
 @contextmanager
 def burning() -> Iterator[None]:
-    """A process that takes a processor."""
+    """Run a process that takes one processor."""
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         yield
@@ -39,7 +39,7 @@ def burning() -> Iterator[None]:
 
 @contextmanager
 def hundred(directory: Path, seconds: float) -> Iterator[Up]:
-    """A fleet that came to rest within this time, without one restart."""
+    """Start a fleet. Check that it comes to rest within this time without a restart."""
     with Up(directory, free_endpoint(), "--sim", str(CARS), "--no-record") as up:
         wait_until_at_rest(up, 3 * seconds)
         took = time.perf_counter() - up.began
@@ -50,7 +50,7 @@ def hundred(directory: Path, seconds: float) -> Iterator[Up]:
 
 
 def moving(up: Up) -> dict[str, str]:
-    """The cars that are not known to stand, and what is known of each."""
+    """Return the cars that are not known to stand, each with its state."""
     states = {
         each.key.split("/")[1]: each.message()
         for each in up.bus.query("fleet/*/state/safety", timeout_s=5.0)
@@ -61,7 +61,7 @@ def moving(up: Up) -> dict[str, str]:
 
 
 def wait_until_at_rest(up: Up, seconds: float, wedged: int = 0) -> set[str]:
-    """Look once a second: to answer costs a hundred gateways what they need to start. Return the wedged cars.
+    """Poll once a second, because answers take CPU time that a hundred gateways need to start. Return the wedged cars.
 
     wedged: number of cars that may show no stop, if they stand and their gateways say so.
     """
@@ -78,7 +78,7 @@ def wait_until_at_rest(up: Up, seconds: float, wedged: int = 0) -> set[str]:
 
 
 def stands(up: Up, car: str) -> bool:
-    """Return True if the car stands in truth."""
+    """Return True if the true motors of the car are off."""
     truths: list[bool] = []
 
     def on_truth(sample: Sample) -> None:
@@ -91,12 +91,12 @@ def stands(up: Up, car: str) -> bool:
 
 
 def restarts(up: Up) -> dict[str, str]:
-    """Processes that were started again, and why."""
+    """Return the restarted processes with the reasons."""
     return {each.name: each.words for each in up.processes() if each.restarts}
 
 
 def stand(pids: list[int]) -> None:
-    """Stop these processes for a while: the first of them first, and the last to go on."""
+    """Pause these processes for a while. The first one is paused first and resumed last."""
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     try:
@@ -118,7 +118,7 @@ def test_a_hundred_cars_come_to_rest_and_none_is_restarted_when_the_hub_or_the_m
         for what, pids in (("hub", [up.hub()]), ("machine", [up.process.pid, *up.left()])):
             stand(pids)
             time.sleep(SETTLED_S)
-            # One of 300 cars showed no stop from then on: likely it lost half a frame while the simulator was late, and
+            # One of 300 cars showed no stop after that. Likely it lost half a frame while the simulator was late, and
             # was wedged (docs/reference/protocol.md#hazards). No gateway can mend this.
             wedged = wait_until_at_rest(up, BUSY_S, wedged=2)
             print(f"{what} stood for {STANDS_S:g} s, restarts: {restarts(up)}")

@@ -1,4 +1,4 @@
-"""What tests/e2e kills and cuts once, many times and with nothing added for a busy machine: `make soak` runs alone."""
+"""Repeats the kills and cuts of tests/e2e many times, with strict limits: `make soak` runs alone."""
 
 import random
 from collections.abc import Iterable, Iterator
@@ -29,7 +29,7 @@ be in the buffer."""
 
 
 def fleets(directory: Path, rounds: int) -> Iterator[FleetProcesses]:
-    """A new fleet for each round."""
+    """Yield a new fleet for each round."""
     for number in range(rounds):
         place = directory / str(number)
         place.mkdir()
@@ -41,7 +41,7 @@ def fleets(directory: Path, rounds: int) -> Iterator[FleetProcesses]:
 
 
 def judged(rounds: Iterable[dict[str, Took]]) -> None:
-    """Show the times of all rounds, and find none that is over its limit."""
+    """Print the times of all rounds. Fail if one is over its limit."""
     found: dict[str, list[Took]] = {}
     for each in rounds:
         for what, took in each.items():

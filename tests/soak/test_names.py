@@ -1,4 +1,4 @@
-"""Ten thousand names in ten seconds at a real coordinator: it decides on few of them, and forgets all of them."""
+"""Ten thousand names in ten seconds at a real coordinator: it decides about few of them, and forgets all of them."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What tests/e2e/test_recorder_kills.py does, many times and with more cars; the recorder's memory."""
+"""Repeats tests/e2e/test_recorder_kills.py many times with more cars, and measures the recorder's memory."""
 
 import random
 import signal
@@ -21,10 +21,10 @@ MESSAGES = 10_000_000
 PUBLISHERS = 40
 AT_ONCE = 50
 LEAD = 4_000
-"""How many may be under way."""
+"""Maximum number of messages in transit."""
 SETTLED = 1_000_000
 GROWN = 1.1
-"""From one half to the other; within each it goes up and down with the index of the file that is being written."""
+"""Maximum ratio of the memory in the second half to the first. The index of the open file makes it vary in each."""
 
 
 @pytest.mark.soak
@@ -40,16 +40,16 @@ def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 def test_what_publishers_hold_is_had_again_however_long_the_hub_was_away(tmp_path: Path) -> None:
-    """Of what comes twice a second a hundred seconds are held."""
+    """Publishers cache a hundred seconds of a topic with two messages a second."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         recording = Recording(fleet, tmp_path / "sessions")
         with Load(fleet.endpoint, CARS, rate_hz=2.0) as load:
             wait_for(lambda: load.count() > 4 * CARS, "a load")
-            recording.process.popen.send_signal(signal.SIGSTOP)  # it would start another
+            recording.process.popen.send_signal(signal.SIGSTOP)  # the recorder would start another hub
             fleet.hub.kill()
             fleet.hub.wait()
-            time.sleep(AWAY_S)  # how long nobody is there is not what is waited for, but what is tried
+            time.sleep(AWAY_S)  # not a wait: the test is about this time without a hub
             recording.process.popen.send_signal(signal.SIGCONT)
             ends_whole(fleet, load, CARS, recording, [recording.session])
     finally:
@@ -92,7 +92,7 @@ def test_memory_is_flat_over_ten_million_messages(tmp_path: Path) -> None:
                 for each in out:
                     each.put(line, time.time_ns())
             sent += AT_ONCE * PUBLISHERS
-            # As many as the recorder takes: what it cannot take it drops, and says so.
+            # Send at the recorder's pace: it drops messages beyond that.
             wait_for(partial(follows, sent - LEAD), "the recorder follows")
             if sent % SETTLED == 0:
                 memory.append(recording.process.rss_mb())
@@ -104,7 +104,7 @@ def test_memory_is_flat_over_ten_million_messages(tmp_path: Path) -> None:
     missed = sum(found["missed"].values())
     print(f"\n{found['messages']} messages, {missed} lost by the bus, in {time.monotonic() - began:.0f} s")
     print(f"RSS after each million: {shown} MB")
-    # Faster than any fleet, the bus itself loses some: that is counted, and nothing is lost here.
+    # At a rate above any fleet's, the bus itself loses messages. The recorder counts them, and loses none by itself.
     assert found["drops"] == {}
     assert found["messages"] + missed >= MESSAGES
     half = len(memory) // 2

@@ -1,6 +1,6 @@
-"""`stop` at 200 random moments in each mode and load: the distribution of what it took against what was announced.
+"""`stop` at 200 random moments in each mode and load: the measured times beside the announced ones.
 
-`STOPS_TSV=FILE make soak` keeps the table as tab-separated text as well.
+`STOPS_TSV=FILE make soak` also writes the table as tab-separated text.
 """
 
 import os

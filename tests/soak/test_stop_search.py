@@ -1,4 +1,4 @@
-"""The search for a stop that is claimed and false, over 30,000 episodes; and each rule taken out, so that it finds one.
+"""The search for false claims of stops, over 30,000 episodes. With any rule taken out, the search finds one.
 
 `STOP_SEARCH=FROM:TO make soak` plays the episodes of other seeds.
 """
@@ -12,7 +12,7 @@ from tests.fuzz.stop_search import explain, found_at, search
 
 FIRST, BEHIND = (int(seed) for seed in os.environ.get("STOP_SEARCH", "1000:31000").split(":"))
 WITHIN = 400
-"""Maximum number of episodes in which the search finds the fault that a rule prevents: those of `make test`."""
+"""Maximum number of episodes until the search finds the fault that a rule prevents, as in `make test`."""
 
 
 @pytest.mark.soak

@@ -1,4 +1,4 @@
-"""Many gaps around stops of strangers' cars, of any length and direction, in every mode; strictly."""
+"""Many gaps around stops of foreign cars, of any length and direction, in every mode, with strict limits."""
 
 import random
 import time
@@ -21,7 +21,7 @@ def test_stops_behind_many_gaps(tmp_path: Path) -> None:
         lot.ready()
         for each in range(seed, seed + ROUNDS):
             print(f"\nseed {each}")
-            pause_s = random.Random(each).uniform(0.0, 4.0)  # some modes are still being opened
+            pause_s = random.Random(each).uniform(0.0, 4.0)  # short pauses stop a mode during its opening
             found += stop_all(lot, any_gaps(MODES, each), pause_s=pause_s, busy_s=0.0)
     finally:
         lot.close()
