@@ -19,7 +19,7 @@ class Cars(FleetProcesses):
 
     def __init__(self, endpoint: str, directory: Path) -> None:
         super().__init__(endpoint, directory)
-        # Named links: one that was lost comes back where it was.
+        # Links with names: a lost one comes back at the same path.
         specs = (f"{car}:{platform}:pty:{directory / car}.tty" for car, platform in CARS.items())
         self.sim, links = self.simulate(*specs)
         self.links = dict(zip(CARS, links, strict=True))
@@ -34,7 +34,7 @@ class Cars(FleetProcesses):
 
 @contextmanager
 def running(command: list[str]) -> "Iterator[subprocess.Popen[str]]":
-    """A process that does not outlive the block, also when an assertion in it fails; its exit would be waited for."""
+    """Run a process that ends with the block, also if an assertion fails. Otherwise the exit would wait for it."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process
@@ -43,7 +43,7 @@ def running(command: list[str]) -> "Iterator[subprocess.Popen[str]]":
 
 
 def asked(drive: Callable[[], Outcome]) -> Outcome:
-    """What became of a drive; one that is half a second old when it arrives is refused with `ask again`: it is."""
+    """Return the outcome of a drive. If the drive was stale at its arrival, send it again, as the message says."""
     while True:
         try:
             outcome = drive()
@@ -66,14 +66,14 @@ def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
 
 @pytest.fixture(autouse=True)
 def nobody_has_a_car(request: pytest.FixtureRequest) -> None:
-    """Who drove in the test before has the car for two seconds more, and whoever ranks lower would be refused."""
+    """Release all cars. The last driver has a lease for two seconds more, and a lower rank would be rejected."""
     if "cars" in request.fixturenames:
         cars: Cars = request.getfixturevalue("cars")
 
         def free() -> bool:
             states = cars.get("fleet/*/state/safety")
             leased = [each.car for each in states if not isinstance(each, str) and each.HasField("lease")]
-            for car in leased:  # a person takes the car, and gives it back at once
+            for car in leased:  # a person takes the car, and releases it at once
                 for what in ({"take": True}, {"release": True}):
                     cars.ask_all("lease", car, sender="between-tests", kind="person", **what)
             return not leased and not any(isinstance(each, str) for each in states)

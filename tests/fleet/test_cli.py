@@ -1,4 +1,4 @@
-"""The `fleet` command: exit codes, what is said of a mistake, what Ctrl-C does; real processes where it matters."""
+"""The `fleet` command: exit codes, messages about mistakes, and Ctrl-C, with real processes if needed."""
 
 import json
 import os
@@ -26,7 +26,7 @@ from tests.support.processes import LONG_S, driving, wait_for
 FLEET = [sys.executable, "-m", "fleet.cli"]
 LONG = f"{LONG_S:g}s"
 STALE = "[stale]"
-"""A drive that is half a second old when it arrives is refused, with `ask again`."""
+"""Reason of a rejected drive that is half a second old at its arrival."""
 
 
 def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
@@ -36,7 +36,7 @@ def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 @contextmanager
 def driven(cars: Cars, *names: str) -> "Iterator[subprocess.Popen[str]]":
-    """`fleet drive`, for long, when all of these cars drive."""
+    """Run a long `fleet drive`. Yield it once all of these cars drive."""
     command = [*FLEET, "drive", ",".join(names), "forward", "--for", LONG, "--connect", cars.endpoint]
     events: list[Any] = []
     cars.bus.subscribe("fleet/*/event/command", lambda sample: events.append(sample.message()))
@@ -50,7 +50,7 @@ def driven(cars: Cars, *names: str) -> "Iterator[subprocess.Popen[str]]":
             if not refused():
                 yield drive
                 return
-            drive.send_signal(signal.SIGINT)  # of the others, if there are any
+            drive.send_signal(signal.SIGINT)  # ends the drives of the other cars
             drive.communicate(timeout=60)
             events.clear()
 
@@ -134,7 +134,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     arguments: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["fleet", *arguments.split(" ")])
-    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())  # nobody is there, and nobody is asked
+    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())  # no hub listens there, and the command queries none
     with pytest.raises(SystemExit) as ended:
         cli.main()
     said = capsys.readouterr()
@@ -177,11 +177,11 @@ WITHOUT_BUS = (
     "play",
     "record",
 )
-"""Subcommands that look at no bus, at that of the file, or in their own subcommands."""
+"""Subcommands without a bus, with the bus of the file, or with options in their own subcommands."""
 
 
 def contexts(command: click.Command, context: click.Context) -> Iterator[click.Context]:
-    """Each command, with the context in which its help is written."""
+    """Yield each command with the context of its help."""
     yield context
     if isinstance(command, click.Group):
         for name in command.list_commands(context):
@@ -282,7 +282,7 @@ def test_list_says_how_each_car_is(cars: Cars) -> None:
         (car, "manual", "off") for car in ("blue", "green", "red")
     ]
     assert 6 < rows[2]["battery_v"] < 9
-    # A Raspberry Pi car measures none.
+    # A Raspberry Pi car does not measure this field.
     assert [(row["battery_v"] is None, row["battery_level"]) for row in rows] == [(True, None)] * 2 + [(False, "ok")]
     done = run(cars.endpoint, "list")
     table = [line.split() for line in done.stdout.splitlines()]
@@ -294,7 +294,7 @@ def test_list_says_how_each_car_is(cars: Cars) -> None:
 
 
 def test_a_reading_of_an_hour_ago_is_not_shown_as_if_it_were_so_now(cars: Cars) -> None:
-    """In tracking only the line is measured: the battery's last reading ages."""
+    """In tracking, only the line is measured, so the battery's last reading ages."""
     assert run(cars.endpoint, "mode", "red", "tracking").returncode == 0
     try:
 
@@ -324,7 +324,7 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
         (found,) = lines(run(cars.endpoint, "get", "red/sensor/range", "--json"))
         return None if found["stale"] else found
 
-    # The test before may have left it in a mode in which the range is not measured.
+    # The test before may have left the car in a mode without range readings.
     reading = wait_for(fresh, "red's range is measured")
     assert list(reading) == ["key", "time", "age_s", "stale", "value"]
     assert 0 <= reading["age_s"] < 60

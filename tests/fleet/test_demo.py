@@ -1,4 +1,4 @@
-"""`fleet demo` as a user runs it: all its checks hold, and interrupted it leaves nothing running."""
+"""`fleet demo` as a user runs it: all its checks pass, and after Ctrl-C no process is left."""
 
 import json
 import signal
@@ -11,7 +11,7 @@ import pytest
 from tests.support.processes import wait_for
 
 PATIENCE_S = 240.0
-"""It starts ten processes one after the other: 20 s, and on a busy machine several times as long."""
+"""Timeout of the demo. It starts ten processes in turn: 20 s, and several times as long on a busy machine."""
 
 
 def _left(marker: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The examples are run as they are, as processes, against simulated cars; what they do is seen in the cars."""
+"""Runs the examples unchanged, as processes, against simulated cars. The cars show the effects."""
 
 import ast
 import json
@@ -17,14 +17,14 @@ LINES = 30
 
 
 def run(cars: Cars, name: str, *arguments: str) -> list[str]:
-    """Run one to its end; what it printed."""
+    """Run an example to its end. Return its output."""
     process = cars.start("-u", "-m", f"fleet.examples.programs.{name}", *arguments)
     assert process.wait() == 0, process.stderr
     return process.lines()
 
 
 def code(notebook: Path) -> list[str]:
-    """Its code cells."""
+    """Return the code cells of a notebook."""
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
@@ -75,7 +75,7 @@ def test_follow_the_leader(cars: Cars) -> None:
 
 
 def test_custom_policy(cars: Cars) -> None:
-    """Red alone can avoid obstacles; when a person has stopped it, the policy leaves it alone."""
+    """Only red can avoid obstacles. After a person's stop, the policy leaves red alone."""
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
         process = cars.start("-m", "fleet.examples.programs.custom_policy")
         wait_for(lambda: cars.state("mode").asked == "obstacle_avoidance", "red avoids obstacles")
@@ -84,7 +84,7 @@ def test_custom_policy(cars: Cars) -> None:
         lines = process.lines()
         assert lines.count("red: switching to mode obstacle_avoidance") == 1
         assert len([line for line in lines if line.startswith("red: refused: red is on hold (mia")]) == 2
-        # In the first round only if it has more room than red.
+        # In the first round, only if this car has more room than red.
         assert len([line for line in lines if line.startswith("blue: refused: blue (raspberry_pi) has no mode")]) in (
             2,
             3,
@@ -94,7 +94,7 @@ def test_custom_policy(cars: Cars) -> None:
 
 
 def test_notebook(cars: Cars) -> None:
-    """Its cells in order, in one namespace, each showing its last line, as a notebook does."""
+    """The cells run in order in one namespace, and each shows its last line, as in a notebook."""
     run_cells = (
         "import ast, json, sys\n"
         "space = {}\n"

@@ -1,4 +1,4 @@
-"""Without the extras, everything works but what they are for; a command that lacks one says what to type."""
+"""Without an extra, only its own commands fail, with a message that names the install command."""
 
 import json
 import subprocess
@@ -27,7 +27,7 @@ for words in json.load(sys.stdin):
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Run every command in one process that cannot import what the extras bring."""
+    """Run every command in one process that cannot import the packages of the extras."""
     folder = tmp_path_factory.mktemp("extras")
     made = Made(folder / "one.mcap", Writer)
     made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)

@@ -94,7 +94,7 @@ def test_a_person_stop_holds_the_car_against_the_coordinator_until_resumed(clien
     with Fleet(cars.endpoint, sender="c", kind="coordinator") as coordinator:
         assert coordinator.car("green").mode("manual").reason == "held"
         assert client.car("green").resume().ok
-        # Who drove it last has it for two seconds more.
+        # The last driver has a lease for two seconds more.
         wait_for(lambda: coordinator.car("green").mode("manual").ok, "the coordinator has it")
 
 
@@ -178,7 +178,7 @@ async def test_the_async_client_does_the_same(cars: Cars) -> None:
 
 @pytest.fixture
 def gateway(cars: Cars) -> Iterator[Bus]:
-    """A session in a fleet of its own, `odd`, in which a test plays the gateways."""
+    """Yield a session in a fleet of its own, `odd`, in which a test plays the gateways."""
     with Bus.open(cars.endpoint) as opened:
         yield opened
 
@@ -195,7 +195,7 @@ def _asked(query: zenoh.Query) -> str:
 def test_a_gateway_that_hangs_is_told_from_one_that_answers_late(
     cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Of 50 cars that stopped, six were said to hang: their answers took more than two seconds."""
+    """A client once reported six of 50 stopped gateways as hanging, because their answers took over two seconds."""
     monkeypatch.setattr("fleet.client.command_tracker.ANSWER_TIMEOUT_S", 0.1)
     monkeypatch.setattr("fleet.client.client.OVERLOAD_ANSWER_TIMEOUT_S", 4.2)
     caplog.set_level("WARNING", "fleet")
@@ -398,5 +398,5 @@ def test_reading_a_command_is_refused_because_asking_for_it_would_carry_it_out(c
         client.get("red/@cmd/stop")
     assert client.car("red").find().ok
     wait_for(lambda: [each for each in events if each.verb == "find"], "a command that is carried out is recorded")
-    # Of a command of the test before the last may be told late.
+    # Events of an earlier test's command may arrive late.
     assert {each.verb for each in events if each.stamp.ToNanoseconds() > began_ns} == {"find"}

@@ -44,13 +44,13 @@ def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 
 def on_a_terminal(endpoint: str, *arguments: str) -> str:
-    """What a person sees."""
+    """Run a command at a terminal. Return its output as a person sees it."""
     controller, device = pty.openpty()
     environment = {key: value for key, value in os.environ.items() if key != "NO_COLOR"} | {"TERM": "xterm"}
     shown = b""
     with subprocess.Popen([*FLEET, *arguments, "--connect", endpoint], stdout=device, stderr=device, env=environment):
         os.close(device)
-        with contextlib.suppress(OSError):  # the last who had the terminal has gone
+        with contextlib.suppress(OSError):  # the last process on the terminal has ended
             while piece := os.read(controller, 4096):
                 shown += piece
     os.close(controller)
@@ -113,9 +113,9 @@ def reading(topic: str, seq: int, age_s: float, boot: str = "a", **fields: Any) 
     [
         ([(1, 2.0), (2, 1.0), (3, 0.0)], 1.0, 0.0),
         ([(1, 2.0), (51, 0.0)], 25.0, 0.0),  # most were missed
-        ([(7, 60.0), (8, 0.5)], None, 0.5),  # one in the time that was looked at
+        ([(7, 60.0), (8, 0.5)], None, 0.5),  # one within the observed time
         ([(7, 60.0)], None, 60.0),
-        ([(1, 0.02), (2, 0.0)], 0.4, 0.0),  # two that came at once are two in the time
+        ([(1, 0.02), (2, 0.0)], 0.4, 0.0),  # two that arrived together count as two
         ([(3, 0.0), (1, 2.0)], 1.0, 0.0),  # in any order
     ],
 )
@@ -211,7 +211,7 @@ def test_wrong_use_is_found_before_anyone_is_asked(
     arguments: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["fleet", *arguments])
-    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())  # nobody is there
+    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())  # no hub listens there
     with pytest.raises(SystemExit) as ended:
         command_line.main()
     said = capsys.readouterr()
@@ -266,11 +266,11 @@ async def test_the_sdk_does_the_same_both_ways(cars: Cars) -> None:
             fleet.sync.watch("red", when="nothing > 1")
 
 
-# ---------------------------------------------------------------------- between the current value and those that come
+# ---------------------------------------------------------------------- between the current value and the next ones
 
 
 class Flicker:
-    """A car whose range is far when it is asked, and near for one message right after the answer."""
+    """A car whose range is far in the answer to a query, and near for one message right after it."""
 
     def __init__(self, bus: Bus) -> None:
         self._topic = topics.TOPICS["sensor/range"]
@@ -320,7 +320,7 @@ def close(for_s: float = 0.0) -> ConditionWait:
 
 
 def ends(waiting: ConditionWait, seen: list[tuple[float, float | None]], end_s: float = 100.0) -> list[bool]:
-    """For readings as (moment, distance)."""
+    """Return whether each reading, given as (time, distance), ends the wait."""
     found = []
     for number, (at, range_m) in enumerate(seen):
         taken = reading("sensor/range", number, end_s - at, range_m=range_m)
@@ -333,11 +333,11 @@ def ends(waiting: ConditionWait, seen: list[tuple[float, float | None]], end_s: 
     [
         (0.0, [(1, 0.5), (2, 0.2)], [False, True]),
         (0.0, [(1, None), (2, 0.2)], [False, True]),
-        (0.0, [(2, 0.5), (1, 0.2)], [False, False]),  # older than what is known
+        (0.0, [(2, 0.5), (1, 0.2)], [False, False]),  # older than the newest reading
         (2.0, [(1, 0.2), (2, 0.2), (3, 0.2)], [False, False, True]),
         (2.0, [(1, 0.2), (2, 0.4), (3, 0.2), (4, 0.2), (5, 0.2)], [False, False, False, False, True]),
-        (2.0, [(1, 0.2), (2, None), (3, 0.2)], [False, False, False]),  # what was not measured breaks it
-        (2.0, [(1, 0.2), (5, 0.2), (6, 0.2), (7, 0.2)], [False, False, False, True]),  # nobody knows what was between
+        (2.0, [(1, 0.2), (2, None), (3, 0.2)], [False, False, False]),  # an unmeasured value breaks the series
+        (2.0, [(1, 0.2), (5, 0.2), (6, 0.2), (7, 0.2)], [False, False, False, True]),  # the gap may hide another value
         (0.5, [(1, 0.2), (1.4, 0.2), (1.5, 0.2)], [False, False, True]),
     ],
 )

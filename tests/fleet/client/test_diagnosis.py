@@ -1,4 +1,4 @@
-"""Each row of the doctor's table, and what it says of a car that is well."""
+"""Each row of the doctor's table, and its result for a car without faults."""
 
 from dataclasses import replace
 from typing import Any

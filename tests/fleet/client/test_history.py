@@ -1,4 +1,4 @@
-"""What gateways still know: `fleet get --last, --since`, as CSV and JSON, and the same for any Zenoh client."""
+"""The gateways' history: `fleet get --last, --since`, as CSV and JSON, and by any Zenoh client."""
 
 import csv
 import io
@@ -27,17 +27,17 @@ from tests.support.processes import FleetProcesses, TcpCar, wait_for
 
 SENT = HISTORY + 100
 AT_ONCE = 20
-"""Readings that are taken in one turn: of a flood, a gateway leaves out what it is late for."""
+"""Number of readings in one burst. In a flood, a gateway drops readings for which it is late."""
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 
 
 def centimetres(number: int) -> float:
-    """What the car measured as its so many-th."""
+    """Return the distance of the reading with this number."""
     return 10 + number / 10
 
 
 class Remembered(FleetProcesses):
-    """One car that has sent more than its gateway keeps, each distance a little more than the one before."""
+    """One car that has sent more readings than its gateway caches, with distances that grow a little each time."""
 
     def __init__(self, endpoint: str, directory: Path) -> None:
         super().__init__(endpoint, directory)
@@ -57,7 +57,7 @@ class Remembered(FleetProcesses):
                 wait_for(lambda newest=newest: self.newest_m() == newest, "all have come")
 
     def newest_m(self) -> float | None:
-        """The last distance; None while the gateway gives none, or does not answer in time."""
+        """Return the last distance, None if the gateway has none or does not answer in time."""
         found = [each.range_m for each in self.get("fleet/red/sensor/range") if not isinstance(each, str)]
         return found[0] if found else None
 
@@ -133,7 +133,7 @@ def test_several_keys_each_keep_their_order(remembered: Remembered) -> None:
 
 
 def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
-    """The stock library with its own defaults: one answer for each key unless a time is asked for."""
+    """Zenoh's own client with its defaults gets one answer for each key, unless the query has a time range."""
     config = zenoh.Config.from_json5('{mode: "client"}')
     config.insert_json5("connect/endpoints", json.dumps([remembered.endpoint]))
     with zenoh.open(config) as session:
@@ -208,7 +208,7 @@ def test_a_history_of_nothing_is_refused(last: int | None, since_s: float | None
 
 
 def readings(count: int, newest_s: float = 0.0, topic: str = "sensor/range") -> list[Reading]:
-    """One a second."""
+    """Return readings with one second between them."""
     return [
         Reading(f"fleet/red/{topic}", NOW - timedelta(seconds=newest_s + count - 1 - each), pb.Range(seq=each))
         for each in range(count)
@@ -239,9 +239,9 @@ def test_what_one_answer_lost_another_has() -> None:
         (1500, 2000, None, ["fleet/red/sensor/range: 1500 of 2000, its gateway keeps the last 1500"]),
         (1500, None, 1499.0, []),
         (1500, None, 2000.0, ["fleet/red/sensor/range: goes back 1499.0 s of 2000 s, its gateway keeps the last 1500"]),
-        (40, None, 2000.0, []),  # it may have begun then, or measured nothing
+        (40, None, 2000.0, []),  # the car may have begun then, or measured nothing before
         (40, 100, 60.0, []),
-        (1500, 1500, 2000.0, []),  # there are as many as were asked
+        (1500, 1500, 2000.0, []),  # all requested readings are there
     ],
 )
 def test_what_is_said_of_less(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""A lease: the car is stopped and given back on any exit, and who lost it is told by whom, never driving on."""
+"""A lease: any exit stops and releases the car. The error of a lost lease names the person who took the car."""
 
 import asyncio
 import signal
@@ -18,7 +18,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, driving, freeze, wait_for
 
-# ---------------------------------------------------------------- whether it is ours
+# ---------------------------------------------------------------- the state of a lease
 
 
 def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "") -> pb.Safety:
@@ -37,16 +37,16 @@ def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "
     ("heard", "lost"),
     [
         ([safety()], ""),
-        ([safety("mia")], ""),  # from before we had it
+        ([safety("mia")], ""),  # from before our lease
         ([safety("mia"), safety("bot")], ""),
-        ([safety("bot"), safety()], ""),  # it lapsed: nobody else has it
+        ([safety("bot"), safety()], ""),  # expired, and no other sender has it
         ([safety("bot"), safety("mia")], "red was taken by mia (person)"),
         ([safety("bot"), safety("mia"), safety("bot")], "red was taken by mia (person)"),  # lost stays lost
-        ([safety("bot", hold="mia")], ""),  # from before we had it
+        ([safety("bot", hold="mia")], ""),  # from before our lease
         ([safety("bot", hold="mia"), safety("bot", hold="mia")], ""),
         ([safety("bot"), safety("bot", hold="mia")], "red was stopped by mia"),
         ([safety("bot", hold="mia"), safety("bot"), safety("bot", hold="mia", since_s=2)], "red was stopped by mia"),
-        ([safety("bot"), safety("bot", hold="bot")], ""),  # we did
+        ([safety("bot"), safety("bot", hold="bot")], ""),  # our own stop
         ([safety("bot"), safety("bot", hold="mia", estop="mia")], "red was e-stopped by mia"),
     ],
 )
@@ -62,7 +62,7 @@ def test_what_was_published_before_is_no_news_when_it_comes_late() -> None:
     for seq, message in enumerate(told, start=1):
         message.boot_id, message.seq = "a", seq
     before, had, taken = told
-    ours.on_safety(had)  # it was asked for
+    ours.on_safety(had)  # the answer to our query
     ours.on_safety(before)
     assert not ours.lost
     ours.on_safety(taken)
@@ -93,11 +93,11 @@ def fleet(cars: Cars) -> Iterator[Fleet]:
 
 
 TAKEN = r"{} (was taken|is driven) by mia \(person\)"
-"""As it was published, or as what is asked for meanwhile is refused: either may be here first."""
+"""Message of a published takeover, or of a rejected command meanwhile. Either may arrive first."""
 
 
 PAUSED_S = 2.5
-"""Longer than an answer is waited for once."""
+"""A pause longer than the timeout of one query."""
 
 
 def holder(cars: Cars, car: str) -> str:
@@ -141,7 +141,7 @@ def test_a_mode_ends_with_the_block(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease() as car:
         car.mode("tracking")
         wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "red tracks")
-    # The gateway reckons with how long the mode is deaf, not with a car whose process was held up meanwhile.
+    # The gateway's limit covers the time in which the mode is deaf, not a stall of the car's process.
     wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "its mode has ended")
     assert not driving(cars.sim, "red")
 
@@ -174,13 +174,13 @@ def test_a_person_takes_a_car_and_keeps_it(fleet: Fleet, cars: Cars) -> None:
 
 
 def go_on(car: Car) -> None:
-    """Ask for one thing after the other until that raises."""
+    """Send commands until one fails, because the lease is lost."""
     wait_for(lambda: not car.led(1, 2, 3).ok, "the lease is lost")
 
 
 @pytest.mark.parametrize("late", ["nothing", "what is published", "what is asked for, too"])
 def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: str) -> None:
-    """Late: what its gateway publishes comes too late, or the gateway answers only after some seconds."""
+    """`late`: the publications of its gateway arrive too late, or the gateway also answers only after some seconds."""
     paused = threading.Timer(PAUSED_S, lambda: cars.gateways["blue"].popen.send_signal(signal.SIGCONT))
 
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
@@ -208,7 +208,7 @@ def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: 
             await drive
 
         async def driven(car: AsyncCar) -> None:
-            while True:  # a drive that arrives half a second old is refused, see `asked`
+            while True:  # the gateway rejects a drive that is half a second old, see `asked`
                 with pytest.raises(NotCarriedOut) as refused:
                     await car.drive("forward", LONG_S)
                 if refused.value.outcome.reason != "stale":

@@ -1,4 +1,4 @@
-"""What a command's answer and events, in any order, say became of it."""
+"""The outcome of a command, by its answer and events in any order."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
 from tests.support.message_length import MAX_LINES, count_lines
 
-# Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
+# Each step: ("answer" | "event", phase, worst case), at 1, 2, 3 ... s after the request at 100.
 Steps = list[tuple[str, str, float]]
 
 
@@ -30,7 +30,7 @@ def told(until: Until, steps: Steps, lasts_s: float = 0.0) -> Progress:
         (Until.SENT, [("event", "asked", 0.0), ("event", "queued", 0.0), ("event", "expired", 0.0)], "expired", False),
         (Until.SENT, [("event", "sent", 0.0), ("answer", "queued", 0.0)], "sent", True),
         (Until.SENT, [("answer", "queued", 0.0), ("event", "superseded", 0.0)], "superseded", False),
-        (Until.STOPPED, [("answer", "sent", 0.0)], "sent", True),  # it was at rest
+        (Until.STOPPED, [("answer", "sent", 0.0)], "sent", True),  # the car was at rest
         (Until.STOPPED, [("answer", "sent", 1.0), ("event", "complete", 0.0)], "complete", True),
         (Until.STOPPED, [("answer", "queued", 1.0), ("event", "sent", 0.0), ("event", "failed", 0.0)], "failed", False),
         (Until.OVER, [("answer", "queued", 0.0), ("event", "sent", 0.0), ("event", "complete", 0.0)], "complete", True),

@@ -1,4 +1,4 @@
-"""Readings out of samples, and what a reader that is too slow gets of a stream."""
+"""Readings made of samples, and the readings that a slow reader of a stream gets."""
 
 import asyncio
 import re
@@ -93,7 +93,7 @@ async def test_so_does_an_async_reader() -> None:
         assert readings.hand_over(sample(seq))
         await asyncio.sleep(0)
     for _ in range(3):
-        await asyncio.sleep(0)  # the last is on its way through the loop
+        await asyncio.sleep(0)  # let the loop deliver the last reading
     assert [(await anext(readings)).value.seq for _ in range(READING_QUEUE_LIMIT)] == list(
         range(101, READING_QUEUE_LIMIT + 101)
     )

@@ -1,4 +1,4 @@
-"""A script that does not close its Fleet ends, with a ResourceWarning, and takes its token with it."""
+"""A script that does not close its Fleet ends with a ResourceWarning, and its token ends with it."""
 
 import os
 import subprocess

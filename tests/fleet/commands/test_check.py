@@ -1,4 +1,4 @@
-"""`fleet check` recognizes fleet files, plans and worlds, and a fleet file's plan and world are checked with it."""
+"""`fleet check` recognizes fleet files, plans and worlds. It checks plan and world together with their fleet file."""
 
 import json
 from pathlib import Path

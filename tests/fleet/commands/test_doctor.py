@@ -1,4 +1,4 @@
-"""`fleet doctor` as it is called, on real gateways and on a real recording."""
+"""The command `fleet doctor` on real gateways and on a real recording."""
 
 import json
 from pathlib import Path

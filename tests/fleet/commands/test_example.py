@@ -1,4 +1,4 @@
-"""`fleet example`: what comes with the package can be listed, shown and copied."""
+"""`fleet example` lists, prints and copies the examples of the package."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`fleet init, check, bind, schema`, in a process at a terminal where they ask; with simulated cars on real PTYs."""
+"""`fleet init, check, bind, schema` with simulated cars on real PTYs. Commands that ask run at a terminal."""
 
 import fcntl
 import io
@@ -38,7 +38,7 @@ def endpoint() -> str:
 
 @pytest.fixture
 def command(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run `fleet ...` to its end, in a directory of its own, with nobody to answer."""
+    """Return a function that runs `fleet ...` to its end, in a directory of its own, without a terminal."""
 
     def run(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
         with monkeypatch.context() as here:
@@ -54,7 +54,7 @@ def command(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> C
 
 @pytest.fixture
 def terminal(tmp_path: Path, endpoint: str) -> Iterator[Callable[..., Terminal]]:
-    """Start `fleet ...` at a terminal."""
+    """Yield a function that starts `fleet ...` at a terminal."""
     started: list[Terminal] = []
 
     def start(*arguments: str) -> Terminal:
@@ -68,7 +68,7 @@ def terminal(tmp_path: Path, endpoint: str) -> Iterator[Callable[..., Terminal]]
 
 
 class Port:
-    """A serial port that says nothing, and what was written to it."""
+    """A silent serial port, and the bytes written to it."""
 
     def __init__(self) -> None:
         self._controller, self.device = pty.openpty()
@@ -103,7 +103,7 @@ def tcp() -> Iterator[TcpCar]:
 
 @pytest.fixture
 def simulate(tmp_path: Path, endpoint: str) -> Iterator[Callable[..., GatewayProcess]]:
-    """Simulated cars on terminals of their names in the directory."""
+    """Yield a function that starts simulated cars on PTYs of their names in the directory."""
     started: list[GatewayProcess] = []
 
     def begin(*cars: str) -> GatewayProcess:

@@ -1,4 +1,4 @@
-"""`fleet down`: how long it waits for a supervisor."""
+"""Time for which `fleet down` waits for a supervisor."""
 
 import threading
 from typing import Any
@@ -36,7 +36,7 @@ def test_a_supervisor_whose_token_is_gone_for_a_moment_has_not_ended(monkeypatch
         for _ in range(3):
             token = theirs.token(TOKEN)
             wait_for(lambda: ours.tokens(TOKEN), "the token")
-            down.thread.join(3 * lifecycle.FLEET_DOWN_POLL_S)  # it looks for the token, too
+            down.thread.join(3 * lifecycle.FLEET_DOWN_POLL_S)  # the command also queries the token
             token.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
             down.thread.join(1.0)
             assert down.thread.is_alive()

@@ -1,4 +1,4 @@
-"""What `fleet list` shows of a car that is not heard, or whose bytes are not those of its platform."""
+"""`fleet list` with a silent car, and with a car of another platform than configured."""
 
 import sys
 from datetime import UTC, datetime

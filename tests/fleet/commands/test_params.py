@@ -85,7 +85,7 @@ def place(tmp_path: Path) -> Path:
         session = tmp_path / "sessions" / name
         session.mkdir(parents=True)
         (session / "session.json").write_text("{}")
-        os.utime(session, (1_000_000 + number, 1_000_000 + number))  # in 1970: only `cut` counts by it
+        os.utime(session, (1_000_000 + number, 1_000_000 + number))  # in 1970, a time that only `cut` uses
     (tmp_path / "sessions" / "empty").mkdir()
     return tmp_path / "sessions"
 

@@ -22,7 +22,7 @@ SHELLS = {
     "zsh": ("zsh -f", 'autoload -Uz compinit; compinit -u; eval "$(_FLEET_COMPLETE=zsh_source fleet)"'),
     "fish": ("fish --no-config -i", "_FLEET_COMPLETE=fish_source fleet | source"),
 }
-"""How each shell starts without the files of its user, and the line that sets completion up."""
+"""The command that starts each shell without the user's files, and the line that sets completion up."""
 TYPED = "fleet dri\tred,bl\t@l\tforw\t"
 WHOLE = "fleet drive red,blue @lab forward"
 BEGIN_OF_LINE = "\x01"
@@ -31,7 +31,7 @@ GROUPS_KEY = "fleet/@supervisor/status"
 
 @pytest.mark.parametrize("shell", ["bash", *(pytest.param(each, marks=pytest.mark.soak) for each in ("zsh", "fish"))])
 def test_tab_completes_commands_cars_groups_and_motions(shell: str, tmp_path: Path) -> None:
-    """The groups are those of the running fleet: there is no fleet file here."""
+    """The groups come from the running fleet, because there is no fleet file here."""
     if shutil.which(shell) is None:
         pytest.skip(f"needs {shell}")
 
@@ -55,7 +55,7 @@ def test_tab_completes_commands_cars_groups_and_motions(shell: str, tmp_path: Pa
             tries = iter(range(100))
 
             def completed() -> bool:
-                """Type it once more: a busy machine completes no names in 0.3 s, and one presses Tab again."""
+                """Type the line again. If no names come within 0.3 s on a busy machine, a person presses Tab again."""
                 number = next(tries)
                 terminal.type(f"{TYPED}{BEGIN_OF_LINE}echo {number}-")
                 found = re.compile(rf"^{number}-(fleet.*?) *$", re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Conditions: what they mean, what is said of the ones that mean nothing, and which can never be true."""
+"""Conditions: their meaning, the messages about invalid ones, and the ones that can never be true."""
 
 import contextlib
 import math
@@ -185,7 +185,7 @@ def test_a_number_that_is_none_was_not_measured_and_a_wrong_type_is_the_callers_
         ("'a' == 'b'", True),
         ("'a' != 'b'", False),
         ("false", True),
-        (" and ".join(["(range_m < 1 or range_m > 2)"] * 12 + ["false"]), False),  # more ways than are looked at
+        (" and ".join(["(range_m < 1 or range_m > 2)"] * 12 + ["false"]), False),  # more alternatives than the limit
     ],
 )
 def test_what_can_never_be_true(text: str, never: bool) -> None:
@@ -198,7 +198,7 @@ def test_two_conditions_make_one() -> None:
     assert is_contradictory(parse("range_m < 1", NAMES) & parse("range_m > 1", NAMES))
 
 
-# ---------------------------------------------------------------------- against a second opinion
+# ---------------------------------------------------------------------- against a reference
 
 _numbers = st.one_of(st.integers(-5, 5), st.floats(-3, 3), st.sampled_from([0.25, 1e22, -1e-9, 2**64]))
 _words = st.text(st.characters(codec="utf-8", exclude_characters="\n\"'"), max_size=4) | st.just("it's")
@@ -259,7 +259,7 @@ _OPS: dict[str, Any] = {
 
 
 def _reference(node: Node, values: dict[str, Any]) -> Any:
-    """Kleene's tables, written another way: as least, most and complement of 0, 1/2, 1."""
+    """Return the value by Kleene's tables, written as minimum, maximum and complement of 0, 1/2, 1."""
     if isinstance(node, Literal):
         return float(node.value) if isinstance(node.value, bool) else node.value
     if isinstance(node, Name):

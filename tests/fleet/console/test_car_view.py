@@ -1,4 +1,4 @@
-"""What a page shows of a car, from its messages."""
+"""The view of a car on a page, by the car's messages."""
 
 from fleet.console.car_view import BatteryTrend, FleetView
 from gateway.protocol.platforms import parse_platform

@@ -56,7 +56,7 @@ def test_a_frame_that_comes_before_the_event_of_its_command_is_shown() -> None:
     ledger = CommandLedger()
     for number in range(MAX_COMMANDS):
         ledger.on_frame(pb.TxFrame(command_id=f"no event {number}", data=b"x", written=True))
-    ledger.on_frame(pb.TxFrame(data=b"x", written=True))  # of no command
+    ledger.on_frame(pb.TxFrame(data=b"x", written=True))  # a frame of no command
     ledger.on_frame(pb.TxFrame(command_id="a", data=b"$0#", written=True))
     ledger.on_event(event("asked"))
     ledger.on_frame(pb.TxFrame(command_id="a", data=b"$1#", written=True))

@@ -22,7 +22,7 @@ async def _app(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 def call(kind: str, path: str, headers: dict[str, str], method: str = "GET") -> list[Any]:
-    """What the guard sends to one request."""
+    """Return the messages that the guard sends for one request."""
     sent: list[Message] = []
     refusals: list[str] = []
     guard = Guard(_app, hosts=HOSTS, cookie="console", token=TOKEN, on_refusal=refusals.append)
@@ -40,7 +40,7 @@ def call(kind: str, path: str, headers: dict[str, str], method: str = "GET") -> 
 
 
 def but(**changes: str | None) -> dict[str, str]:
-    """Our page's headers with these changes. None leaves a header out."""
+    """Return our page's headers with these changes. None leaves a header out."""
     return {name: value for name, value in (OURS | changes).items() if value is not None}
 
 

@@ -1,4 +1,4 @@
-"""What a page says of a person, an action and a car is what the gateway decides: both sides in one table."""
+"""The page shows the gateway's decision about a person, an action and a car. One table compares both."""
 
 import itertools
 from collections.abc import Iterator
@@ -67,15 +67,15 @@ ASKED: dict[str, tuple[Action, ...]] = {
     "end_loan": (EndLoan(),),
 }
 RULES = {"leased", "lent", "not_allowed", "paused", "held", "estopped"}
-"""Reasons about who may do what. All others are about the car."""
+"""Reasons about rights. All others are about the car."""
 
 
 def cars() -> Iterator[tuple[arbiter.CommandContext, CarRules]]:
-    """Each state of a car: as its gateway has it, and as the console reads it in state/safety."""
+    """Yield each state of a car: the gateway's own, and the console's by state/safety."""
     control = Workbench().control
     for people, estops, hold, pause, lease, loan in itertools.product(TABLES, ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
         if lease is not None and lease.kind is LEAD and not people.leads:
-            continue  # no lease outlives the gateway that gave it, nor its people
+            continue  # a lease ends with its gateway, and so with the gateway's people
         control.people, safety = people, Safety(hold)
         control.safety = safety
         for estop in estops:
@@ -92,7 +92,7 @@ def cars() -> Iterator[tuple[arbiter.CommandContext, CarRules]]:
 
 
 def decided(context: arbiter.CommandContext, sender: str, action: Action) -> str | None:
-    """The rule by which the gateway refuses; None if it does not, or for another reason."""
+    """Return the rule of RULES by which the gateway rejects an action, None if it has another reason or accepts."""
     ranked = context.people.ranked(Sender(sender, PERSON))
     refusal = arbiter.refuse(Command("1", "any", ranked, action, take=isinstance(action, TakeLease)), context)
     return str(refusal[0]) if refusal is not None and str(refusal[0]) in RULES else None

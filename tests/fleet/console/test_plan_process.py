@@ -9,7 +9,7 @@ from tests.support.processes import FleetProcesses
 
 
 async def nobody_answers() -> None:
-    """Ask a coordinator that is not there."""
+    """Query a coordinator that does not exist."""
 
 
 async def test_what_keeps_a_coordinator_from_starting_is_reported(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def test_a_press_without_an_echo_ends_after_the_gap_and_stays_over() -> None:
 
 
 def test_an_echo_after_the_gap_does_not_count_even_if_nothing_has_expired_it() -> None:
-    """Our own loop was blocked: the echoes that waited are handled before `expire`."""
+    """If our own loop was blocked, it handles the pending echoes before `expire`."""
     book, _ = book_with_press()
     late = book.tick(10.0 + MAX_ECHO_GAP_S + 0.1)
     assert book.echo(1, 1, late, 10.0 + MAX_ECHO_GAP_S + 0.1) is None
@@ -46,7 +46,7 @@ def test_an_echo_after_the_gap_does_not_count_even_if_nothing_has_expired_it() -
 
 
 def test_the_echo_of_an_old_tick_does_not_count() -> None:
-    """A healed link delivers a burst. So does a thawed page."""
+    """A restored link delivers a burst, and so does a resumed page."""
     book, first = book_with_press()
     book.tick(10.1)
     assert book.echo(1, 1, first, 9.99 + MAX_TICK_AGE_S) is not None
@@ -99,7 +99,7 @@ def test_a_stop_ends_every_press_and_the_next_one_waits() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(["tick", "echo", "late echo", "release", "expire"]), st.floats(0.0, 0.5))))
 def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
-    """Whatever comes in whatever order: no echo counts after a gap, and no press lives through one."""
+    """In any order of events, no echo counts after a gap, and no press outlives a gap."""
     book, newest = book_with_press()
     now, last_echo, over = 10.0, 10.0, False
     ticks = {newest: 10.0}

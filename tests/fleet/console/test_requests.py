@@ -1,4 +1,4 @@
-"""Messages of pages: each value is checked, and what is wrong is refused."""
+"""Messages of pages: the console checks each value, and rejects invalid ones."""
 
 import contextlib
 import json

@@ -34,9 +34,9 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
 PEOPLE = ("teacher:lead", "mia", "thief")
-"""Who may drive red."""
+"""The people who may drive red."""
 WARM_UP = 2000
-"""Connections until TLS and the allocator have what they keep: 17 MB with the first thousand, then about 1."""
+"""Connections until TLS and the allocator need no more memory. The first thousand take 17 MB, the next one about 1."""
 MAX_GROWTH_MB_PER_THOUSAND = 2.0
 
 
@@ -55,27 +55,27 @@ class ServerStage:
         self.person = Client(fleet.endpoint, sender="mia", kind="person")
 
     def run(self, *arguments: str) -> str:
-        """Run `fleet console ...`; its output."""
+        """Run `fleet console ...`; return its output."""
         done = CliRunner().invoke(cli, ["console", *arguments], env=self.fleet.environment)
         assert done.exit_code == 0, done.output
         return done.output
 
     def code(self, *arguments: str) -> str:
-        """A new pairing code."""
+        """Return a new pairing code."""
         return self.run("pair", *arguments).split(" type ")[1][:9]
 
     def device(self, *arguments: str) -> NetworkDevice:
-        """A paired device."""
+        """Return a paired device."""
         made = NetworkDevice(self.lan_port)
         assert made.pair(self.code(*arguments))["ok"]
         return made
 
     def drive(self) -> None:
-        """Another person drives red."""
+        """Drive red as another person."""
         wish = replace(drive_request("forward", 10.0, wait=False), take=True)
         while not (outcome := self.person.ask(wish, ["red"])[0]).ok:
             assert outcome.reason == "held", outcome
-            time.sleep(0.6)  # a gateway wants a pause after a stop
+            time.sleep(0.6)  # after a stop, the gateway rejects a stream that does not pause
         wait_for(lambda: self.judge.driving, "red drives")
 
     def rest(self) -> None:
@@ -85,7 +85,7 @@ class ServerStage:
             wait_for(lambda: not self.judge.driving, "red stands")
 
     def log(self) -> str:
-        """What the console has logged."""
+        """Return the log of the console."""
         return self.console.process.stderr
 
 
@@ -105,9 +105,9 @@ def stage(stages: ServerStage) -> Iterator[ServerStage]:
 
 
 def answer(port: int, verb: str, path: str, body: str | None = None, **headers: str) -> tuple[int, bytes]:
-    """Ask the console; its status and its text."""
+    """Send a request to the console; return status and text."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-    with contextlib.suppress(ConnectionError):  # it refuses a large body before its end
+    with contextlib.suppress(ConnectionError):  # the console rejects a large body before its end
         connection.request(verb, path, body, headers)
     response = connection.getresponse()
     found = response.status, response.read()
@@ -162,7 +162,7 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
     assert stage.judge.driving
     assert device.ask("POST", "/stop")[0] == 204
     wait_for(lambda: not stage.judge.driving, "red stands")
-    # Only leads and this computer see who is paired, and pair others.
+    # Only leads and this computer see the paired devices, and pair new ones.
     assert json.loads(device.ask("GET", "/people")[1]) == {"may_pair": False, "lan": None}
     assert device.ask("POST", "/people", '{"t": "pair", "name": "x", "rank": "lead"}')[0] == 403
     listed = json.loads(teacher.ask("GET", "/people")[1])["lan"]
@@ -174,7 +174,7 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
 
 
 def book_file(stage: ServerStage) -> PeopleFile:
-    """The file of the paired devices."""
+    """Return the file of the paired devices."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FLEET_STATE_DIR", stage.fleet.environment["FLEET_STATE_DIR"])
         return PeopleFile(people_path(stage.fleet.endpoint, "fleet"))
@@ -196,7 +196,7 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
         assert next_message(page, "rights")["manage"] == "Only a lead may (teacher)."
         page.send(json.dumps({"t": "plan", "id": 7, "verb": "stop"}))
         assert next_message(page, "plan_done")["words"] == "Only a lead may (teacher)."
-        page.send(json.dumps({"t": "pause", "id": "p1", "why": "x"}))  # no page may read that all cars were stopped
+        page.send(json.dumps({"t": "pause", "id": "p1", "why": "x"}))  # the page may not claim that all stopped
         assert next_message(page, "bad")["words"] == "Only a lead may (teacher)."
     for path in ("/recording/status", "/recording/mark", "/plan/check"):
         assert driver.ask("POST", path, plan)[0] == 200, "for everyone"
@@ -218,7 +218,7 @@ def test_a_plan_is_set_under_the_persons_name_also_without_an_open_page(stage: S
         for open_page in (False, True):
             with teacher.socket() if open_page else contextlib.nullcontext() as page:
                 if page is not None:
-                    page.recv()  # it has joined
+                    page.recv()  # the page has joined
                 status, text = teacher.ask("POST", "/plan/set", "roles:\n  guide: {mode: tracking}\n")
             assert (status, json.loads(text)) == (200, {"ok": True, "words": "it is in force"})
     finally:
@@ -240,7 +240,7 @@ def test_a_stop_has_its_persons_name_also_without_an_open_page(stage: ServerStag
 
 
 def next_message(page: ClientConnection, kind: str) -> Any:
-    """The next message of this kind that a page gets."""
+    """Wait for the next message of this kind to a page, and return it."""
     while (found := json.loads(page.recv(timeout=30)))["t"] != kind:
         pass
     return found
@@ -255,7 +255,7 @@ def hold(stage: ServerStage, page: ClientConnection) -> threading.Thread:
 
 
 def press_until_closed(page: ClientConnection) -> None:
-    """Press forward, echo each tick, and press again if that press ends: a gateway wants a pause after a stop."""
+    """Press forward and echo each tick. If the press ends, press again: a gateway requires a pause after a stop."""
     press, again_at = 0, -1.0
     fields = {"cars": ["red"], "motion": "forward"}
     with contextlib.suppress(ConnectionClosed):
@@ -324,7 +324,7 @@ def test_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) -> None:
         try:
             connection.request("POST", "/pair", f"AAAA{number:04}", {"Origin": stranger.origin})
             response = connection.getresponse()
-        except (http.client.HTTPException, OSError):  # a stranger's connection lasts for ten seconds
+        except (http.client.HTTPException, OSError):  # an unpaired connection lasts for ten seconds
             connection.close()
             continue
         statuses.append(response.status)
@@ -345,7 +345,7 @@ def test_a_cookie_at_two_addresses_is_logged(stage: ServerStage) -> None:
     thief = NetworkDevice(stage.lan_port, source="127.0.0.5")
     thief.cookie = device.cookie
     with device.socket() as page:
-        page.recv()  # it has joined
+        page.recv()  # the page has joined
         thief.ask("GET", "/hello")
         wait_for(lambda: "in use at 127.0.0.5, 127.0.0.1" in stage.log(), "the warning")
 
@@ -371,7 +371,7 @@ def test_what_is_too_large_or_elsewhere_is_refused(stage: ServerStage, where: st
 
 
 def loopback_cookie(stage: ServerStage) -> str:
-    """The cookie of a page of this computer."""
+    """Return the cookie of a page of this computer."""
     connection = http.client.HTTPConnection("127.0.0.1", stage.console.port, timeout=30)
     connection.request("GET", "/hello")
     found = str(connection.getresponse().getheader("set-cookie"))
@@ -380,7 +380,7 @@ def loopback_cookie(stage: ServerStage) -> str:
 
 
 def loopback_socket(stage: ServerStage) -> ClientConnection:
-    """A page of this computer."""
+    """Open the socket of a page of this computer."""
     address = f"ws://127.0.0.1:{stage.console.port}/ws"
     headers = {"Cookie": loopback_cookie(stage)}
     return connect(address, origin=Origin(stage.console.address), additional_headers=headers, proxy=None)
@@ -402,13 +402,13 @@ def test_floods_and_half_open_connections_stop_no_stop(stage: ServerStage) -> No
         for each in half_open[60:]:
             each.sendall(b"POST /stop HTTP/1.1\r\nHost: ")
         stage.drive()
-        # Over a socket that was open before, and by a request of its own: both go on.
+        # A socket that was open before and a new request both work.
         page.send(json.dumps({"t": "stop", "id": "one"}))
         wait_for(lambda: not stage.judge.driving, "red stands")
         stage.drive()
         assert device.ask("POST", "/stop")[0] == 204
         wait_for(lambda: not stage.judge.driving, "red stands")
-        # A stranger's connection on the network ends after ten seconds, also if it never began TLS.
+        # An unpaired connection on the network ends after ten seconds, also if it never began TLS.
         for each in half_open[:60]:
             each.settimeout(30)
             with contextlib.suppress(ConnectionError):
@@ -417,7 +417,7 @@ def test_floods_and_half_open_connections_stop_no_stop(stage: ServerStage) -> No
             each.close()
         sizes_mb = []
         for number in range(40):
-            # Memory follows the connections that are open at once. So each hundred waits for the last one.
+            # Memory depends on the number of open connections. So each hundred waits for the one before.
             wait_for(lambda: server.num_fds() <= settled_fds + 5, "all are closed")
             if number % 10 == 9:
                 sizes_mb.append(server.memory_info().rss / 1e6)
@@ -466,12 +466,12 @@ def test_a_second_console_says_where_the_first_is_and_another_port_works(stage: 
     assert second.process.end() == 0
 
 
-def test_a_page_starts_a_plan_where_none_runs(stage: ServerStage) -> None:  # the last one: its coordinator stays
+def test_a_page_starts_a_plan_where_none_runs(stage: ServerStage) -> None:  # the last test: its coordinator stays
     teacher = stage.device("teacher", "--rank", "lead")
     plan = "roles:\n  guide: {mode: manual}\n"
     status, text = teacher.ask("POST", "/plan/set", plan)
     assert (status, json.loads(text)["ok"]) == (200, True), text
     with teacher.socket() as page:
-        while not (shown := next_message(page, "plan"))["running"]:  # its token comes later than its answer
+        while not (shown := next_message(page, "plan"))["running"]:  # the token may arrive after the answer
             pass
     assert (shown["plan"]["text"], shown["plan"]["set_by"].partition("@")[0]) == (plan, "teacher")

@@ -1,4 +1,4 @@
-"""Which names are sessions of the folder, and what a download holds."""
+"""The names that are sessions of the folder, and the contents of a download."""
 
 import io
 import zipfile
@@ -12,7 +12,7 @@ from fleet.recording.session_dir import SPARE_FILE
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with one session of two files, beside a secret."""
+    """Make a folder with one session of two files, beside a secret."""
     folder = tmp_path / "sessions"
     for directory in (folder / "one", tmp_path / "secret"):
         directory.mkdir(parents=True)

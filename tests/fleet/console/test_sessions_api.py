@@ -1,4 +1,4 @@
-"""The routes of the sessions page without a browser: recordings are served, and no path leads out of their folder."""
+"""The routes of the sessions page without a browser. They serve recordings, and no path leads out of the folder."""
 
 import http.client
 import io
@@ -25,7 +25,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
 
 
 def answer(port: int, verb: str, path: str, body: str = "", **headers: str) -> tuple[int, bytes]:
-    """Ask the console; its status and its text."""
+    """Send a request to the console; return status and text."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S * 2)
     connection.request(verb, path, body, headers)
     response = connection.getresponse()
@@ -35,7 +35,7 @@ def answer(port: int, verb: str, path: str, body: str = "", **headers: str) -> t
 
 
 def cookie_of(port: int) -> str:
-    """The cookie that the console gives to its own pages."""
+    """Return the cookie of the console's own pages."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S * 2)
     connection.request("GET", "/hello")
     found = connection.getresponse().getheader("Set-Cookie") or ""

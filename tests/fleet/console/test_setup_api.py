@@ -1,4 +1,4 @@
-"""The routes of the set-up page without a browser: what is written, and what is not."""
+"""The routes of the set-up page without a browser, and the files that they write."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`fleet plan run` as a process, with real gateways: a plan is kept, and never against a hold."""
+"""`fleet plan run` as a process with real gateways. It enforces a plan, but never against a hold."""
 
 import json
 import re
@@ -29,7 +29,7 @@ STARTED: list[GatewayProcess] = []
 
 
 class Lines:
-    """What a coordinator has decided, for each car in order: which of two cars is decided first is chance."""
+    """The decisions of a coordinator, for each car in order. The order between two cars is random."""
 
     def __init__(self, process: GatewayProcess) -> None:
         self.process = process
@@ -42,7 +42,7 @@ class Lines:
                 return line
 
     def _next(self, car: str) -> Any:
-        """The next line of this car; those of others are kept for when they are asked for."""
+        """Return the next line of this car. Store the lines of other cars for later calls."""
         if passed := self._passed.get(car):
             return passed.pop(0)
         while (line := self.process.line())["car"] != car:
@@ -59,7 +59,7 @@ def coordinator(cars: Cars, path: Path, plan: str = PLAN, *more: str) -> Gateway
 
 @pytest.fixture(autouse=True)
 def none_outlives_its_test() -> Iterator[None]:
-    """There is one at a time: that of a test that failed would fail all that follow."""
+    """End the coordinator of a failed test. There is one at a time, so it would fail all later tests."""
     yield
     while STARTED:
         STARTED.pop().end()
@@ -77,12 +77,12 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     lines.until("red", "tracking", "role tracking")
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
-        # Someone's stop: the coordinator leaves the car alone, also when its mode is not the planned one.
+        # A person stops the car. The coordinator leaves it alone, also if its mode is not the planned one.
         assert client.car("red").stop().ok
         held = lines.until("red", None, "on hold by ann")
         assert held["would_change"].endswith(" resumes it (`fleet resume red`)")
         assert client.get("red/state/mode")[0].value.asked == "manual"
-        # The end of the hold: the mode is asked for again.
+        # The hold ends. The coordinator requests the mode again.
         assert client.car("red").resume().ok
         lines.until("red", "tracking", "role tracking")
         wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
@@ -95,7 +95,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         assert client.car("green").drive("stop").ok
         drive.join()
         lines.until("red", "tracking", "role tracking")
-        # A gateway that comes back: its car is brought to its mode again.
+        # A gateway comes back. The coordinator brings its car to its mode again.
         assert cars.gateways["red"].end() == 0
         lines.until("red", None, "not on the bus")
         cars.gateways["red"] = cars.serve("red")
@@ -313,7 +313,7 @@ def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_ove
         assert all(each in answer.words for each in expected), answer.words
     (in_force,) = cars.get("fleet/@coordinator/plan")
     assert in_force.text == "roles: {scout: {mode: tracking}}"
-    # A role of the fleet file that the plan does not have may be a typo of either: it is told, and no more.
+    # A role of the fleet file that is not in the plan may be a typo. The coordinator only reports it.
     (sample,) = cars.bus.query(key, payload=b"roles: {scouts: {mode: manual}}", timeout_s=5.0)
     assert isinstance(sample, bus.Sample)
     answer = sample.message()
@@ -324,7 +324,7 @@ def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_ove
 
 
 def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
-    # The coordinator of the test before may have asked for a mode that red still changes to.
+    # The coordinator of the test before may have requested a mode that red still opens.
     wait_for(lambda: cars.state("safety", "red").trust != "stopping", "red changes no mode")
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     Lines(process).until("red", "tracking", "role scout")
@@ -342,14 +342,14 @@ def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Car
     wait_for(lambda: not cars.bus.tokens("fleet/@coordinator"), "its token is gone")
     following = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     Lines(following).until("red", "tracking", "role scout (1 of 1): it had it before")
-    # What it has asked for would have come before what is asked for now.
+    # A request of the coordinator would arrive before this stop.
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         assert client.car("blue").stop().ok
     Lines(following).until("blue", None, "on hold by ann")
 
     def told() -> list[Any]:
         events: list[Any] = [sample.message() for sample in asked]
-        # What became of a command of the first may be told late.
+        # Events of the first coordinator's commands may arrive late.
         return [each for each in events if not each.sender.endswith(f"-{process.pid}")]
 
     wait_for(told, "the stop is heard here, too")

@@ -30,7 +30,7 @@ KEY = "fleet/@coordinator/@cmd/plan"
 
 @dataclass
 class Started:
-    """A coordinator on a thread, what it decides, and what it says; `broken`: what takes its words fails."""
+    """A coordinator on a thread, its decisions, and its messages. `broken`: the receiver of its messages fails."""
 
     processes: Processes
     decided: "queue.Queue[Decision]" = field(default_factory=queue.Queue)
@@ -51,12 +51,12 @@ class Started:
             raise RuntimeError("nobody foresaw it")
 
     def ask(self, payload: bytes) -> Any:
-        """Ask for another plan; return the result, or the error's words."""
+        """Request another plan. Return the result, or the text of the error."""
         (answer,) = self.processes.bus.query(KEY, payload=payload, timeout_s=10.0)
         return answer.words if isinstance(answer, Failure) else answer.message()
 
     def goes_on(self, plan: str) -> None:
-        """Give it another plan, which it follows."""
+        """Set another plan, and check that the coordinator follows it."""
         assert self.ask(plan.encode()).status == "sent"
         while self.decided.get(timeout=PATIENCE_S).subject != "role further":
             pass
@@ -85,7 +85,7 @@ def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -
     logged: list[Sample] = []
     started.processes.bus.subscribe("fleet/@coordinator/log", logged.append)
     started.broken = True
-    words = started.ask(b"fixed: {purple: {mode: manual}}")  # its warning meets what is broken
+    words = started.ask(b"fixed: {purple: {mode: manual}}")  # its warning goes to the broken receiver
     started.broken = False
     assert isinstance(words, str)
     assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: RuntimeError at test_guard.py:")
@@ -140,7 +140,7 @@ def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> N
 
 
 def test_a_decision_is_persisted_before_it_is_published(started: Started) -> None:
-    """Else a coordinator killed at that moment leaves commands that the next one does not know of."""
+    """Otherwise a coordinator that is killed at that moment leaves commands that the next one does not know."""
     assert started.ask(PHASES.encode()).status == "sent"
     wait_for(lambda: len(started.persisted) == 2, "both phases are decided")
     assert started.persisted == [("work", "work"), ("done", "done")]

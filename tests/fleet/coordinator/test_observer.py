@@ -1,4 +1,4 @@
-"""What the coordinator has heard of the cars, what it must still ask for, and what it forgets."""
+"""The coordinator's observations of cars, its pending queries, and the cars that it forgets."""
 
 import pytest
 
@@ -65,7 +65,7 @@ def test_a_car_that_is_back_within_the_minute_is_not_forgotten() -> None:
 
 
 def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgotten() -> None:
-    """Of which nothing is said; that say a word, or how they are, and go; and one that is not on the bus."""
+    """Most names have only a token, some also a state, and one is not on the bus. All of them disappear."""
     plan = parse("roles: {scout: {mode: manual}}")
     observer, memory, now = FleetObserver(), PolicyState(), 100.0
     come(observer, "red", now)

@@ -1,4 +1,4 @@
-"""Fleet files: layers resolved, faults across cars told, and links understood as gateways understand them."""
+"""Fleet files: layers are resolved, faults between cars are reported, and links mean the same as for gateways."""
 
 import contextlib
 import json

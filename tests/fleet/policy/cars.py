@@ -1,4 +1,4 @@
-"""Pictures of cars for the tests of policy/; times are seconds of one clock."""
+"""Snapshots of cars for the tests of policy/. Times are seconds of one clock."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ def seen(at: float, **topics: dict[str, Any]) -> dict[str, Observation]:
 
 
 class PolicyRun:
-    """A coordinator that is told what it sees, and whose cars obey at once if `obey`."""
+    """A coordinator with given observations. If `obey`, its cars obey at once."""
 
     def __init__(self, plan: Plan, *cars: str, obey: bool = True) -> None:
         self.plan = plan
@@ -36,7 +36,7 @@ class PolicyRun:
         self.readings[car] = {**self.readings.get(car, {}), **seen(self.now, **topics)}
 
     def at(self, now: float) -> DecisionStep:
-        """One step at this time."""
+        """Run one step at this time."""
         self.now = now
         self.last = step(self.plan, FleetSnapshot(dict(self.cars), dict(self.readings)), self.memory, now)
         self.memory = self.last.memory
@@ -48,7 +48,7 @@ class PolicyRun:
         return self.last
 
     def until(self, now: float, every: float = 0.1) -> DecisionStep:
-        """Steps up to this time."""
+        """Run steps up to this time. Return the last one."""
         while self.now + every <= now + 1e-9:
             self.at(round(self.now + every, 6))
         return self.last

@@ -1,4 +1,4 @@
-"""The assignment costs no more than any other: compared with all there are."""
+"""The assignment has the minimum cost of all assignments."""
 
 from itertools import product
 

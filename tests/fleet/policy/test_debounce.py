@@ -1,4 +1,4 @@
-"""Nothing follows a flicker."""
+"""A short change of a condition has no effect."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What follows from pictures, step by step on a clock of its own: who takes which role, and that nothing flaps."""
+"""Decisions by snapshots, step by step on virtual time: cars take roles, and no role flaps."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -204,7 +204,7 @@ rules:
 
 
 def test_a_car_that_lost_the_line_drives_on_by_itself_unless_it_was_stopped() -> None:
-    """docs/how-to/write-a-plan.md warns of it: the rule ends without `fleet resume`."""
+    """The rule ends without `fleet resume`. docs/how-to/write-a-plan.md warns of this."""
     plan = parse("""
 roles: {guide: {mode: tracking}}
 rules:
@@ -233,7 +233,7 @@ rules:
     ("back_s", "kept"), [(0.3, True), (HUB_RETURN_GRACE_S - 0.2, True), (HUB_RETURN_GRACE_S + 0.2, False)]
 )
 def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s: float, kept: bool) -> None:
-    """Without one the coordinator decides nothing; a car that nobody could hear was not lost."""
+    """Without a hub, the coordinator decides nothing. A car that was only unreachable then is not lost."""
     run = PolicyRun(ONE, "blue", "green", "red")
     run.until(1.0)
     (scout,) = run.roles
@@ -536,7 +536,7 @@ def test_whatever_happens(plan: Any, course: list[Any]) -> None:
             name for name, known in run.cars.items() if known.held_by or known.estopped_by
         }
         for name, known in run.cars.items():
-            if (known.held_by or known.estopped_by) and known.mode:  # else nothing is heard of it, nor of a hold
+            if (known.held_by or known.estopped_by) and known.mode:  # else no state is known
                 assert name not in result.roles
         for role in plan.roles.values():
             if role.count is not None and not any(other.if_none == role.name for other in plan.roles.values()):

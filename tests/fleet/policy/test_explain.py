@@ -1,4 +1,4 @@
-"""Each kind of decision is explained as the table (tests/vectors/decisions.tsv) has it, on the case that it names."""
+"""The text of each kind of decision is that of tests/vectors/decisions.tsv, on the case that the row names."""
 
 from dataclasses import replace
 from typing import Any
@@ -55,7 +55,7 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 
 def _last(case: str) -> PolicyRun:
-    """A coordinator that has come to the decision."""
+    """Return a coordinator that has made the decision."""
     run = PolicyRun(SCOUT, "red", obey=False)
     run.memory = replace(run.memory, started_at=0.0)
     run.readings["red"] = {} if "not known" in case else {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
@@ -132,7 +132,7 @@ def _out(case: str) -> PolicyRun:
         run.change(car, held_by="ann")
     run.at(0.0)
     assert any(each.kind == DecisionKind.VACANT for each in run.last.changed)
-    run.at(0.1)  # cars on hold are not waited for: the phase's time-out counts from its start
+    run.at(0.1)  # the phase does not wait for cars on hold: its timeout counts from its start
     run.change("red", held_by=None)
     run.at(10.0)
     return run

@@ -70,14 +70,14 @@ def test_a_stopped_plan_brings_its_cars_to_rest_once_and_leaves_them_alone() -> 
     run.until(4.0)
     assert not run.memory.to_rest
     assert run.of("red").decided == "left alone"
-    run.change("red", mode="light_seeking")  # by a person
+    run.change("red", mode="light_seeking")  # set by a person
     run.until(90.0, every=1.0)
     assert len(run.asked) == 2
     assert "already" in ask(run, "stop")
 
 
 def test_a_command_that_was_on_its_way_does_not_pass_for_rest() -> None:
-    """The car still says manual: the mode command before the stop has no outcome yet."""
+    """The car still reports manual, because the mode command before the stop has no outcome yet."""
     run = started(FLAT, "red", obey=False)
     ask(run, "stop")
     run.change("red", busy=True)

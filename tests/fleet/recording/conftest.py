@@ -35,7 +35,7 @@ def popen(command: list[str]) -> "subprocess.Popen[str]":
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """A hub of this test's own."""
+    """Start a hub for one test."""
     where = free_endpoint()
     with zenoh.open(router_config(where)):
         yield where
@@ -46,10 +46,10 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture
 def hub_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A hub in a process of its own, for what is huge.
+    """Start a hub in a process of its own, for large loads.
 
-    The sessions of one process share two threads that receive: while the hub waits on one of them for room on the way
-    to a recorder, and the other sleeps, that recorder does not receive, and after five seconds the hub gives it up.
+    All sessions of one process share two receiving threads. If the hub waits on one of them for room towards a
+    recorder, and the other one sleeps, the recorder receives nothing. After five seconds the hub closes its link.
     """
     fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("hub"))
     try:
@@ -60,20 +60,20 @@ def hub_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def bus(endpoint: str) -> Iterator[Bus]:
-    """A session that was there before the recorder."""
+    """Open a session before the recorder starts."""
     with Bus.open(endpoint) as opened:
         yield opened
 
 
 def publisher(bus: Bus, car: str, topic: str) -> Publisher:
-    """A publisher that knows of the recorder: a session that was there before it is told a moment later."""
+    """Declare a publisher. Wait until it has the recorder's subscription, which an older session gets a moment later."""
     made = bus.publisher(keys.topic_key("fleet", car, topic), TOPICS[topic], car)
-    with bus._session.declare_publisher(made.key) as plain:  # zenoh.ext's publishers cannot be asked this
+    with bus._session.declare_publisher(made.key) as plain:  # zenoh.ext's have no such method
         wait_for(lambda: plain.matching_status.matching, f"a subscriber of {made.key}")  # type: ignore[attr-defined]
     return made
 
 
 def heard(session: zenoh.Session) -> None:
-    """Wait until the recorder has what this session has published: a question of the same priority is behind it."""
+    """Wait until the recorder has this session's publications. A query of the same priority comes behind them."""
     ask = "fleet/@recorder/status"
     wait_for(lambda: any(reply.ok for reply in session.get(ask, timeout=10.0)), "the recorder answers")

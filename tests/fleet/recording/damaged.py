@@ -1,4 +1,4 @@
-"""A file as our recorder writes it, small enough to damage it in every place; and what must hold for one that is."""
+"""A file as our recorder writes it, small enough to damage each byte, and the judge of damaged copies."""
 
 import tracemalloc
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 CHUNKS, PER_CHUNK = 5, 8
 MOST_MEMORY = 3 * MAX_RECORD_BYTES
-"""A chunk as it is in the file, uncompressed, and as messages."""
+"""Maximum memory: one chunk compressed, uncompressed, and as messages."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Original:
     data: bytes
     messages: tuple[Recorded, ...]
     chunks: tuple[tuple[int, int], ...]
-    """Where each begins and ends."""
+    """Begin and end of each chunk."""
 
     def until(self, at: int) -> list[Recorded]:
-        """The messages of the chunks that end before a byte."""
+        """Return the messages of the chunks that end before a byte."""
         return list(self.messages[: PER_CHUNK * sum(end <= at for _, end in self.chunks)])
 
     def chunk_of(self, message: Recorded) -> int:
@@ -36,12 +36,12 @@ class Original:
 
     @cached_property
     def _numbers(self) -> dict[Recorded, int]:
-        # Looked up for each message of thousands of copies.
+        # A local name, because the loop compares the messages of thousands of copies.
         return {message: number for number, message in enumerate(self.messages)}
 
 
 def written(path: Path) -> Original:
-    """Write one: five chunks of three keys, of which the last comes with the second chunk only."""
+    """Write five chunks of three keys. The last key begins with the second chunk."""
     segment = Segment(path, {"fleet": "fleet"})
     channels: dict[str, int] = {}
     number = 0
@@ -76,14 +76,14 @@ def written(path: Path) -> Original:
 
 
 def put(path: Path, data: bytes) -> None:
-    """Write a file, also where there is one."""
-    # Truncating one costs 8 ms instead of 0.1: ext4 writes such a file to the disk when it is closed (auto_da_alloc).
+    """Write a file, or overwrite it."""
+    # Truncating a file takes 8 ms instead of 0.1 ms: ext4 flushes such a file when it is closed (auto_da_alloc).
     path.unlink(missing_ok=True)
     path.write_bytes(data)
 
 
 def judge(original: Original, data: bytes, first: int, path: Path) -> list[Recorded]:
-    """Hold a damaged copy, the same up to byte `first`, against what must be; what it shows."""
+    """Check the messages of a damaged copy, which is the same up to byte `first`. Return them."""
     put(path, data)
     tracemalloc.start()
     try:
@@ -112,5 +112,5 @@ def judge(original: Original, data: bytes, first: int, path: Path) -> list[Recor
 
 
 def places(words: str) -> list[int]:
-    """The offsets that a report names."""
+    """Return the offsets in a report."""
     return [int(part.partition(":")[0]) for part in words.split("byte ")[1:]]

@@ -1,4 +1,4 @@
-"""`fleet record` as the process that it is."""
+"""`fleet record` as a process."""
 
 import json
 import os
@@ -54,7 +54,7 @@ def test_a_signal_closes_the_session_whole(number: signal.Signals, endpoint: str
 
 def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
-    """When it said how many messages it has, and how many these were."""
+    """Time of each status, and its number of messages."""
     bus.subscribe(
         "fleet/@recorder/status",
         lambda sample: told.append((sample.time_ns, sample.message().messages)),  # type: ignore[attr-defined]
@@ -74,7 +74,7 @@ def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_pa
     rows = list(opened.messages())
     numbers = [message.sequence for message in rows if message.key == out.key]
     assert numbers == list(range(1, len(numbers) + 1))
-    # What it has said to have is here, and it says so each second: sooner, if it was held up the last time.
+    # The session has all messages that the status counted. A status comes each second, or sooner after a delayed one.
     times, counts = zip(*told, strict=True)
     assert len(rows) >= counts[-1] > counts[0]
     assert min(after - before for before, after in pairwise(times)) < 1.2e9

@@ -1,4 +1,4 @@
-"""Reading part of a session: by key and by time, with and without an index; only what is needed is uncompressed."""
+"""Reads of a part of a session by key and time, with and without an index. Only needed chunks are uncompressed."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ KEYS = ("fleet/red/sensor/range", "fleet/red/state/link", "fleet/blue/sensor/ran
 
 
 def write(path: Path, first: int = 0) -> None:
-    """Chunks of 50 ns; each has all keys, and the chunk numbered 7 has one of its own."""
+    """Write chunks of 50 ns with all keys. Chunk 7 also has a key of its own."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -74,7 +74,7 @@ def test_a_part_is_what_a_filter_of_the_whole_gives(
 
 
 def test_what_is_not_needed_is_not_read(tmp_path: Path) -> None:
-    """Every other chunk is damaged: whoever reads one says so."""
+    """All other chunks are damaged, so a reader that reads one reports it."""
     path = tmp_path / "0001.mcap"
     write(path)
     index = next(iter(Session(tmp_path).indexes().values()))

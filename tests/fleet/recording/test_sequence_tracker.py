@@ -1,4 +1,4 @@
-"""Gaps, what fills them, what comes twice."""
+"""Gaps, their backfill, and duplicates."""
 
 import random
 
@@ -9,7 +9,7 @@ from fleet.recording.sequence_tracker import MAX_TRACKED_SOURCES, SequenceTracke
 
 
 def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]:
-    """As the recorder does: only what does not follow is looked at."""
+    """Add numbers as the recorder does, which checks only numbers out of sequence."""
     found = []
     for number in given:
         if numbers.last.get(sender) == number - 1:
@@ -98,7 +98,7 @@ def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: 
         if number not in lost and (numbers.last.get("a") == number - 1 or numbers.add_live("a", number, number)):
             numbers.last["a"] = number
             taken.append(number)
-        if chance.random() < 0.1:  # everything that is held is had again, now and then
+        if chance.random() < 0.1:  # now and then, all cached messages are backfilled
             taken += [old for old in range(max(1, number - 20), number + 1) if numbers.add_backfilled("a", old, old)]
     taken += [old for old in range(1, 61) if numbers.add_backfilled("a", old, old)]
     assert sorted(taken) == list(range(1, 61))

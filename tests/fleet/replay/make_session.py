@@ -1,4 +1,4 @@
-"""A session of three cars and every message type, by the stock mcap writer: `python make_session.py FILE.mcap`."""
+"""Writes a session of three cars and every message type with mcap's writer: `python make_session.py FILE.mcap`."""
 
 import math
 import sys
@@ -69,7 +69,7 @@ def log(car: str, at_s: float, level: int, words: str) -> Log:
 
 
 def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
-    """One car: manual, then tracking, then avoidance; its own circle in the world."""
+    """Write one car: manual, then tracking, then avoidance, on a circle of its own."""
     base = f"fleet/{car}"
     for tenth in range(seconds * 10):
         at = tenth / 10
@@ -132,7 +132,7 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
 
 
 def world(second: int) -> pb.World:
-    """A room with a line, a lamp that is switched, a thing that turns."""
+    """Return a room with a line, a lamp that is switched, and an object that turns."""
     corners = [(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)]
     points = [pb.SimPoint(x_m=x, y_m=y) for x, y in corners]
     walls = [pb.SimWall(begin=points[n - 1], end=points[n]) for n in range(4)]
@@ -147,7 +147,7 @@ def mode(at_s: float, seconds: int) -> str:
 
 
 def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counter[str]:
-    """Write the session; how many messages each key has."""
+    """Write the session. Return the number of messages by key."""
     made = Made(path, writer)
     for index, car in enumerate(CARS):
         drive_about(made, car, index, seconds)

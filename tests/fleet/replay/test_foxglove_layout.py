@@ -1,4 +1,4 @@
-"""The layout for Foxglove: every panel shows a key and a field that there are, and every key is shown."""
+"""The layout for Foxglove: every panel has an existing key and field, and every key has a panel."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from schemas.topics import TOPICS, of_key
 
 FILE = Path(__file__).parents[3] / "deploy" / "foxglove.json"
 PATH = re.compile(r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[A-Za-z0-9_/]+))(?P<fields>(?:\.[a-z_]+(?:\[\d\])?)*)')
-"""As Foxglove's own grammar of message paths has it, as far as we use it."""
+"""The part of Foxglove's grammar of message paths that we use."""
 
 
 def test_the_file_is_what_the_tables_make() -> None:

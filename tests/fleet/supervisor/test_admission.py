@@ -1,4 +1,4 @@
-"""Which processes may be started or killed now: by tables and on virtual time."""
+"""The processes that may start or be killed now, by tables and on virtual time."""
 
 import itertools
 
@@ -21,7 +21,7 @@ from fleet.supervisor.admission import (
         ([], True),
         ([99.0], True),
         ([99.0, 99.5], False),
-        ([99.0, 100.0 - START_SLOT_TIMEOUT_S], True),  # one of them has had its time
+        ([99.0, 100.0 - START_SLOT_TIMEOUT_S], True),  # the slot of one has timed out
         ([0.0, 1.0, 2.0, 3.0], True),
     ],
 )
@@ -62,7 +62,7 @@ def test_kills_have_a_budget_for_the_whole_fleet() -> None:
 @pytest.mark.parametrize("count", [1, 10, 100])
 @pytest.mark.parametrize("work_s", [0.3, 1.0])
 def test_a_fleet_starts_one_after_the_other_and_never_more_than_have_a_place(count: int, work_s: float) -> None:
-    """On virtual time: two processors are shared by those that start, and each needs `work_s` of one."""
+    """On virtual time, starting processes share two processors, and each needs `work_s` of one."""
     admission, waiting, starting, now, most = Admission(3), count, list[list[float]](), 0.0, 0
     while waiting or starting:
         if waiting and admission.admit_start(now, [since for since, _ in starting], restart=False):

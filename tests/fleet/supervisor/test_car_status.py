@@ -1,4 +1,4 @@
-"""What a car's row and the table show, and what is kept in logs."""
+"""The row of a car, the table, and the limits of logs."""
 
 import io
 import os
@@ -110,7 +110,7 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
     ("safety", "words"),
     [
         (pb.Safety(), ""),
-        (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # of this run: it is shown when it begins
+        (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # a hold of this run
         (
             pb.Safety(hold=MIAS),
             "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. To end that: fleet resume red --fleet lab",

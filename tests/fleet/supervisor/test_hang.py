@@ -1,4 +1,4 @@
-"""What tells a process that hangs from a slow one, a machine that stands, and a hub on which nobody is heard."""
+"""Distinguishes a hanging process from a slow one, from a stalled machine, and from a hub without messages."""
 
 import os
 import subprocess
@@ -30,9 +30,9 @@ from tests.support.processes import freeze, wait_for
     [
         (0.0, 0.0, False, Sign.BLOCKED),  # a lock, SIGSTOP
         (0.005, 0.0, False, Sign.SLOW),  # a gateway at rest
-        (0.0005, 0.9, False, Sign.SLOW),  # it gets no processor
-        (0.0, 0.0, True, Sign.SLOW),  # it waits for one, or for the disk, and was not counted yet
-        (0.5, 0.5, False, Sign.SLOW),  # it starts on a busy machine
+        (0.0005, 0.9, False, Sign.SLOW),  # the process waits for a processor
+        (0.0, 0.0, True, Sign.SLOW),  # the process waits for a processor or the disk, without a count yet
+        (0.5, 0.5, False, Sign.SLOW),  # a start on a busy machine
         (0.99, 0.01, False, Sign.SPINNING),
     ],
 )
@@ -53,7 +53,7 @@ def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
 
 def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothing() -> None:
     pulse = Pulse()
-    for half in range(20):  # it worked, then it stands
+    for half in range(20):  # the process worked, then hangs
         pulse.add(half / 2, CpuTime(min(half, 8) / 2))
     assert pulse.sign is Sign.BLOCKED
     pulse.add(11.0, None)
@@ -63,7 +63,7 @@ def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothi
 @pytest.mark.parametrize(
     ("sign", "many", "may_move", "seconds"),
     [
-        (Sign.BLOCKED, False, True, 0.0),  # it stops its car no more: another does
+        (Sign.BLOCKED, False, True, 0.0),  # a blocked gateway cannot stop its car, so it is replaced
         (Sign.SPINNING, False, True, 0.0),
         (Sign.UNKNOWN, False, True, 0.0),
         (Sign.BLOCKED, True, True, MANY_SILENT_S),
@@ -83,7 +83,7 @@ def test_how_long_a_process_may_be_silent(sign: Sign, many: bool, may_move: bool
         (Sign.BLOCKED, 0.0),
         (Sign.UNKNOWN, 0.0),
         (Sign.SLOW, SLOW_SILENT_S),
-        (Sign.SPINNING, SLOW_SILENT_S),  # a hundred sessions come back to it at once
+        (Sign.SPINNING, SLOW_SILENT_S),  # a hundred sessions reconnect to the hub at once
     ],
 )
 def test_a_hub_that_works_is_not_hung(sign: Sign, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""When a process is started, killed and started again: by tables, and for any order of what may happen."""
+"""Starts, kills and restarts of a process, by tables and for any order of events."""
 
 from dataclasses import dataclass
 from math import inf
@@ -23,7 +23,7 @@ from fleet.supervisor.restart_policy import (
 from gateway.control.stop_executor import SHUTDOWN_S
 
 LEAVES_BUS_S = 2.0
-"""A gateway on a busy machine needs so long to end after its wait."""
+"""Time that a gateway on a busy machine needs to end after its wait."""
 PATIENCE = Patience(start_s=20.0, silence_s=4.0)
 
 
@@ -108,8 +108,8 @@ def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -
     [
         (103.9, 0.0, RestartAction.NOTHING),
         (104.1, 0.0, RestartAction.KILL),
-        (200.0, None, RestartAction.NOTHING),  # nobody could have been heard
-        (200.0, 197.0, RestartAction.NOTHING),  # the hub is back, or we are awake, for 3 s only
+        (200.0, None, RestartAction.NOTHING),  # no process could be observed
+        (200.0, 197.0, RestartAction.NOTHING),  # the hub is back, or the supervisor runs again, for 3 s only
         (200.0, 195.9, RestartAction.KILL),
     ],
 )
@@ -161,7 +161,7 @@ def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
 
 @dataclass
 class FakeProcess:
-    """What a state is told of: at most one lives."""
+    """The process of a state. At most one runs at a time."""
 
     alive: bool = False
 

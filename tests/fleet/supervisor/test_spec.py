@@ -1,4 +1,4 @@
-"""From a fleet file and the command line to what is to run, and from one spec to the next."""
+"""Specs from a fleet file and a command line, and the differences between two specs."""
 
 import subprocess
 import sys
@@ -68,7 +68,7 @@ def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> N
     assert {name: _people(car.arguments) for name, car in spec.cars.items()} == {
         "ann": listed("lee", "ana:other", "kim", "teacher:lead"),
         "bob": listed("lee:other", "ana", "kim", "teacher:lead"),
-        "red": listed("lee:other", "ana:other", "kim", "teacher:lead"),  # a simulated car beside the file's
+        "red": listed("lee:other", "ana:other", "kim", "teacher:lead"),  # a simulated car beside those of the file
     }
     nobody = build_spec(parse_fleet(FILE + "people: {}\n", tmp_path / "fleet.yaml"), UpOptions())
     assert _people(nobody.cars["ann"].arguments) == ["--people-only"]
@@ -124,7 +124,7 @@ def test_any_number_of_cars_without_a_file(count: int) -> None:
 
 
 def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
-    """Argument parsers that know their arguments complain of the last one only."""
+    """With an invalid last argument, each parser accepts all others."""
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions(simulated=1))
     endpoint = "tcp/127.0.0.1:1"
     commands = [

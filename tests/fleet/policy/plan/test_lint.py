@@ -1,4 +1,4 @@
-"""What can never work in a plan is found before anything moves; what can work is let alone."""
+"""`fleet check` finds parts of a plan that can never work, and accepts all others."""
 
 import pytest
 
@@ -192,7 +192,7 @@ def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
 @pytest.mark.parametrize(
     "others",
     [
-        "patrol: {mode: obstacle_avoidance, needs: battery_v > 6, count: all}",  # until it is measured: manual
+        "patrol: {mode: obstacle_avoidance, needs: battery_v > 6, count: all}",  # manual until the battery is measured
         "patrol: {mode: obstacle_avoidance, count: all, priority: -1}, rest: {mode: manual}",
         "patrol: {mode: obstacle_avoidance, cars: [green], count: all}",
     ],
@@ -215,7 +215,7 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
 @pytest.mark.parametrize(
     "more",
     [
-        # The narrower one first: so it is meant.
+        # The narrower rule comes first, so the overlap is intended.
         (
             "rules: [{when: {any_car: range.range_m < 0.1}, then: {who: red, mode: manual}},"
             " {when: {any_car: range.range_m < 0.9}, then: {who: red, mode: following}}]"

@@ -1,4 +1,4 @@
-"""What a plan may say, and that every mistake in it is told at once, with line, column and what is allowed."""
+"""The fields of a plan. All mistakes are reported at once, with line, column and the allowed values."""
 
 from pathlib import Path
 
@@ -164,7 +164,7 @@ phases:
 
 
 def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itself() -> None:
-    """Names, types, references and conditions at once; what looks wrong only because something else is, is left out."""
+    """Faults in names, types, references and conditions are reported at once, without follow-up errors."""
     with pytest.raises(BadFile) as raised:
         parse(EVERYTHING_WRONG, "p")
     assert [(each.line, each.field) for each in raised.value.problems] == [

@@ -1,4 +1,4 @@
-"""What no car measures in the modes that a plan gives it makes no rule fire and ends no phase: that is found."""
+"""The check finds rules and phases on readings that no car measures in the modes of the plan."""
 
 import pytest
 
@@ -62,14 +62,14 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
                 " Or add timeout_s."
             ),
         ),
-        # Two rules that only each other would make true.
+        # Two rules, each of which could only fire after the other one.
         (
             GUIDE
             + "rules:\n  - {when: {any_car: light.left}, then: {who: all_cars, mode: following}}\n"
             + "  - {when: {any_car: obstacle.left}, then: {who: all_cars, mode: light_seeking}}",
             "rule 1: it never fires. It waits for light.left",
         ),
-        # A role that only such a rule gives.
+        # A role that only such a rule assigns.
         (
             (
                 "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, given_by: rules}}\n"
@@ -78,7 +78,7 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
             ),
             "rule 2: it never fires. There are never cars with role seek.",
         ),
-        # Each is measured in some mode, but in none that the plan has both.
+        # Each field is measured in some mode, but no mode of the plan measures both.
         (
             (
                 "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, count: all}}\n"
@@ -136,19 +136,19 @@ TWO_PATROLS = PATROL.replace("count: all", "count: 2")
         (TWO_PATROLS + LIGHT, None),  # a third car has no role, and stands
         (TWO_PATROLS + LIGHT, THREE),
         (SEARCH.replace("SEARCH", "roles: [rest]"), None),
-        # What is so is measured, whatever else is not.
+        # One measured alternative is enough.
         (
             GUIDE + "rules: [{when: {any_car: light.left or line.left_outer}, then: {who: this_car, mode: manual}}]",
             THREE,
         ),
-        # The first rule brings the cars to where the second one sees.
+        # The first rule brings the cars into the mode in which the second rule has its reading.
         (
             GUIDE
             + "rules:\n  - {when: line.left_outer, until: light.left, then: {who: this_car, mode: manual}}\n"
             + "  - {when: {any_car: light.left, for_s: 9}, then: {phase: b}}\nphases: {a: {}, b: {}}",
             THREE,
         ),
-        # A rule about what a role needs is for the cars that lack it.
+        # A rule about the needs of a role is for the cars that lack them.
         (
             (
                 "roles: {guide: {mode: tracking, count: all, needs: battery.voltage_v > 7}}\n"
@@ -175,7 +175,7 @@ def test_two_cars_for_two_places_leave_none_that_stands() -> None:
 
 
 def test_a_large_fleet_and_a_long_plan_are_checked_in_time() -> None:
-    """A hundred cars, each with a place of its own, and the most rules that a plan may have."""
+    """The check handles a hundred cars, each with a role of its own, and the maximum number of rules in time."""
     cars = {f"car{number}": listed("arduino") for number in range(100)}
     roles = "".join(f"  role{number}: {{mode: tracking, count: 5}}\n" for number in range(20))
     rules = "".join(

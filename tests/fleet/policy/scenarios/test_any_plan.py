@@ -1,4 +1,4 @@
-"""Any text as a plan: it is put in force or refused with the declared error, whatever it says. No other exception."""
+"""Any text as a plan is put in force or rejected with the declared error. No other exception occurs."""
 
 import json
 
@@ -32,7 +32,7 @@ PLACES = (
 
 
 def put_in_force(text: str) -> Plan | None:
-    """Do with a text what a coordinator does with a plan; return the plan, None if it was refused."""
+    """Parse and check a text as a coordinator does. Return the plan, None if it was rejected."""
     try:
         plan = parse(text)
     except BadFile:
@@ -114,7 +114,7 @@ SENSIBLE = st.recursive(
     max_leaves=12,
 )
 CONDITIONS = st.one_of(st.lists(WORDS, max_size=20).map(" ".join), SENSIBLE, st.text())
-"""Conditions that mean something, that nearly do, and that do not."""
+"""Valid, nearly valid and invalid conditions."""
 FIELDS = (
     *(
         "roles",

@@ -1,4 +1,4 @@
-"""When the time-out of a phase counts, and what of a plan outlives its coordinator."""
+"""The timeout of a phase, and the parts of a plan's state that outlive the coordinator."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ PLAN = parse(
 
 
 def ends_at(run: PolicyRun) -> float:
-    """When the phase ends, to a tenth."""
+    """Return the time at which the phase ends, to a tenth."""
     while run.at(round(run.now + 0.1, 1)).memory.phase.name == "work":
         assert run.now < 60.0
     return run.now
@@ -29,9 +29,9 @@ def ends_at(run: PolicyRun) -> float:
     ("before", "known_at", "in_mode_at", "ends"),
     [
         (HERE, 0.0, 0.1, 5.1),  # obeys at once
-        (HERE, 0.0, 4.0, 9.0),  # the mode takes its time
+        (HERE, 0.0, 4.0, 9.0),  # the mode opens slowly
         (GONE, 7.0, 8.0, 13.0),  # its gateway comes late
-        (HERE, 0.0, 60.0, PHASE_SETTLE_TIMEOUT_S + 5.1),  # it never is: no longer than that
+        (HERE, 0.0, 60.0, PHASE_SETTLE_TIMEOUT_S + 5.1),  # never obeys: the wait is limited
     ],
 )
 def test_a_time_out_counts_from_when_the_cars_are_in_their_modes(

@@ -1,4 +1,4 @@
-"""A file of our recorder's, cut and damaged in every place: what is whole is shown, what is not is said, and where."""
+"""Files of our recorder, truncated and damaged in every place. The reader returns whole messages, and names damage."""
 
 import io
 import os
@@ -35,7 +35,7 @@ def flipped(data: bytes, at: int, bit: int) -> bytes:
 
 
 def sampled(original: Original) -> list[int]:
-    """Offsets: dense where messages and the footer are, a few in the index, which has a checksum as a whole."""
+    """Return offsets: many in messages and footer, and a few in the index, which has one checksum."""
     end, size = original.chunks[-1][1], len(original.data)
     first = original.chunks[0]
     return [
@@ -95,7 +95,7 @@ def flipped_it_loses_its_own_chunk_at_most(original: Original, at: int, bits: It
 
 
 def without_an_index_it_loses_its_own_chunk_at_most(original: Original, step: int, path: Path) -> None:
-    """Cut between chunks and within one; what describes the channels of a lost chunk is lost with it."""
+    """Cut between chunks and within one. A lost chunk also loses the channels that only it describes."""
     described = {0: {"fleet/red/sensor/range", "fleet/red/state/link"}, 1: {"fleet/blue/note"}}
     heads = [at for begin, end in original.chunks for at in (*range(begin, begin + 60), *range(end, end + 40))]
     lengths = (original.chunks[-1][1], original.chunks[-1][1] - 30, len(original.data) - 9)
@@ -112,7 +112,7 @@ def without_an_index_it_loses_its_own_chunk_at_most(original: Original, step: in
 
 
 def test_without_an_index_too_a_flipped_bit_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
-    """Each of the bytes in a file of one of the lengths."""
+    """Each byte is flipped in a file of one of the lengths."""
     without_an_index_it_loses_its_own_chunk_at_most(original, 3, tmp_path / "x.mcap")
 
 
@@ -122,7 +122,7 @@ def test_without_an_index_each_byte_in_a_file_of_each_length(original: Original,
 
 
 def chance(at: int) -> int:
-    """A bit."""
+    """Return a bit for the byte."""
     return random.Random(at).randrange(8)
 
 
@@ -152,7 +152,7 @@ def test_a_file_whose_first_bytes_are_damaged_is_no_other_kind_of_file(
 
 
 def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> None:
-    """Every 57 bytes the head of a chunk that goes on almost to the end of the file."""
+    """The file has the head of a chunk every 57 bytes, each with a length almost to the end of the file."""
     path = tmp_path / "x.mcap"
     size = 2_000_000
     parts = [b"\x89MCAP0\r\n"]
@@ -215,7 +215,7 @@ def test_an_absurd_length_is_not_believed(original: Original, tmp_path: Path, fi
     for length in ABSURD:
         data = original.data[:at] + struct.pack("<Q", length) + original.data[at + 8 :]
         judge(original, data, at, tmp_path / "x.mcap")
-        # Without an end there is no index to go by.
+        # Without its end, the file has no index.
         judge(original, data[:-8], at, tmp_path / "x.mcap")
 
 
@@ -225,7 +225,7 @@ def test_an_absurd_length_of_any_record_is_not_believed(original: Original, tmp_
         (length,) = struct.unpack_from("<Q", original.data, at + 1)
         for number, absurd in enumerate(ABSURD):
             data = original.data[: at + 1] + struct.pack("<Q", absurd) + original.data[at + 9 :]
-            # Every second one without an end, so without an index to go by.
+            # Every second file has no end, and so no index.
             judge(original, data[:-8] if (number + at) % 2 else data, at + 1, tmp_path / "x.mcap")
         at += 9 + length
 
@@ -283,7 +283,7 @@ def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> No
 def test_what_follows_the_end_is_said_and_hides_nothing(
     original: Original, tmp_path: Path, count: int, filling: bytes
 ) -> None:
-    """A machine that lost its power leaves zeros at the end of a file."""
+    """After a power failure, a file may end with zeros."""
     data = original.data + filling * count
     assert judge(original, data, len(original.data), tmp_path / "x.mcap") == list(original.messages)
     assert f"byte {len(original.data)}: {count} bytes follow the end" in report(tmp_path / "x.mcap")
@@ -300,7 +300,7 @@ def test_a_damaged_index_hides_no_chunk(original: Original, tmp_path: Path) -> N
 
 
 def test_what_was_described_in_a_lost_chunk_is_said(original: Original, tmp_path: Path) -> None:
-    """Cut, so there is no index that describes the channels again; the first chunk describes two of the three."""
+    """The file is cut, so no index repeats the channels. The first chunk describes two of the three."""
     begin, end = original.chunks[0]
     data = flipped(original.data, end - 2, 0)[: original.chunks[-1][1]]
     path = tmp_path / "x.mcap"
@@ -324,7 +324,7 @@ def test_many_damages_are_one_short_line(original: Original, tmp_path: Path) -> 
 
 
 def spliced(original: Original, seed: int) -> tuple[bytes, int]:
-    """Something cut out, put in or copied elsewhere, once or a few times; and the first byte that may differ."""
+    """Cut out, insert or copy bytes, once or a few times. Return the data and the first byte that may differ."""
     chance = random.Random(seed)
     data, first = original.data, len(original.data)
     for _ in range(chance.randint(1, 4)):
@@ -392,7 +392,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
 
 @contextmanager
 def no_superuser(seen: Path) -> Iterator[None]:
-    """As a user who may not read everything; `seen` is opened to them."""
+    """Run as a user without all rights, who may read `seen`."""
     if os.geteuid():
         yield
         return

@@ -1,4 +1,4 @@
-"""Which files are a session, and what is wrong with it as a whole. Damage within a file is test_salvage.py's."""
+"""The files of a session, and faults of the whole session. test_mcap_reader.py tests damage within a file."""
 
 import io
 import os
@@ -12,7 +12,7 @@ from fleet.recording.tools.analysis import NoTable
 
 
 def mcap(*sequences: int) -> bytes:
-    """A whole file with these messages."""
+    """Return a whole file with messages of these numbers."""
     out = io.BytesIO()
     writer = Writer(out)
     writer.start()
@@ -98,7 +98,7 @@ def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> No
     )
     with pytest.raises(NoSession, match=r"format 99.*update zenoh-car-fleet.* as .*0001\.mcap"):
         Session(tmp_path)
-    # Nor is it read when what else it says cannot be understood by now.
+    # A description of a later format is not read, either.
     (tmp_path / "session.json").write_text('{"format": 99, "messages": {"red": 3}}')
     with pytest.raises(NoSession, match="format 99"):
         Session(tmp_path)

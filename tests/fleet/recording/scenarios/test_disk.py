@@ -1,4 +1,4 @@
-"""A disk that is full, goes away or must not be written to, and a quota: what was written stays, and it is said."""
+"""A full, absent or read-only disk, and a quota: written data stays, and the recorder reports the cause."""
 
 import errno
 import json
@@ -26,17 +26,17 @@ from tests.fleet.recording.test_record_command import ready
 from tests.fleet.recording.writing.test_session_writer import BEGUN_NS, SECOND_NS, feed
 from tests.support import in_process
 
-pytestmark = pytest.mark.xdist_group("disk")  # what one fills, another has not
+pytestmark = pytest.mark.xdist_group("disk")  # these tests fill the same disk
 
 BALLAST = 1_200_000_000
-"""Half of it is more than what others write on the machine's disk meanwhile, where only that can be used."""
+"""Size of a file that fills the disk. Half of it is more than other processes write to a shared disk meanwhile."""
 TINY = 6_000_000
 SMALL = 150_000_000
 KEPT = SMALL // 3
 
 
 def can_mount() -> bool:
-    """Whether this user may mount a disk of its own."""
+    """Return True if this user may mount a tmpfs."""
     return (
         sys.platform == "linux"
         and os.geteuid() == 0
@@ -48,11 +48,11 @@ def can_mount() -> bool:
 
 MAY_MOUNT = can_mount()
 DISKS = ["keep free", *(["really full"] if MAY_MOUNT else [])]
-"""What fills a disk of its own, where one can be mounted: nobody else has a part in how full that is."""
+"""Ways to fill a disk. A disk of its own, if one can be mounted, has no other writers."""
 
 
 class Disk:
-    """A disk that can be filled, and emptied again."""
+    """A disk that a test can fill and empty."""
 
     def __init__(self, root: Path, ballast: Path, size: int, options: tuple[str, ...]) -> None:
         self.root = root
@@ -66,7 +66,7 @@ class Disk:
                 size = min(self._size, shutil.disk_usage(self._ballast.parent).free) - but
                 try:
                     os.posix_fallocate(file.fileno(), 0, size)
-                except OSError as error:  # the recorder has written since we asked
+                except OSError as error:  # the recorder has written meanwhile
                     if error.errno != errno.ENOSPC:
                         raise
                     file.truncate(0)
@@ -79,7 +79,7 @@ class Disk:
 
 @contextmanager
 def disk(kind: str, place: Path) -> Iterator[Disk]:
-    """One that is kept free, or can be filled to the last byte."""
+    """Yield a disk with a reserve, or one that can be filled to the last byte."""
     if not MAY_MOUNT:
         keep = shutil.disk_usage(place).free - BALLAST // 2
         try:
@@ -162,14 +162,14 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)
         numbers = [message.sequence for message in Session(session).messages() if message.key == out.key]
-        # What came meanwhile was held, and is here, too.
+        # The recorder buffered the messages meanwhile, and has recorded them, too.
         assert numbers == list(range(1, sent + 1))
         assert (process.returncode, end["drops"], end["missed"]) == (0, {}, {})
         assert "Recording pauses until there is room" in errors
         assert "there is room again" in errors
         verdict = verify(Session(session))
         assert (verdict.missing, verdict.twice, verdict.closed) == ([], [], True)
-        # Nearly full, a file is closed in time; where there is no room at all, not even its index can be written.
+        # On a nearly full disk, the file is closed in time. Without any room, not even its index can be written.
         assert list(verdict.damage) == ([] if kind == "keep free" else ["0001.mcap"])
 
 
@@ -213,7 +213,7 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
         assert len(holds(session, out.key)) + dropped == sent
         assert description.messages == end["messages"] == sum(1 for _ in Session(session).messages())
         assert not (session / session_dir.SPARE_FILE).exists()
-        if kind == "keep free":  # there was room, which only was to stay free
+        if kind == "keep free":  # the reserve has room for the index
             assert (process.returncode, dropped) == (0, 0)
             assert verify(Session(session)).whole
         else:
@@ -326,7 +326,7 @@ def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Pat
     assert process.returncode == 0
     assert Path(json.loads(text)["session"]) != session
     assert f"{session} is removed" in errors
-    assert errors.count("more than its quota") <= 2  # told when it begins, not with every figure
+    assert errors.count("more than its quota") <= 2  # reported once at the begin, not with each status
     assert all(verify(Session(path)).whole for path in tmp_path.iterdir())
 
 

@@ -1,7 +1,7 @@
-"""A session that an earlier version recorded opens, verifies, replays and decodes as it did then.
+"""A session of an earlier version opens, verifies, replays and decodes as with that version.
 
 `tests/vectors/session-0.1` was recorded and cut on 2026-11-22 by commit 9c9c14b, before all modules were renamed. The
-expected words are what that commit printed.
+expected texts are the output of that commit.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""A session with every type of message that is recorded, made from the table of topics and the messages' own fields."""
+"""A session with every recorded type of message, made from the table of topics and the messages' own fields."""
 
 from collections import Counter
 from pathlib import Path
@@ -12,7 +12,7 @@ from schemas.topics import CAR_TOPICS, SERVICE_TOPICS
 from tests.fleet.replay.make_session import START_NS
 
 EACH = 4
-"""Messages of a type: three with all fields, of different values, and one with none."""
+"""Number of messages of a type: three with different values in all fields, and one without fields."""
 TEXTS = ('with "quotes", commas\r\nand lines', "ümläut, 漢字", " spaces ")
 
 
@@ -59,7 +59,7 @@ def _value(field: Any, number: int) -> Any:
 
 
 def keys_and_types() -> dict[str, str]:
-    """Key to full message name, one of each topic, and the command that is published."""
+    """Return key and full message name, one of each topic, and the published command."""
     return {
         **{f"fleet/red/{topic.name}": topic.message for topic in CAR_TOPICS},
         **{f"fleet/{topic.name}": topic.message for topic in SERVICE_TOPICS},
@@ -68,7 +68,7 @@ def keys_and_types() -> dict[str, str]:
 
 
 def make(path: Path) -> Counter[str]:
-    """Write it as one MCAP file by the stock writer; how many messages each key has."""
+    """Write one MCAP file with mcap's writer. Return the number of messages by key."""
     counts: Counter[str] = Counter()
     with path.open("wb") as file:
         writer = Writer(file)

@@ -1,4 +1,4 @@
-"""What a script gets of a session: Arrow and pandas tables, joins, decoded messages, and a plot."""
+"""A session in a script: Arrow and pandas tables, joins, decoded messages, and a plot."""
 
 import sys
 from pathlib import Path
@@ -32,7 +32,7 @@ def made(tmp_path: Path) -> Made:
 
 
 def modes_and_distances(made: Made) -> None:
-    """Distances of two cars each second; of red a mode at 1.5 s, and another at 3.5 s."""
+    """Write distances of two cars each second, and modes of red at 1.5 s and 3.5 s."""
     for second in range(8):
         for car in ("blue", "red"):
             given: Any = {"no_echo": True} if second == 2 else {"range_m": second + 0.5}

@@ -1,4 +1,4 @@
-"""What `fleet doctor SESSION` counts, and what it says of a session that is damaged."""
+"""The figures of `fleet doctor SESSION`, and its findings about a damaged session."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`fleet sessions` as it is called: every subcommand, and everything that can be wrong with what it is given."""
+"""The command `fleet sessions`: every subcommand, and all kinds of wrong arguments."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ from tests.support import in_process
 
 
 def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """`fleet sessions`: its exit code, and no traceback whatever happens."""
+    """Run `fleet sessions`. Return its exit code and output, and check that it prints no traceback."""
     done = in_process.fleet("sessions", *arguments, cwd=cwd)
     assert "Traceback" not in done.stderr, done.stderr
     return done
@@ -107,7 +107,7 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
     assert list(Session(out).messages()) == expected
     assert (out / "fleet.yaml").exists()
     assert "cut of 20260921T141320Z-fleet" in fleet("info", out).stdout
-    with (out / "0001.mcap").open("rb") as file:  # the stock reader takes it
+    with (out / "0001.mcap").open("rb") as file:  # mcap's reader accepts the file
         assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) == len(expected)
     again = fleet("cut", session, "--out", out)
     assert (again.returncode, "is there already" in again.stderr) == (2, True)
@@ -128,7 +128,7 @@ def test_files_that_went_are_told_also_the_last(session: Path) -> None:
     shutil.copy(session / "0001.mcap", session / "0002.mcap")
     each = 4 * len(every_type.keys_and_types())
     describe(session, closed=True, messages=2 * each)
-    assert f"NOT whole, {2 * each} messages" in fleet("verify", session).stdout  # the second says all again
+    assert f"NOT whole, {2 * each} messages" in fleet("verify", session).stdout  # the second file repeats all messages
     (session / "0002.mcap").unlink()
     told = f"session.json says that there were {2 * each} messages: {each} are not here"
     assert told in fleet("verify", session).stdout
@@ -138,7 +138,7 @@ def test_files_that_went_are_told_also_the_last(session: Path) -> None:
     assert "lacks 1 of its files, the first is 0002.mcap" in fleet("verify", session).stdout
     assert "; lost: " in fleet("recover", session).stdout
     for text in ("[]", '{"segments": 3}', "{", '{"segments": [3]}'):
-        (session / "index.json").write_text(text)  # a cache: nothing depends on it
+        (session / "index.json").write_text(text)  # only a cache
         assert told in fleet("verify", session).stdout
 
 

@@ -1,4 +1,4 @@
-"""What is said of sessions that are not as usual: made of others, empty at their end, with a clock that went back."""
+"""Summaries of unusual sessions: made of others, empty at their end, or with a clock that went back."""
 
 import itertools
 import json
@@ -18,7 +18,7 @@ S = 1_000_000_000
 
 
 def write(path: Path, at_s: list[list[float]], *, closed: bool = True, cut: bool = True) -> Segment:
-    """A session; of each list one chunk. Its segment is finished if it is closed."""
+    """Write a session with one chunk per list. Its segment has an end if `closed`."""
     path.mkdir(parents=True, exist_ok=True)
     segment = Segment(path / "0001.mcap", {})
     channel = segment.channel("fleet/red/x", "application/json")
@@ -51,7 +51,7 @@ def test_what_was_made_of_a_damaged_one_says_how_much_is_missing(tmp_path: Path)
     data[place.at + place.length - 2] ^= 1
     (old / "0001.mcap").write_bytes(data)
     assert run("recover", old, "--out", new).exit_code == 0
-    assert run("recover", new, "--out", again).exit_code == 0  # which makes nothing good
+    assert run("recover", new, "--out", again).exit_code == 0  # a second recovery changes nothing
     for path in (new, again):
         result = run("verify", path)
         assert result.exit_code == 1

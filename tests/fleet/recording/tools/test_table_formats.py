@@ -1,7 +1,7 @@
 """MCAP, .rrd, CSV and Parquet of a session with every type of message hold the same rows and values.
 
-Each is read by the stock reader of its format, and brought into one form by the message's own fields; nothing of ours
-is asked what it wrote.
+The standard reader of each format reads the file. The message's own fields bring the values into one form. No code of
+ours reads its own files.
 """
 
 import csv
@@ -27,7 +27,7 @@ from tests.fleet.recording.tools import every_type
 NO_FIELD = ("key", "car", "log_time", "publish_time", "sequence")
 TIMESTAMP = "google.protobuf.Timestamp"
 Rows = dict[str, list[tuple[int, int, dict[str, Any]]]]
-"""By key: log time, publish time, fields that are given."""
+"""Log time, publish time and set fields of each message, by key."""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def tables(session: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def original(session: Path) -> Rows:
-    """As mcap's reader and protobuf's own code have it."""
+    """Return the rows by mcap's reader and protobuf's own code."""
     found: Rows = {}
     with session.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
@@ -70,7 +70,7 @@ def original(session: Path) -> Rows:
 
 
 def fields(message: Any) -> dict[str, Any]:
-    """What a message has, in the form that all are compared in."""
+    """Return the fields of a message in the common form."""
     return {
         field.name: form(field, getattr(message, field.name), lambda _, inner: fields(inner))
         for field in message.DESCRIPTOR.fields
@@ -79,7 +79,7 @@ def fields(message: Any) -> dict[str, Any]:
 
 
 def form(field: Any, value: Any, inner: Callable[[Any, Any], Any]) -> Any:
-    """A field's value: times in ns, maps as dict, the rest as Python has it."""
+    """Return a field's value: times in ns, maps as dict, all others as in Python."""
     if field.message_type is not None and field.message_type.GetOptions().map_entry:
         return dict(value)
     if field.message_type is not None and field.message_type.full_name == TIMESTAMP:
@@ -94,7 +94,7 @@ def form(field: Any, value: Any, inner: Callable[[Any, Any], Any]) -> Any:
 
 
 def without_car(rows: Rows) -> Rows:
-    """The tables have it once, from the key."""
+    """Remove the field `car`, which the tables have once, from the key."""
     return {
         key: [
             (log, published, {name: value for name, value in row.items() if name != "car"})
@@ -105,12 +105,12 @@ def without_car(rows: Rows) -> Rows:
 
 
 def own_fields(descriptor: Any) -> list[Any]:
-    """The fields that have a column of the same name; the fields of a command's request come after them."""
+    """Return the fields with a column of the same name. The fields of a command's request come after them."""
     return [field for field in descriptor.fields if field.name not in ("car", "request")]
 
 
 def without_requests(rows: Rows) -> Rows:
-    """What stands in columns of its own (test_analysis.py) is not compared here."""
+    """Remove the requests of commands, which have columns of their own (test_analysis.py)."""
     return {
         key: [(log, at, {name: value for name, value in row.items() if name != "request"}) for log, at, row in of]
         for key, of in rows.items()
@@ -118,7 +118,7 @@ def without_requests(rows: Rows) -> Rows:
 
 
 def given(descriptor: Any, values: dict[str, Any]) -> dict[str, Any]:
-    """A message of JSON as `export` writes it."""
+    """Return the fields of a JSON message of `export`."""
     found = {}
     for field in descriptor.fields:
         if field.name not in values:
@@ -131,7 +131,7 @@ def given(descriptor: Any, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def of_cell(field: Any, text: str) -> Any:
-    """What a cell of CSV says; None if nothing was measured."""
+    """Return the value of a CSV cell, None if it is empty."""
     message = field.message_type
     if message is not None and message.full_name == TIMESTAMP and not field.is_repeated:
         return nanoseconds(text) if text else None
@@ -225,14 +225,14 @@ def test_rrd_holds_what_the_recording_holds(original: Rows, session: Path, tmp_p
     assert {key: sorted(rows, key=lambda row: row[:2]) for key, rows in found.items()} == {
         key: rows for key, rows in original.items() if key not in logs
     }
-    # Rerun makes foxglove.Log the text of a log of its own.
+    # Rerun turns foxglove.Log into its own text log.
     assert {key: sorted(rows) for key, rows in texts.items()} == {
         key: [(log, published, row["message"]) for log, published, row in original[key]] for key in logs
     }
 
 
 def arrow_rows(path: Path) -> Iterator[tuple[str, str, int, int, Any]]:
-    """Key, component, log time, publish time and value of every row in an .rrd."""
+    """Yield key, component, log time, publish time and value of every row in an .rrd."""
     for chunk in rrc.RrdReader(path).store().stream():
         if chunk.is_static:
             continue
@@ -249,7 +249,7 @@ def arrow_rows(path: Path) -> Iterator[tuple[str, str, int, int, Any]]:
 
 
 def of_arrow(descriptor: Any, values: dict[str, Any]) -> dict[str, Any]:
-    """A message as Rerun's reader decoded it by reflection."""
+    """Return the fields of a message that Rerun's reader decoded by reflection."""
     found: dict[str, Any] = {}
     for field in descriptor.fields:
         value, message = values[field.name], field.message_type

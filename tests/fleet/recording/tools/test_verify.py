@@ -1,4 +1,4 @@
-"""`verify` says exactly what is missing: numbers lost, late and twice; schemas of another day; clocks that go wrong."""
+"""`verify` reports lost, late and duplicate numbers, schemas of other versions, and clocks that jump."""
 
 import random
 from pathlib import Path
@@ -19,7 +19,7 @@ MS = 1_000_000
 
 
 class Written:
-    """A file made message by message."""
+    """A file that a test writes message by message."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
@@ -80,7 +80,7 @@ def test_each_gap_is_named_with_its_publisher_its_numbers_and_when(written: Writ
     for seq in (5, 6, 9, 10):
         written.put(RANGE, seq)
     for seq in (1, 3):
-        written.put(RANGE, seq, "b2")  # its gateway was started again
+        written.put(RANGE, seq, "b2")  # the gateway was restarted
     for seq in (1, 2, 5):
         written.raw("fleet/note", b"{}", seq)
     verdict = written.verdict()
@@ -154,7 +154,7 @@ def test_clocks_that_are_wrong_are_said_and_make_nothing_missing(written: Writte
 
 
 def changed(fields: int) -> bytes:
-    """Today's schema of a range, with a field that we do not know and without the last."""
+    """Return today's schema of a range, with an unknown field and without the last one."""
     files = FileDescriptorSet.FromString(messages.descriptor_set("fleet.v1.Range"))
     message = next(one for file in files.file for one in file.message_type if one.name == "Range")
     del message.field[-1]

@@ -1,4 +1,4 @@
-"""What comes over the bus lies in the file as it came; what is lost is counted. Read with the stock mcap reader."""
+"""The recorder writes messages of the bus unchanged, and counts lost ones. mcap's reader reads the file."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def test_every_message_of_who_comes_later_lies_in_the_file_as_it_was_published(e
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
         for number in range(10):
-            # Each in a session of its own, and nothing waits: the recorder said that it was ready.
+            # Each publisher has a session of its own and starts at once, because the recorder is ready.
             with Bus.open(endpoint) as late:
                 for topic, message in (
                     ("sensor/range", pb.Range(range_m=1.25)),
@@ -124,7 +124,7 @@ def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
     with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
-        # Publishers that hold nothing: what they lost is lost. One skips two, another begins anywhere and wraps.
+        # Publishers without a cache cannot backfill. One skips two numbers, another one begins anywhere and wraps.
         for numbers in ((0, 1, 4, 5), (0xFFFFFFFE, 0xFFFFFFFF, 0)):
             with stranger.declare_publisher(key) as out:
                 wait_for(lambda out=out: out.matching_status.matching, "a subscriber")  # type: ignore[misc]  # zenoh's stub: a bool
@@ -156,17 +156,17 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
         session = recorder.start()
         out = publisher(bus, "red", "sensor/range")
         sent = 0
-        while not dropping.is_set() or sent < 1000:  # of which the publisher holds a few, to be asked for again
+        while not dropping.is_set() or sent < 1000:  # the publisher caches some of these for the backfill
             for _ in range(50):
                 out.put(pb.Range(range_m=1.0), time.time_ns())
             sent += 50
-            time.sleep(0.01)  # a pace that the hub carries whole: what is lost is lost in the queue
+            time.sleep(0.01)  # a rate that the hub passes without loss, so only the queue loses messages
         heard(bus._session)
         outcome = recorder.close()
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))[out.key]
     dropped, missed = outcome.drops[out.key], outcome.missed.get(out.key, 0)
-    # What the queue refused shows as a gap in the numbers of what was written, except after the last one; and some of
-    # it may have been had again.
+    # Messages that the queue dropped are gaps in the written numbers, except after the last one. The backfill may have
+    # filled some of them.
     assert held < sent <= held + dropped
     assert missed <= sent - held
     assert json.loads(metadata(session / "0001.mcap")["recording"]["drops"]) == dict(outcome.drops)
@@ -179,7 +179,7 @@ def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_larg
     with Bus.open(hub_apart) as own, zenoh.open(own_config(hub_apart)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path, max_bytes=30_000_000)
         session = recorder.start()
-        # By default Zenoh drops what it cannot pass on at once, on a busy machine most of what is so large.
+        # By default, Zenoh drops messages that it cannot send at once: on a busy machine, most of the large ones.
         whole: Any = {"congestion_control": zenoh.CongestionControl.BLOCK}
         stranger.put("fleet/red/map", payload, **whole)
         wait_for(lambda: recorder._session.bytes > len(payload), "it is in the file")
@@ -223,7 +223,7 @@ def test_a_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: 
         session = recorder.start()
         with pytest.raises(AnotherRecorder, match=str(session)):
             Recorder(bus, "fleet", tmp_path).start()
-        other = Recorder(bus, "other", tmp_path)  # another fleet is another matter
+        other = Recorder(bus, "other", tmp_path)  # another fleet may have its own recorder
         other.start()
         other.close()
         recorder.close()

@@ -1,4 +1,4 @@
-"""Files by size and by time, sessions by size, old sessions that give way, clocks that go back; no bus."""
+"""Rollover of files by size and time, of sessions by size, the quota, and clocks that go back. Without a bus."""
 
 import json
 import os
@@ -107,7 +107,7 @@ def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, Any], t
 
 
 def session(root: Path, number: int, *, closed: bool = True) -> Path:
-    """One of half a megabyte, an hour after the one before."""
+    """Write a session of half a megabyte, an hour after the one before."""
     now = BEGUN_NS + number * 3600 * SECOND_NS
     tape = SessionWriter(root, "fleet", Options(), now)
     feed(tape, now, count=400)

@@ -1,4 +1,4 @@
-"""Recorded frames against today's decoder: recorded vectors have no difference, and what was changed is found."""
+"""Recorded frames against today's decoder: recorded vectors have no difference, and each change is found."""
 
 import json
 from dataclasses import replace
@@ -49,7 +49,7 @@ def test_there_are_vectors() -> None:
 
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
 def test_every_field_of_a_vector_counts(path: Path) -> None:
-    """Whatever is changed in a recorded frame's readings is found, and named."""
+    """Any change in the readings of a recorded frame is found and named."""
     _, items = test_vector.read(path)
     frames = [number for number, item in enumerate(items) if isinstance(item, Rx) and item.readings]
     changed = 0
@@ -84,28 +84,28 @@ def test_an_echo_is_known_by_what_was_sent_and_for_two_seconds() -> None:
     assert redecoded([*known, echo])[0] == []
     late, _ = redecoded([*known, replace(echo, at_ns=6 * S)])
     assert [(each.what, each.now) for each in late] == [("verdict", "unknown_word")]
-    # Of a frame that was sent before the recording began, nothing is known.
+    # Frames from before the recording are unknown.
     assert redecoded([*known[:2], replace(echo, at_ns=S)])[0] == []
     assert len(redecoded([*known[:2], replace(echo, at_ns=3 * S)])[0]) == 1
 
 
 def test_what_the_recording_does_not_tell_is_no_difference_and_is_counted() -> None:
-    """Following without its # and with nothing in sight has the text of light seeking that waits for its #."""
+    """A frame of following without obstacles has the text of light seeking before its #."""
     seen = {"sensor/obstacle": {"left": True, "right": True}}
     frame = Rx(S, FOLLOWING, "sensors", ("sensor/obstacle",), seen)
     for then in (frame, replace(frame, published=(), readings={})):
         found, one = redecoded([KnownPlatform(0, "arduino"), KnownMode(0, None), then])
         assert (found, one.counts.undecided) == ([], 1)
-    # A mode that was confirmed at that very moment.
+    # A mode that was confirmed at the time of the frame.
     changing: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, None), frame, KnownMode(S + 1, Mode.FOLLOWING)]
     assert redecoded(changing)[0] == []
-    # What cannot be is a difference all the same.
+    # Impossible readings are a difference in any case.
     wrong = replace(frame, readings={"sensor/obstacle": {"left": False, "right": True}})
     assert [each.what for each in redecoded([KnownPlatform(0, "arduino"), wrong])[0]] == ["sensor/obstacle left"]
 
 
 def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_path: Path) -> None:
-    """The made session's line readings are not those of its frames, but for one frame here and there."""
+    """In the generated session, most line readings differ from their frames."""
     session = tmp_path / "made.mcap"
     make(session, seconds=12)
     result = run("sessions", "redecode", session)
@@ -137,7 +137,7 @@ def test_a_session_that_was_cut_off_is_decoded_as_far_as_it_goes(tmp_path: Path)
     session.write_bytes(session.read_bytes()[:-9000])
     result = run("sessions", "redecode", session, "--json")
     summary = json.loads(result.output.splitlines()[-1])
-    assert result.exit_code == 1  # its readings differ
+    assert result.exit_code == 1  # the readings differ
     assert "made.mcap" in summary["damage"]
     assert summary["frames"] > 0
 

@@ -1,4 +1,4 @@
-"""`fleet plan try`: the same plan decides what was decided, another one otherwise; and how that is told apart."""
+"""`fleet plan try`: the same plan makes the recorded decisions, and another plan makes others."""
 
 import json
 import signal
@@ -68,7 +68,7 @@ def until(process: GatewayProcess, subject: str, kind: str) -> None:
 
 @pytest.fixture(scope="module")
 def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rule, a hold, a gateway that is killed, a coordinator that is killed and started again, a new plan."""
+    """Record a rule, a hold, a killed gateway, a killed and restarted coordinator, and a new plan."""
     plan = tmp_path_factory.mktemp("plan") / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
     recorder = cars.start("-m", "fleet.cli", "record", "--sessions", str(plan.parent), "--json")
@@ -79,7 +79,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
         command(client, "next")
         until(first, "phase", "phase")
         drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 5.0))
-        drive.start()  # for longer than what is no difference, also if the coordinator hears of it late
+        drive.start()  # longer than the tolerance of a difference, also if the coordinator gets it late
         until(first, "red", "rule")
         drive.join()
         until(first, "red", "role")
@@ -163,7 +163,7 @@ def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:
 
 def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "part"
-    # A plan is published again every ten seconds: between the first two times there is none.
+    # The coordinator publishes the plan every ten seconds. Between the first two there is no other.
     first, second, *_ = (each.recorded_ns for each in Session(recorded).messages(["fleet/@coordinator/plan"]))
     between = ("--from", time_spec.iso(first + S), "--to", time_spec.iso(second))
     assert run("sessions", "cut", recorded, *between, "--out", out).exit_code == 0
@@ -197,7 +197,7 @@ def timeline(*found: RecordedDecision) -> Timeline:
 
 def test_differences_are_stretches_of_time() -> None:
     then = timeline(said(1, "tracking"), said(5, "tracking"), said(8, "manual"))
-    assert len(then["red"]) == 2  # what is said again is not decided again
+    assert len(then["red"]) == 2  # a repeated message is no new decision
     assert list(differences(then, then, 0, 20 * S)) == []
     now = timeline(said(1.5, "tracking"), said(4, "following"), said(8, "manual"))
     assert list(differences(then, now, 0, 20 * S)) == [
@@ -205,7 +205,7 @@ def test_differences_are_stretches_of_time() -> None:
         DecisionDifference("red", 4 * S, 8 * S, then["red"][0], now["red"][1]),
     ]
     assert list(differences(then, {}, 0, 3 * S)) == [DecisionDifference("red", 1 * S, 3 * S, then["red"][0], None)]
-    # Two that follow each other are two.
+    # Two decisions in a row are two.
     changing = timeline(said(1, "a"), said(2, "b"))
     assert [(each.from_ns, each.to_ns) for each in differences(changing, {}, 0, 3 * S)] == [(S, 2 * S), (2 * S, 3 * S)]
 
@@ -260,7 +260,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
 
 
 def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> None:
-    """The session keeps the plan as plan.yaml, and a car without a link was simulated then."""
+    """The session has the plan as plan.yaml, and a car without a link was simulated then."""
     made = Made(tmp_path / "0001.mcap", Writer)
     for at in range(3):
         made.put("fleet/@coordinator/decision", pb.Decision(subject="red", decided="left alone", kind="alone"), at + 1)

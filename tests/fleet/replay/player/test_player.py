@@ -1,4 +1,4 @@
-"""A session on the bus again: under another name, byte for byte, on time, and nothing takes a command."""
+"""Replays a session to the bus: under another name, byte for byte, on time, and without taking commands."""
 
 import json
 import signal
@@ -32,7 +32,7 @@ def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
 
 
 class InOrder(Writer):
-    """Writes by time, as a recorder does."""
+    """A writer that sorts messages by time, as a recorder's are."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -61,12 +61,12 @@ def play(fleet: FleetProcesses, session: Path, *more: str) -> GatewayProcess:
 def test_a_schedule_has_one_origin() -> None:
     every = Schedule(rate=3.0)
     assert [every.due_s(START_NS + number * S // 10) for number in range(4)] == pytest.approx([0, 1 / 30, 2 / 30, 0.1])
-    # A tenth of a second a thousand million times is not a thousandth off.
+    # After 10^9 steps of a tenth of a second, the error is less than a thousandth.
     long = Schedule()
     long.played_ns = 10**17
     assert long.due_s(0) == 1e8
     assert long.due_s(S // 10) == 1e8 + 0.1
-    # Pauses are made shorter, a clock that went back stands, a loop goes on from where it ended.
+    # Pauses are shortened, a clock that went back stands still, and a loop continues at its end.
     gaps = Schedule(rate=2.0, longest_gap_ns=5 * S)
     assert [gaps.due_s(at * S) for at in (0, 4, 104, 103, 104)] == [0.0, 2.0, 4.5, 4.5, 5.0]
     assert gaps.shortened == 1
@@ -94,8 +94,8 @@ def test_all_of_it_comes_again_as_it_was(fleet: FleetProcesses, session: Path) -
         assert [sample.payload for sample in now[key]] == [one.payload for one in ones], key
         assert [sample.sequence for sample in now[key]] == [one.sequence for one in ones], key
         assert {sample.encoding for sample in now[key]} == {f"application/protobuf;{ones[0].message}"}
-    # Six seconds at three times their speed. When it was put, not when it came: each is as long before the last as it
-    # was then, less what this machine made it wait; that is next to nothing for one of them at least.
+    # Six seconds at triple speed. Compare publication times, not arrival times: the distance of each message to the
+    # last one is a third of the recorded one, less a delay by this machine. At least one message has almost no delay.
     put = [
         (one.recorded_ns / 3, sample.time_ns)
         for key, ones in then.items()
@@ -147,7 +147,7 @@ def test_a_part_of_it_over_and_over(fleet: FleetProcesses, session: Path) -> Non
     assert player.end(signal.SIGINT) == 0
     assert {sample.key.split("/")[1] for sample in got} == {"red"}
     first, second, *_ = (number for before, number in pairwise([1 << 31, *ranges()]) if number < before)
-    assert first > second  # the first round begins later
+    assert first > second  # only the first round begins at --offset
 
 
 def test_what_was_said_before_the_beginning_can_be_asked_for(fleet: FleetProcesses, session: Path) -> None:
@@ -176,7 +176,7 @@ def test_who_ends_it_before_the_first_message_is_told_no_fault(fleet: FleetProce
 
 
 def live(fleet: FleetProcesses, token: str) -> None:
-    """Be there for all to see."""
+    """Declare a liveliness token."""
     fleet.bus.token(token)
     with bus.Bus.open(fleet.endpoint) as other:
         wait_for(lambda: other.tokens(token), "the hub knows of it")
@@ -187,7 +187,7 @@ def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, sessio
     player = play(fleet, session, "--as", "again")
     assert player.wait() == 2
     assert "fleet again is alive (red): name this one otherwise with --as" in player.stderr
-    # Also one whose cars have not come yet; a policy that waits for the recorded cars is what --cars-only is for.
+    # Also without cars yet. --cars-only is for a policy that waits for the recorded cars.
     live(fleet, "third/@supervisor")
     assert play(fleet, session, "--as", "third", "--cars-only").wait() == 2
     live(fleet, "tried/@coordinator")
@@ -214,7 +214,7 @@ def test_commands_of_a_recording_are_not_given_again(fleet: FleetProcesses, tmp_
     assert play(fleet, tmp_path / "driven.mcap").wait() == 0
     wait_for(lambda: got, "the reading has come, before which the command would have")
     assert got == ["fleet-replay/red/sensor/range"]
-    # Neither is it taken out of the recording, nor would it be published if it were.
+    # The player by itself publishes no command, either.
     player = Player(fleet.bus, "direct", "")
     player.play(Session(tmp_path / "driven.mcap").messages(), Schedule(), 0.0, lambda: False, lambda _: None)
     assert player.published == 1

@@ -1,4 +1,4 @@
-"""A session becomes an .rrd with its layout; what is in it is counted by Rerun's own reader."""
+"""Exports a session to an .rrd with its layout. Rerun's own reader counts the rows."""
 
 import os
 import shutil
@@ -104,7 +104,7 @@ def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
         names = part.field.rstrip("!").partition("[")[0].split(".")
         assert names[0] in fields, part
         assert len(names) == 1 or names[1] in fields[names[0]].message_type.fields_by_name, part
-        # What may be missing must not be drawn as the zero that stands for it.
+        # A missing value must not be drawn as zero.
         assert not isinstance(part, panels.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
     for words in panels.TEXT_LINES:
         fields = message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name
@@ -132,7 +132,7 @@ def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None
     from mcap.writer import Writer
 
     class Flushing(Writer):
-        """A chunk for every hundred messages."""
+        """A writer with one chunk for every hundred messages."""
 
         def add_message(self, *arguments: object, **named: object) -> None:
             super().add_message(*arguments, **named)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""`fleet view`: what it shows is what is on the bus; it listens on loopback only, and leaves nothing behind."""
+"""`fleet view` shows the messages of the bus, listens on loopback only, and leaves no process behind."""
 
 import os
 import signal
@@ -65,7 +65,7 @@ def following_of(bus: Bus, sink: Callable[[rr.RecordingStream], None]) -> Iterat
 
 
 def ended(program: psutil.Process) -> bool:
-    """Whether it is gone, or only waits for its parent to look."""
+    """Return True if the process has ended or is a zombie."""
     try:
         return not program.is_running() or program.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -73,7 +73,7 @@ def ended(program: psutil.Process) -> bool:
 
 
 def viewers(process: GatewayProcess) -> list[psutil.Process]:
-    """Rerun's programs below a process."""
+    """Return the processes of Rerun below a process."""
     below = psutil.Process(process.pid).children(recursive=True)
     return [each for each in below if each.name().startswith("rerun")]
 
@@ -191,8 +191,8 @@ def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
                     following.step()
                     return following.dropped > 2000
 
-                # A viewer that runs may take longer than this to acknowledge what it has, so only a stopped one has
-                # this little time.
+                # A running viewer may take longer than this to acknowledge its data, so only a stopped one gets so
+                # little time.
                 with monkeypatch.context() as hurried:
                     hurried.setattr(live, "VIEWER_FLUSH_TIMEOUT_S", 0.2)
                     wait_for(full, "what comes is left out")

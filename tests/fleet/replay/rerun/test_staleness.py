@@ -1,4 +1,4 @@
-"""Lanes end where nothing more was heard: neither sooner, nor twice, whatever the order in which batches come."""
+"""Lanes end after the last message: not sooner, and only once, in any order of batches."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def batch(*seconds: float) -> Any:
 
 
 def drawn(ends: StaleStates, now: float) -> list[float]:
-    """Seconds at which lanes end."""
+    """Return the seconds at which lanes end."""
     found: list[float] = []
     for chunk in ends.chunks(int(now * 1e9)):
         made = chunk.to_record_batch()
