@@ -1,4 +1,4 @@
-"""The bus on real Zenoh sessions: hub, publications, queries, tokens, and what happens without a hub."""
+"""The bus on real Zenoh sessions: hub, publications, queries, tokens, and the time without a hub."""
 
 import asyncio
 import os
@@ -20,7 +20,7 @@ from tests.support.ports import free_endpoint
 
 
 def wait_for(condition: Callable[[], object]) -> None:
-    """Poll until it holds; Zenoh's callbacks come when they come."""
+    """Poll until a condition holds. Zenoh's callbacks may come at any time."""
     processes.wait_for(condition, "what is waited for on the bus")
 
 
@@ -107,7 +107,7 @@ def test_ctrl_c_does_not_interrupt_a_declaration(endpoint: str) -> None:
 
 
 def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str) -> None:
-    """Zenoh answers for a watch from what has come so far: a coordinator was told that there was no car."""
+    """Zenoh answers a watcher's query with the tokens until now. So a coordinator once saw no car."""
     there = {"fleet/red", "fleet/green", "fleet/blue"}
     with bus.Bus.open(endpoint) as cars:
         for token in there:
@@ -125,7 +125,7 @@ def test_a_hub_is_started_once_and_ends_by_itself() -> None:
     where = free_endpoint()
     idle = subprocess.Popen([sys.executable, "-m", "schemas.bus.hub", "--endpoint", where, "--idle-s", "3"])
     wait_for(lambda: bus.accepts(where))
-    with bus.Bus.open(where, start_hub=True) as opened:  # it must not end while the second one starts
+    with bus.Bus.open(where, start_hub=True) as opened:  # the session must not end while the second one starts
         assert opened.connected
         second = subprocess.run(
             [sys.executable, "-m", "schemas.bus.hub", "--endpoint", where],
@@ -216,7 +216,7 @@ def test_the_endpoint_is_the_argument_then_the_variable_then_loopback(monkeypatc
 
 
 async def turns() -> None:
-    """Let the loop run what is ready, and what that makes ready."""
+    """Let the loop run all ready callbacks, and the callbacks that these add."""
     for _ in range(4):
         await asyncio.sleep(0)
 
@@ -236,7 +236,7 @@ async def test_a_handover_keeps_order_is_bounded_and_counts_what_it_drops() -> N
 
 
 async def test_a_handover_lets_others_have_their_turn() -> None:
-    """Of two that are full, the second waited until the first was empty."""
+    """With two full handovers, the second one used to wait until the first one was empty."""
     taken: list[str] = []
     loop = asyncio.get_running_loop()
     many: bus.Handover[str] = bus.Handover(loop, taken.append, limit=1000)

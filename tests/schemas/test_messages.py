@@ -15,7 +15,7 @@ from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 
 SERVICES = {"fleet.v1.DownCommand", "fleet.v1.ReloadCommand"}
-"""What the fleet's own services take."""
+"""Commands of the fleet's own services."""
 NAMES = sorted(
     {topic.message for topic in topics.TOPICS.values()}
     | {row.message for row in COMMANDS.values()}
@@ -46,7 +46,7 @@ def test_units_name_fields_of_the_message(topic: topics.Topic) -> None:
 
 
 def test_no_enum_is_on_the_wire() -> None:
-    """An enum number that a schema lacks makes Rerun's MCAP importer die."""
+    """Rerun's MCAP importer crashes on an enum number that is not in the schema."""
     assert not [name for name, kind in pb.DESCRIPTOR.enum_types_by_name.items() if kind]
     for message in pb.DESCRIPTOR.message_types_by_name.values():
         assert not [field.name for field in message.fields if field.enum_type]

@@ -1,4 +1,4 @@
-"""Where the state of a fleet lies, by platform and by bus."""
+"""The directory of a fleet's state, by platform and by bus."""
 
 import sys
 from pathlib import Path

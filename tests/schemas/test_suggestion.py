@@ -1,4 +1,4 @@
-"""Which names are near a word: real misspellings and beginnings, and nothing that is only somewhat like it."""
+"""Names near a word: real misspellings and beginnings, but no names with a vague similarity."""
 
 import pytest
 

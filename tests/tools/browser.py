@@ -14,7 +14,7 @@ APT = ["apt-get", "install", "--yes", "--no-install-recommends", "chromium"]
 
 
 def main() -> None:
-    """Take the distribution's package where we may install it, else Playwright's download. Exit 1 with what to type."""
+    """Install the distribution's package as root, else Playwright's download. After a failure, print the command."""
     if any(map(shutil.which, CHROMIUM_NAMES)):
         return
     with sync_playwright() as playwright:

@@ -65,7 +65,7 @@ COMMANDS: Final = ("stop", "resume")
 
 @dataclass(slots=True)
 class State:
-    """What was published until a moment."""
+    """The published state at a moment."""
 
     rows: dict[str, CarStatus] = field(default_factory=dict)
     services: dict[str, str] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class State:
                 self.commands.append(f"$ fleet {value.verb} {reading.car}")
 
     def table(self) -> Any:
-        """The table of `fleet up`, drawn by its own code."""
+        """Return the table of `fleet up`, drawn by its own code."""
         processes = _Processes(
             [SimpleNamespace(name=name, status=SimpleNamespace(state=state)) for name, state in self.services.items()],
             "~/.local/state",
@@ -117,7 +117,7 @@ class _Processes(list[Any]):
 
 
 def states(session: Session, count: int) -> Iterator[State]:
-    """The state at `count` moments, from a while before the first command to a while after the last."""
+    """Yield the state at `count` moments, from BEFORE_S before the first command to AFTER_S after the last one."""
     readings = sorted(session.messages(decode=True), key=lambda reading: reading.time)
     seconds = [reading.time.timestamp() for reading in readings]
     asked = [

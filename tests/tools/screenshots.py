@@ -20,45 +20,45 @@ from fleet.replay.rerun.viewer import VIEWER_POLL_INTERVAL_S, Viewer, free_port
 
 SIZE: Final = "1920x1080"
 AT: Final = 0.75
-"""Of the session's time: where the cursor is."""
+"""Position of the cursor, as a share of the session's time."""
 UP_WITHIN_S: Final = 30.0
 DRAWN_WITHIN_S: Final = 120.0
 SETTLE_S: Final = 1.0
-"""The viewer offers no sign that it has drawn everything: two pictures so far apart that are the same are one."""
+"""Time between two equal pictures that show the end of drawing. The viewer has no sign of it."""
 DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 COLOURS: Final = 255
 WORLD: Final = "World, from above"
 LANES: Final = (0, 93, 960, 768)
-"""Of a car's picture: its lanes, in a size in which one can read them, without the viewer's bars."""
+"""The part of a car's picture with its lanes in a readable size, without the viewer's bars."""
 
 
 class NoPicture(Exception):
-    """There is no picture; its text says what is missing."""
+    """There is no picture. The text names the missing part."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What the viewer says that it shows."""
+    """The viewer's report about its views."""
 
     views: tuple[str, ...]
     """Names of all views, on every tab."""
     faults: tuple[str, ...]
-    """What it could not show, and why."""
+    """Faults of views, with the causes."""
 
 
 def software_driver() -> str | None:
-    """The installed driver that needs no card; without naming it a machine's broken card would be tried first."""
+    """Return the installed driver that needs no card. Without its name, Vulkan would try a broken card first."""
     found = [str(each) for place in DRIVERS for each in sorted(Path(place).glob("lvp_icd*.json"))]
     return found[0] if found else None
 
 
 def take(rrd: Path, out: Path, view: str = "") -> Shown:
-    """Draw `rrd` as its layout says into a PNG; of the view alone whose name begins so. Raises NoPicture."""
+    """Draw `rrd` with its layout into a PNG: all of it, or the view whose name begins with `view`. Raise NoPicture."""
     port = free_port()
     with tempfile.TemporaryDirectory() as home, _viewer(port, Path(home)) as viewer:
         try:
             png, shown = _look(_connect(viewer, port), rrd, view)
-        except (RuntimeError, OSError, ValueError):  # its ways to say that nobody answers, or no more
+        except (RuntimeError, OSError, ValueError):  # the viewer's errors without an answer
             viewer.wait(SETTLE_S)
             raise NoPicture(
                 "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
@@ -84,7 +84,7 @@ def _look(client: Any, rrd: Path, view: str) -> tuple[bytes, Shown]:
 
 
 def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
-    """Make those of a session; by file name what is shown. Raises NoPicture, NoSession and ExportFailed."""
+    """Make the pictures of a session. Return the views by file name. Raise NoPicture, NoSession and ExportFailed."""
     from fleet.recording.reading.session import Session
     from fleet.replay.rerun.export import export
 
@@ -104,7 +104,7 @@ def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
 
 
 def _loaded(client: Any) -> Any:
-    """Its state once it has all: a recording is there, and its time has an end, as soon as it has some of it."""
+    """Wait until the viewer has a whole recording, whose time has an end. Return the viewer's state."""
     deadline = time.monotonic() + UP_WITHIN_S
     while (state := client.get_state()).loading or not (
         state.recordings and state.recordings[0].timelines and state.views
@@ -116,7 +116,7 @@ def _loaded(client: Any) -> Any:
 
 
 def _drawn(client: Any, view_id: str | None) -> bytes:
-    """A picture, once two in a row are the same."""
+    """Return a picture, once two in a row are equal."""
     deadline = time.monotonic() + DRAWN_WITHIN_S
     last = _screenshot(client, view_id, deadline)
     while time.monotonic() < deadline:
@@ -129,7 +129,7 @@ def _drawn(client: Any, view_id: str | None) -> bytes:
 
 
 def _screenshot(client: Any, view_id: str | None, deadline: float) -> bytes:
-    """A picture; the viewer gives one up after five seconds, which on a busy machine without a card is too soon."""
+    """Return a picture. The viewer gives up after five seconds, too soon on a busy machine without a card: retry."""
     while True:
         try:
             png: bytes = client.take_screenshot(view_id)
@@ -141,7 +141,7 @@ def _screenshot(client: Any, view_id: str | None, deadline: float) -> bytes:
 
 
 def _write(png: bytes, out: Path) -> None:
-    """With a palette: a third of the bytes, and nothing that one would see."""
+    """Write a picture with a palette. This saves two thirds of the bytes without a visible difference."""
     from PIL import Image  # rerun-sdk depends on it
 
     with Image.open(io.BytesIO(png)) as image:
@@ -150,7 +150,7 @@ def _write(png: bytes, out: Path) -> None:
 
 @contextlib.contextmanager
 def _viewer(port: int, home: Path) -> Iterator[Viewer]:
-    """Rerun's viewer without a window, with a home of its own: driver caches and settings stay out of the user's."""
+    """Start Rerun's viewer without a window, in a home of its own, away from the user's caches and settings."""
     own = {
         name: str(home) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR")
     }
@@ -169,7 +169,7 @@ def _connect(viewer: Viewer, port: int) -> Any:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
-        except (RuntimeError, OSError, ValueError):  # how it says that nothing answers yet
+        except (RuntimeError, OSError, ValueError):  # the errors before the viewer answers
             if viewer.wait(VIEWER_POLL_INTERVAL_S) is not None or time.monotonic() > deadline:
                 raise
         else:

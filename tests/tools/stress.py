@@ -1,14 +1,14 @@
 """Runs the suite twice at once while its processes are paused at random: `make stress` (POSIX).
 
-A paused process is what a busy machine makes of any process: late, at any line. All processes of both suites are
-paused but the two controllers of pytest: workers, hubs, gateways, cars and what they leave behind.
+On a busy machine, any process may be late at any line. A pause has the same effect. All processes of both suites are
+paused but the two controllers of pytest: workers, hubs, gateways, cars, and processes that a test left behind.
 A seed repeats the times and the draws, not the processes that run at those times.
 
 Each suite has half of the workers. With all of them, twice the processes of `make test` would share the processors, and
 cars would be late without a pause.
 
-A process that a test itself has stopped is left alone. Tests stop a process by `tests.support.processes.freeze`, which
-waits for the end of a pause.
+The tool never resumes a process that a test itself has stopped. Tests stop a process by
+`tests.support.processes.freeze`, which waits for the end of a pause.
 """
 
 import argparse
@@ -31,11 +31,11 @@ from tests.support import scheduling
 ROOT = Path(__file__).parents[2]
 SUITES = ("first", "second")
 RUN = "STRESS_RUN"
-"""Variable in the environment of all processes of a run: a hub has left the family of the test that needed it."""
+"""Variable in the environment of all processes of a run. A hub is no descendant of its test, so only this finds it."""
 PAUSE_S = (0.010, 0.900)
 """Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
 CONTROL_PAUSE_S = (0.010, 0.300)
-"""The same for a gateway and a simulator. A gap of 0.5 s in a gateway's loop ends a drive
+"""Range of the pauses of a gateway or simulator. A gap of 0.5 s in a gateway's loop ends a drive
 (docs/explanation/how-it-works.md). A car shows its stop by a pause of its reports. So longer pauses would rightly fail
 each test that drives. Tests of these rules stop the process themselves."""
 GAP_S = (0.0, 2.0)
@@ -57,13 +57,13 @@ class Pauses:
         self._found: list[psutil.Process] = []
         self._look_at = self._next_at = 0.0
         self._paused: dict[psutil.Process, float] = {}
-        """When each paused process resumes."""
+        """Time at which each paused process resumes."""
         self.count = 0
         self.total_s = 0.0
         self.processes: set[int] = set()
 
     def step(self, now: float) -> None:
-        """Do what is due: resume, list, pause."""
+        """Resume, list and pause processes that are due."""
         for process in [each for each, until in self._paused.items() if until <= now]:
             self._resume(process)
         if now >= self._look_at:
@@ -83,7 +83,7 @@ class Pauses:
         """Pause a process for a share of the range of lengths, 0 to 1."""
         if process in self._paused:
             return
-        with suppress(psutil.Error):  # it has ended
+        with suppress(psutil.Error):  # the process has ended
             if process.status() == psutil.STATUS_STOPPED:
                 return
             least, most = CONTROL_PAUSE_S if in_control(process) else PAUSE_S
@@ -109,7 +109,7 @@ def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
     """Return the processes of a run but those that are spared."""
     found = []
     for process in psutil.process_iter():
-        with suppress(psutil.Error):  # it has ended, or belongs to somebody else
+        with suppress(psutil.Error):  # the process has ended, or belongs to another user
             if process.pid not in spared and process.environ().get(RUN) == run:
                 found.append(process)
     return found
@@ -160,7 +160,7 @@ def main() -> int:
     finally:
         pauses.resume_all()
     codes = [suite.wait() for suite in suites.values()]
-    for process in of_run(str(directory), ()):  # hubs in their last seconds, and what an interrupted test left
+    for process in of_run(str(directory), ()):  # hubs in their last seconds, and processes of an interrupted test
         with suppress(psutil.Error):
             process.terminate()
     for name, code in zip(suites, codes, strict=True):

@@ -1,4 +1,4 @@
-"""Pictures of a replay: not blank, the expected views, the expected colours in the expected places."""
+"""Pictures of a replay: not blank, with the expected views, and with the expected colors in their places."""
 
 import contextlib
 from pathlib import Path
@@ -13,16 +13,16 @@ from tests.fleet.replay.make_session import make
 from tests.tools.screenshots import NoPicture, Shown, pictures, software_driver
 
 NEAR = 24
-"""How far a pixel's channels may be from a colour: lines are smoothed, and the picture has a palette."""
+"""Maximum distance of a pixel's channels from a color. Lines are smoothed, and the picture has a palette."""
 
 
 def share(image: np.ndarray, colour: tuple[int, int, int]) -> float:
-    """Of the pixels of an image those that have about this colour."""
+    """Return the share of an image's pixels that have about this color."""
     return float((np.abs(image.astype(int) - colour).max(axis=2) < NEAR).mean())
 
 
 def lane(value: int) -> tuple[int, int, int]:
-    """A state's colour as the viewer paints it: darker, so that its words can be read."""
+    """Return a state's color as the viewer paints it: darker, for a readable text."""
     return tuple(int(0.785 * (value >> shift & 255)) for shift in (24, 16, 8))  # type: ignore[return-value]  # three
 
 
@@ -36,7 +36,7 @@ def test_the_pictures_show_the_fleet_a_car_and_the_world(tmp_path: Path) -> None
     session = tmp_path / "0001.mcap"
     make(session)
     if software_driver() is None:
-        # Nothing can be drawn here, or by a card that we know nothing of: what is said is all there is to see.
+        # Without a driver, or with an unknown card, the test can only check the message.
         with contextlib.suppress(NoPicture):
             pictures(session, tmp_path)
         return
@@ -73,7 +73,7 @@ def _is_a_car(image: np.ndarray, shown: Shown) -> None:
     for state in ("tracking", "confirmed", "true"):
         assert share(left, lane(colors.STATE_COLORS[state])) > 0.002, state
     assert share(left, lane(0xFF0010FF)) > 0.002, "the LED's lanes are in its colour"
-    # 0.00065 seen, less as lines are smoothed.
+    # Measured: 0.00065. The share is small because lines are smoothed.
     assert share(right, car_color("blue", 0)) > 0.0002, "distance and battery"
     assert share(right, (217, 83, 79)) > 0.00005, "the critical threshold"
 

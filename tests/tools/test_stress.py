@@ -1,4 +1,4 @@
-"""`make stress` resumes each process that it paused, and leaves alone what a test has stopped."""
+"""`make stress` resumes each process that it paused, and no process that a test has stopped."""
 
 import os
 import random
@@ -20,9 +20,9 @@ ONE_TEST = f"one-test-of-{os.getpid()}"
 
 @pytest.fixture
 def sleepers() -> Iterator[list[psutil.Process]]:
-    """Two processes that do nothing."""
+    """Start two processes that sleep."""
     started = [subprocess.Popen(["sleep", "600"], env={"STRESS_RUN": ONE_TEST}) for _ in range(2)]
-    # Until it has been executed, a child still has the environment of its parent.
+    # Until its exec, a child still has the environment of its parent.
     wait_for(lambda: len(of_run(ONE_TEST, ())) == 2, "both can be found")
     yield [psutil.Process(each.pid) for each in started]
     for each in started:

@@ -66,7 +66,7 @@ def bus(endpoint: str) -> Iterator[Bus]:
 
 
 def publisher(bus: Bus, car: str, topic: str) -> Publisher:
-    """Declare a publisher. Wait until it has the recorder's subscription, which an older session gets a moment later."""
+    """Declare a publisher. Wait until it has the recorder's subscription. An older session gets it late."""
     made = bus.publisher(keys.topic_key("fleet", car, topic), TOPICS[topic], car)
     with bus._session.declare_publisher(made.key) as plain:  # zenoh.ext's have no such method
         wait_for(lambda: plain.matching_status.matching, f"a subscriber of {made.key}")  # type: ignore[attr-defined]

@@ -1,6 +1,6 @@
 """The other ends of links: the master of a PTY, a TCP server, a module of a Bluetooth service in this process.
 
-Each does what a car's end can do. The link does not know: it goes through pyserial, a socket, bleak's BlueZ backend.
+Each behaves as a car's end can. The link uses its real library: pyserial, a socket, or bleak's BlueZ backend.
 """
 
 import asyncio
@@ -28,27 +28,27 @@ class Peer(ABC):
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Send all of it; blocks while nobody takes it."""
+        """Send all bytes. The call blocks while the link takes none."""
 
     @abstractmethod
     def receive(self, size: int) -> bytes:
-        """Exactly so many bytes."""
+        """Return exactly `size` bytes."""
 
     @abstractmethod
     def die(self) -> None:
-        """Hang up; a PTY as an unplugged port does."""
+        """Close the connection. A PTY closes as an unplugged port does."""
 
     @abstractmethod
     def revive(self) -> None:
-        """Be there again, under the same URL."""
+        """Come back under the same URL."""
 
     @abstractmethod
     def stall(self) -> None:
-        """Take no more bytes, without hanging up."""
+        """Take no more bytes, but keep the connection."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of everything."""
+        """Close everything."""
 
 
 class PtyPeer(Peer):
@@ -85,7 +85,7 @@ class PtyPeer(Peer):
         os.close(slave)
 
     def stall(self) -> None:
-        pass  # nobody reads it: it will be full
+        pass  # no reader: the buffer is full
 
     def close(self) -> None:
         self.die()
@@ -101,7 +101,7 @@ class TcpPeer(Peer):
 
     @property
     def peer(self) -> socket.socket:
-        """The connection; waits for one."""
+        """Wait for a connection, and return it."""
         if self._peer is None:
             self._peer, _ = self._listener.accept()
             self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -123,15 +123,15 @@ class TcpPeer(Peer):
         self._peer = None
 
     def reset(self) -> None:
-        """Die with a real RST."""
+        """Close the connection with a real RST."""
         self.peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.die()
 
     def revive(self) -> None:
-        pass  # it listens all the time
+        pass  # the server always listens
 
     def stall(self) -> None:
-        pass  # nobody reads it: it will be full
+        pass  # no reader: the buffer is full
 
     def close(self) -> None:
         if self._peer is not None:
@@ -140,10 +140,10 @@ class TcpPeer(Peer):
 
 
 class BlePeer(Peer):
-    """A module that a private BlueZ hears."""
+    """A module of a private BlueZ."""
 
     def __init__(self) -> None:
-        from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as what it needs
+        from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as its parts
 
         self.module = Module(free_address(), "BT04")
         self.bluez = FakeBluez(self.module)
@@ -151,7 +151,7 @@ class BlePeer(Peer):
         self._before = os.environ.get(SYSTEM_BUS)
         os.environ[SYSTEM_BUS] = self.bluez.address
         self._write_s = ble.BLE_WRITE_TIMEOUT_S
-        # a busy machine keeps both ends from running for longer than a command may take
+        # on a busy machine, both ends may stall for longer than the timeout of a command
         ble.BLE_WRITE_TIMEOUT_S = PATIENCE_S  # type: ignore[misc]
 
     def send(self, data: bytes) -> None:
@@ -170,7 +170,7 @@ class BlePeer(Peer):
         self.stall_after(0)
 
     def stall_after(self, pieces: int) -> None:
-        """Take so many more."""
+        """Take this number of further pieces."""
         self.module.takes = pieces
         ble.BLE_WRITE_TIMEOUT_S = self._write_s  # type: ignore[misc]
 
@@ -184,14 +184,14 @@ class BlePeer(Peer):
 
 
 async def settled() -> None:
-    """Wait until bleak has noticed that its bus is gone: it keeps one for as long as there is a loop."""
+    """Wait until bleak has noticed the end of its bus, of which it keeps one per loop."""
     async with asyncio.timeout(PATIENCE_S):
         while others := asyncio.all_tasks() - {asyncio.current_task()}:
             await asyncio.wait(others)
 
 
 def open_descriptors() -> dict[str, str]:
-    """What this process has open; where the system does not tell, nothing."""
+    """Return the open descriptors of this process, none if the system does not list them."""
     found = {}
     with contextlib.suppress(FileNotFoundError):
         for each in Path("/proc/self/fd").iterdir():
@@ -208,5 +208,5 @@ async def no_threads() -> None:
 
 
 def link_threads() -> list[threading.Thread]:
-    """Threads of links."""
+    """Return the threads of links."""
     return [thread for thread in threading.enumerate() if thread.name.startswith("read ")]

@@ -1,4 +1,4 @@
-"""What only Bluetooth LE does: modules of several kinds, pieces, names, a service that hangs, dies or remembers."""
+"""Behavior of Bluetooth LE only: kinds of modules, pieces, names, and a service that hangs, dies or remembers."""
 
 import asyncio
 import gc
@@ -79,7 +79,7 @@ async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> N
 
 
 async def test_a_frame_goes_in_pieces_of_what_the_module_takes(peer: BlePeer) -> None:
-    """The fake refuses a longer one, as BlueZ does."""
+    """The fake rejects a longer piece, as BlueZ does."""
     for mtu, pieces in ((23, [LED[:20], LED[20:]]), (28, [LED[:25], LED[25:]]), (185, [LED])):
         peer.module.mtu = mtu
         link = await open_link(peer.url)
@@ -132,7 +132,7 @@ async def test_by_name(peer: BlePeer) -> None:
 
 
 async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
-    """One of them is connected, by another gateway: it is not heard, and counts."""
+    """Another gateway is connected to one of them. This one does not advertise, but counts."""
     first = await open_link(peer.url)
     other = Module(free_address(), "BT04")
     peer.bluez.modules.append(other)
@@ -153,7 +153,7 @@ async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
 
 
 async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """BlueZ answers neither Connect nor Disconnect, for which bleak would wait for ever."""
+    """BlueZ answers neither Connect nor Disconnect. bleak alone would wait without an end."""
     monkeypatch.setattr(ble, "DISCONNECT_TIMEOUT_S", 0.2)
     peer.module.connects = peer.module.leaves = False
     await refused(peer, timeout_s=0.5)
@@ -209,7 +209,7 @@ asyncio.run(main())
 async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_taken_over(
     peer: BlePeer, *, named: bool
 ) -> None:
-    """It does not advertise then, so a scan alone would never find it again."""
+    """A connected module does not advertise, so a scan alone would never find it again."""
     done = await asyncio.to_thread(
         subprocess.run, [sys.executable, "-c", KILLED, str(peer.url)], env=os.environ, timeout=60, check=False
     )
@@ -223,7 +223,7 @@ async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_t
 
 
 async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(peer: BlePeer) -> None:
-    """No callback tells, and bleak goes on to say that it is connected, with the service's next life too."""
+    """bleak calls no callback. It reports a connection, also after the restart of the service."""
     link = await open_link(peer.url)
     peer.bluez.kill()
     with pytest.raises(LinkLost, match=r"is gone: .*ServiceUnknown"):
@@ -238,7 +238,7 @@ async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(
 
 
 async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
-    """Its next life has no such connection, though bleak remembers one."""
+    """The restarted service has no connection, although bleak remembers one."""
     link = await open_link(peer.url)
     peer.bluez.kill()
     peer.bluez.restart()
@@ -250,7 +250,7 @@ async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
 
 
 async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: BlePeer) -> None:
-    """Radio cannot be held back. What had come is still read, then the cause is told."""
+    """Radio has no flow control. The link still returns the received bytes, then the cause of its end."""
     size = MAX_BUFFERED_BYTES + 20_000
     peer.module.mtu = 515
     await asyncio.to_thread(peer.send, b"x" * size)
@@ -277,13 +277,13 @@ async def test_opening_that_is_given_up_leaves_nothing(peer: BlePeer) -> None:
             await asyncio.sleep(0)
         opening.cancel()
         try:
-            await (await opening).close()  # it was faster
+            await (await opening).close()  # the link opened before the close
         except asyncio.CancelledError:
             given_up += 1
         assert not peer.module.waiting
     assert given_up
     async with asyncio.timeout(PATIENCE_S):
-        while len(open_descriptors()) > len(before):  # the other ends are in this process too
+        while len(open_descriptors()) > len(before):  # this process also has the other ends
             gc.collect()
             await asyncio.sleep(0.01)
     link = await open_link(peer.url)

@@ -1,4 +1,4 @@
-"""A whole gateway over Bluetooth LE: a simulated car on the UART of a module that a private BlueZ hears."""
+"""A whole gateway over Bluetooth LE: a simulated car on the UART of a module of a private BlueZ."""
 
 import sys
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
 
 REPEAT_S = 5.0
-"""Time after which a driver who sees the car stand presses again."""
+"""Time after which the driver of a car that stands repeats the drive."""
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
 
@@ -26,7 +26,7 @@ def peer() -> Iterator[BlePeer]:
 
 @pytest.fixture
 def fleet(tmp_path: Path, peer: BlePeer) -> Iterator[FleetProcesses]:
-    """Its processes are told of the private bus, which must outlive them."""
+    """Start a fleet whose processes use the private bus, which must outlive them."""
     started = FleetProcesses(free_endpoint(), tmp_path)
     yield started
     started.close()
@@ -34,7 +34,7 @@ def fleet(tmp_path: Path, peer: BlePeer) -> Iterator[FleetProcesses]:
 
 @pytest.fixture
 def sim(fleet: FleetProcesses, peer: BlePeer) -> GatewayProcess:
-    """A simulated car, wired to the module."""
+    """Start a simulated car, and connect it to the module."""
     simulated, (link,) = fleet.simulate("red:arduino:pty")
     peer.bluez.wire(peer.module, link.removeprefix("serial://"))
     return simulated

@@ -1,6 +1,6 @@
-"""One suite over every kind of link: a real PTY, a real TCP server, a BlueZ of our own behind bleak's own backend.
+"""One suite for every kind of link: a real PTY, a real TCP server, a fake BlueZ behind bleak's own backend.
 
-Bluetooth is in it on Linux: elsewhere bleak talks to the system's own Bluetooth, and nothing could stand in for it.
+Bluetooth is tested on Linux only: elsewhere bleak uses the system's own Bluetooth, which no fake can replace.
 """
 
 import asyncio
@@ -62,7 +62,7 @@ async def link(peer: Peer) -> AsyncIterator[Link]:
 
 
 async def read(link: Link, size: int) -> bytes:
-    """Exactly so many bytes, as they come."""
+    """Read exactly `size` bytes."""
     data = b""
     async with asyncio.timeout(PATIENCE_S):
         while len(data) < size:
@@ -74,7 +74,7 @@ async def read(link: Link, size: int) -> bytes:
 
 
 async def until_lost(again: Callable[[], Awaitable[object]]) -> str:
-    """Do it until the link is lost; the words."""
+    """Repeat a call until the link is lost. Return the message."""
     async with asyncio.timeout(PATIENCE_S):
         words = ""
         while not words:
@@ -88,7 +88,7 @@ async def until_lost(again: Callable[[], Awaitable[object]]) -> str:
 
 
 async def lost(link: Link) -> str:
-    """Read until the link is lost; the words."""
+    """Read until the link is lost. Return the message."""
     return await until_lost(link.read)
 
 
@@ -111,7 +111,7 @@ async def test_byte_by_byte_and_slowly(link: Link, peer: Peer) -> None:
 
 
 async def test_lossy_and_noisy(link: Link, peer: Peer) -> None:
-    """What comes is handed on as it came, and nothing is made up; the next good frame decodes."""
+    """The link passes bytes unchanged and adds none, and the next good frame decodes."""
     noise = random.Random(7)
     sent, whole = b"", 0
     for _ in range(40):
@@ -143,7 +143,7 @@ async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
 
 
 async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
-    """Not so on a PTY: the system throws away what nobody had read when the port went."""
+    """A PTY is excluded: the system discards unread bytes when the port disappears."""
     link = await open_link(peer.url)
     if not isinstance(peer, PtyPeer):
         peer.send(FRAME)
@@ -208,9 +208,9 @@ async def test_it_opens_again_after_every_kind_of_end(peer: Peer) -> None:
             peer.die()
 
 
-@pytest.mark.parametrize("peer", ["serial", "tcp"], indirect=True)  # radio cannot be held back: test_ble.py
+@pytest.mark.parametrize("peer", ["serial", "tcp"], indirect=True)  # radio has no flow control: test_ble.py
 async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link, peer: Peer) -> None:
-    """Whoever sends more than fits waits; what was taken is read in order, and then the rest."""
+    """A sender of more bytes than fit must wait. The reader gets all bytes in order."""
     total = 24 * 1024 * 1024 if isinstance(peer, TcpPeer) else 8 * 1024 * 1024
     block = bytes(range(256)) * 256
     sent = 0
@@ -230,7 +230,7 @@ async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link
     thread.start()
     async with asyncio.timeout(PATIENCE_S):
         before = -1
-        while before != sent or not sent:  # it stands still
+        while before != sent or not sent:  # the sender is blocked
             before = sent
             for _ in range(10):
                 await asyncio.sleep(0.01)
@@ -261,7 +261,7 @@ async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, 
 
 
 async def test_closing_ends_a_write_that_waits(link: Link, peer: Peer) -> None:
-    """Whatever it waits for, it is over with the link, and nothing follows a half frame."""
+    """A waiting write ends with the link, and no byte follows a half frame."""
     peer.stall()
     writing = asyncio.create_task(until_lost(lambda: link.write(FRAME)))
     for _ in range(5):
@@ -277,7 +277,7 @@ async def test_frames_from_several_writers_are_never_mixed(link: Link, peer: Pee
 
 
 async def test_nothing_is_left_behind(peer: Peer) -> None:
-    await (await open_link(peer.url)).close()  # what is kept for as long as there is a loop is there now
+    await (await open_link(peer.url)).close()  # opens the descriptors that last as long as the loop
     if isinstance(peer, TcpPeer):
         peer.die()
     gc.collect()
@@ -321,7 +321,7 @@ async def test_a_real_reset(tmp_path: Path) -> None:
 
 
 async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
-    """Before the loop has heard of the reset, so that only the write itself can tell."""
+    """The loop has not noticed the reset yet, so only the write itself can report it."""
     peer = TcpPeer()
     link = await open_link(peer.url)
     assert peer.peer
@@ -333,7 +333,7 @@ async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
 
 
 async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path) -> None:
-    """pyserial's own write would wait for a write_timeout, or spin; the best of several: machines are busy."""
+    """pyserial's own write would wait for a write_timeout, or spin. The best of several rounds counts."""
     peer = PtyPeer(tmp_path)
     stood = []
     for _ in range(5):
@@ -350,7 +350,7 @@ async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path)
 
 
 async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: Path) -> None:
-    """The reader lets go of a dead port in its thread: never between a write's look at the descriptor and its use."""
+    """The reader's thread closes a dead port, but never between a write's check of the descriptor and its use."""
     peer = PtyPeer(tmp_path)
     usual = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
@@ -371,7 +371,7 @@ async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: P
 @pytest.mark.parametrize("says", [b"", FRAME])
 @pytest.mark.parametrize("reset", [False, True])
 async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes, reset: bool) -> None:
-    """A car has one client. One that has spoken and then hangs up has other reasons."""
+    """A car has one client. A car that has sent bytes before its end has other reasons."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = await open_link(TcpUrl("127.0.0.1", server.getsockname()[1]))
         peer, _ = server.accept()
@@ -388,7 +388,7 @@ async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes
 
 
 async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
-    """Held back it would go out in one segment with the next, of which a car obeys only the first."""
+    """A delayed frame would go out in one segment with the next one, and a car obeys only the first."""
     peer = TcpPeer()
     assert isinstance(peer.url, TcpUrl)
     ours = socket.create_connection((peer.url.host, peer.url.port))
@@ -403,7 +403,7 @@ async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it(
     peer.close()
 
 
-@pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # the car's to refuse
+@pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # there the car refuses
 async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
     with pytest.raises(Busy, match="in use by "):
         await open_link(peer.url)
@@ -415,7 +415,7 @@ async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
 
 
 async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
-    """Reading blocks a thread, never the loop; and that thread is the only one."""
+    """A read blocks one thread, and never the loop."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)
     assert [thread.name for thread in link_threads()] == [f"read {peer.url}"]
@@ -430,7 +430,7 @@ async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
 
 
 async def test_what_a_stuck_port_never_took_is_thrown_away(tmp_path: Path) -> None:
-    """Else it is still full when it is opened again. What the other end's side has taken can not be had back."""
+    """Otherwise the port is still full at its next opening. Bytes that the other end has taken stay there."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)
     await until_lost(lambda: link.write(FRAME))
@@ -447,7 +447,7 @@ async def test_what_a_stuck_port_never_took_is_thrown_away(tmp_path: Path) -> No
 async def test_a_port_that_hangs_in_opening_is_tried_by_one_thread_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No device that anyone may have here hangs in opening, as a Bluetooth tty can: pyserial's open is held up."""
+    """The test delays pyserial's open, because no device of this machine hangs in opening as a Bluetooth tty can."""
     peer = PtyPeer(tmp_path)
     hangs = threading.Event()
     opening = serial.Serial.open

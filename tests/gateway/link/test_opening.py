@@ -1,4 +1,4 @@
-"""URLs, and links that cannot be opened: one line that says what, where and what to do."""
+"""URLs, and links that cannot be opened: the message has one line with fault, place and remedy."""
 
 import asyncio
 import grp
@@ -159,7 +159,7 @@ except CannotOpen as error:
 
 
 def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
-    """Root may open anything, so a process that is nobody tries; whoever is not root tries itself."""
+    """Root may open any port, so a process of the user nobody tries. Other users try in this process."""
     peer = PtyPeer(tmp_path)
     port = (tmp_path / "tty").resolve()
     port.chmod(0)
@@ -182,7 +182,7 @@ def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
 
 async def test_a_tcp_car_that_cannot_be_reached() -> None:
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))  # bound, not listening: refused, and nobody else gets the port
+        taken.bind(("127.0.0.1", 0))  # bound, not listening: refuses, and no other process gets the port
         words = await refused(TcpUrl("127.0.0.1", taken.getsockname()[1]))
         assert (
             "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it"
@@ -194,7 +194,7 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
 
 
 async def test_a_name_with_several_addresses_is_tried_on_each_and_says_why_in_the_same_words() -> None:
-    """asyncio would say "Multiple exceptions", without the number that tells a refusal from the rest."""
+    """asyncio's own text would be "Multiple exceptions", without the number that identifies a refusal."""
     with socket.socket() as taken, socket.create_server(("127.0.0.1", 0)) as server:
         taken.bind(("127.0.0.1", 0))
         nobody = (socket.AF_INET, taken.getsockname())
@@ -214,7 +214,7 @@ print(*(name in sys.modules for name in ("serial", "serial.tools", "bleak")))
 
 
 def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
-    """A gateway is started a hundred times."""
+    """A fleet starts up to a hundred gateways."""
     peer = PtyPeer(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
         for url, said in (
@@ -295,7 +295,7 @@ async def test_a_name_server_that_answers_late_is_of_use_to_the_next_try(monkeyp
 
 
 async def test_a_tcp_car_that_does_not_answer() -> None:
-    """A listener whose queue is full drops what asks: as silent as a car that is off."""
+    """A listener with a full queue drops new connections, and is as silent as a car that is off."""
     with socket.socket() as full:
         full.bind(("127.0.0.1", 0))
         full.listen(0)

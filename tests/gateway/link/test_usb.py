@@ -1,4 +1,4 @@
-"""A USB device is found by what it says of itself, each time again: none, one, several, and after a replug."""
+"""Each opening finds a USB device by its description: none, one, several, and after a replug."""
 
 import asyncio
 from collections.abc import Callable
@@ -73,7 +73,7 @@ def test_none_or_several_is_one_line(url: UsbUrl, there: list[UsbSerialPort], wo
 
 @pytest.fixture
 def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Say which ports the system lists, in pyserial's own words: a PTY is in no such list."""
+    """Return a function that sets the system's list of ports, in pyserial's own type. The list never has a PTY."""
 
     def listed(*ports: UsbSerialPort) -> None:
         found = []
@@ -113,7 +113,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
 async def test_a_device_that_goes_while_the_ports_are_listed_costs_one_try(
     asked: str, failure: Exception, tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """pyserial reads a device's numbers from files that go with it. The next try must find nothing that hangs."""
+    """pyserial reads a device's numbers from files that disappear with it. The next try must not hang."""
 
     def half_gone() -> list[ListPortInfo]:
         raise failure
@@ -166,7 +166,7 @@ async def test_another_device_that_comes_in_its_place_is_not_commanded(named: st
 
 
 async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
-    """Gone, or something that says nothing of itself."""
+    """The device is unplugged, or has no description."""
     peer = PtyPeer(tmp_path)
     plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
@@ -199,13 +199,13 @@ async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> No
 
 
 async def test_a_path_by_id_leads_to_the_port_that_the_device_has_now(tmp_path: Path) -> None:
-    """As /dev/serial/by-id: the link stays where it is, and points to another port; the first is still there, dead."""
+    """As with /dev/serial/by-id, the symlink points to another port. The first port still exists, but is dead."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)
     peer.die()
     with pytest.raises(LinkLost):
         await link.read()
-    peer.revive()  # the old port is still open, so this is another
+    peer.revive()  # the old port is still open, so the system assigns another one
     await link.close()
     link = await open_link(peer.url)
     peer.send(FRAME)

@@ -67,7 +67,7 @@ def test_bad_input_is_counted_by_cause_and_the_next_good_frame_decodes(row: dict
 
 def test_every_cause_has_a_test() -> None:
     seen = {cause for row in BAD for cause in row["causes"].split()}
-    # overlong and out of range are in tests of their own: the one is long, the other rejects fields, not frames
+    # Other tests cover the causes overlong and out of range: the first needs many bytes, the second rejects fields.
     assert seen | {Cause.OVERLONG, Cause.OUT_OF_RANGE} == set(Cause)
 
 

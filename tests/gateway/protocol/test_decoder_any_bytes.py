@@ -1,4 +1,4 @@
-"""Any bytes, cut anywhere, give the same events; readings of every spelling decode to what was spelled."""
+"""Any bytes give the same events, wherever they are cut. Readings of every spelling decode to their values."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -35,7 +35,7 @@ def timeless(events: list[Event]) -> list[Event]:
 
 
 def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: bool) -> list[Event]:
-    """All events when each burst comes in pieces of `size` bytes, with or without the ticks that are asked for."""
+    """Return all events of bursts in pieces of `size` bytes, with or without the requested ticks."""
     decoder, now, events = Decoder(), 100.0, []
     decoder.sent(b"$4WD,MODE00#", now)
     decoder.sent(b"#", now)

@@ -1,4 +1,4 @@
-"""Every frame to the car: bytes of the table, both ways, and what is refused."""
+"""Every frame to the car: encoding and parsing of the table's bytes, and rejected values."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""The table of platforms, the times, and what of a frame is measured."""
+"""The table of platforms, the times, and the measured fields of a frame."""
 
 import re
 

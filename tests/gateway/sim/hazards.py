@@ -52,7 +52,7 @@ async def drive(car: Stranger) -> None:
 
 
 async def block(car: Stranger) -> None:
-    """Deaf for 0.65 s from now, motors as they are."""
+    """Block the car for 0.65 s, with its motors unchanged."""
     await car.write(PTZ90)
     await car.until(lambda truth: truth.blocked)
 
@@ -186,10 +186,10 @@ async def wedged(car: Stranger) -> None:
     await car.write(STOP)
     await car.wait(0.3)
     assert car.truth.driving
-    await car.write(MODE00)  # read at the wrong place: no close
+    await car.write(MODE00)  # the car reads the digits at a wrong place, so the frame closes no mode
     await car.wait(1.5)
     assert car.truth.driving
-    await car.wait(1.0)  # but it has cleared the buffer
+    await car.wait(1.0)  # but the frame has cleared the buffer
     await drive(car)
     await car.write(STOP)
     await car.until(lambda truth: not truth.driving)
@@ -368,7 +368,7 @@ async def pi_short(car: Stranger) -> None:
 @hazard("over Bluetooth a half frame ended by a lone # kills the program", platform="raspberry_pi")
 async def pi_lone_hash(car: Stranger) -> None:
     await drive(car)
-    await car.write(b"#")  # nothing pending: nothing
+    await car.write(b"#")  # without a pending frame it has no effect
     await car.wait(0.2)
     assert car.truth.alive
     assert car.truth.driving
@@ -410,7 +410,7 @@ async def pi_light(car: Stranger) -> None:
     assert car.truth.led == seen[0]
 
 
-# No table row of its own, said under "Consequences": the car has no dead-man timer.
+# From "Consequences", without a row in the table: the car has no dead-man timer.
 
 
 @hazard("no dead-man")

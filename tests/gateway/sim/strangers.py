@@ -1,4 +1,4 @@
-"""Someone who knows the wire and nothing of our code, at one car: on virtual time, at its PTY, or at its socket."""
+"""Clients of one car that know only the wire: on virtual time, at its PTY, or at its socket."""
 
 import asyncio
 import random
@@ -38,7 +38,7 @@ def opening(mode: int) -> bytes:
 
 
 def opening_s(mode: int) -> float:
-    """docs/reference/protocol.md#blocking-times."""
+    """Return the time of an opening (docs/reference/protocol.md#blocking-times)."""
     return 2.1 + 0.2 * (mode + 1)
 
 
@@ -62,7 +62,7 @@ class Stranger(Protocol):
 
 
 class VirtualStranger:
-    """At the core itself, as fast as the CPU allows."""
+    """A client of the model itself, on virtual time."""
 
     def __init__(self, car: Firmware) -> None:
         self.car = car
@@ -112,7 +112,7 @@ def virtual(
 
 
 class WireStranger:
-    """At a running simulator's link, with real pyserial or a real socket; the truth is read from the core."""
+    """A client of a running simulator's link, by real pyserial or a real socket. The model gives the truth."""
 
     def __init__(self, simulation: Simulation, car: SimCar) -> None:
         self._simulation = simulation
@@ -180,7 +180,7 @@ class WireStranger:
         host, _, port = self._car.url.removeprefix("tcp://").rpartition(":")
         try:
             _, writer = await asyncio.open_connection(host, int(port))
-        except (ConnectionRefusedError, ConnectionResetError):  # reset: it was in the queue of a socket that was closed
+        except (ConnectionRefusedError, ConnectionResetError):  # reset: it was in a closed socket's queue
             return True
         writer.close()
         return False

@@ -1,4 +1,4 @@
-"""What a user may write to describe a car, and the one-line errors for what not."""
+"""Descriptions of cars on the command line, and one-line errors for invalid ones."""
 
 import pytest
 

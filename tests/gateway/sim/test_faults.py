@@ -1,4 +1,4 @@
-"""What a user may write to do something to a car, and the one-line errors for what not."""
+"""Descriptions of faults, and one-line errors for invalid ones."""
 
 import pytest
 

@@ -47,7 +47,7 @@ def where(simulation: Simulation, name: str) -> tuple[str, int]:
 async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
     car = pair.cars["red"]
     with serial.Serial(car.url.removeprefix("serial://"), timeout=0) as port:
-        port.write(FAN)  # while it runs no reading of the car's own comes between two frames
+        port.write(FAN)  # while the fan runs, the car sends no reading of its own
         await until(lambda: car.truth.fan, "the fan runs")
         begun = time.monotonic()
         for _ in range(4):
@@ -65,7 +65,7 @@ async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
             lambda: data.extend(port.read(4096)) or (b"LF" in data[-40:] and car.truth.mode == "tracking"), "tracks"
         )
         begun = time.monotonic()
-        assert car.truth.mode == "tracking"  # which has it send what is due, so that none of it counts
+        assert car.truth.mode == "tracking"  # advances the car to now, so that no due reading counts
         while port.read(4096):
             pass
         data.clear()
@@ -113,7 +113,7 @@ async def test_a_plain_pty_says_its_new_name() -> None:
     named: list[str] = []
     car.on_renamed = lambda moved: named.append(moved.url)
     first = car.url
-    with serial.Serial(first.removeprefix("serial://")):  # held open, the old name cannot be given again
+    with serial.Serial(first.removeprefix("serial://")):  # while open, the system cannot assign the old name again
         await simulation.inflict(Fault(FaultKind.LINK_DROP, for_s=0.05))
         await until(lambda: named, "back")
     assert named == [car.url]
@@ -144,7 +144,7 @@ async def test_a_dropped_tcp_link_resets_refuses_and_comes_back_by_itself(pair: 
     with pytest.raises(ConnectionError):
         await asyncio.open_connection(host, port)
     assert pair.cars["green"].truth.driving
-    await pair.inflict(Fault(FaultKind.LINK_DROP, "green", for_s=0.2))  # and now not for ever
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "green", for_s=0.2))  # now for a limited time
 
     async def answers() -> bool:
         try:
@@ -243,7 +243,7 @@ async def test_a_symlink_that_a_killed_simulator_left_is_replaced(tmp_path: Path
 
 
 async def test_a_number_that_a_newer_terminal_has_is_no_reason_to_keep_a_symlink(tmp_path: Path) -> None:
-    """A killed simulator's terminal is gone, and its number is given to the next program that asks for one."""
+    """A killed simulator's terminal is gone, and the system gives its number to the next program."""
     path = tmp_path / "red"
     controller, device = pty.openpty()
     path.symlink_to(os.ttyname(device))
@@ -259,7 +259,7 @@ async def test_a_number_that_a_newer_terminal_has_is_no_reason_to_keep_a_symlink
 async def test_a_live_simulators_symlink_is_not_taken(pair: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "red"
     first = path.readlink()
-    with serial.Serial(str(path)):  # a host does not change whose it is
+    with serial.Serial(str(path)):  # a host that opens the port does not change the owner
         with pytest.raises(Taken, match=f"car blue: {path} leads to {first}, which is in use, .* name another path"):
             await Simulation(parse_cars([f"blue:arduino:pty:{path}"])).start()
         assert path.readlink() == first
@@ -278,7 +278,7 @@ def test_a_symlink_of_somebody_else_is_left_alone(target: str, tmp_path: Path) -
     assert str(path.readlink()) == target
 
 
-# The process.
+# ---------------------------------------------------------------- the process
 
 
 class SimProcess:
@@ -344,7 +344,7 @@ def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
     assert sim.ask(car="red", fault="link_drop")["ok"]
     assert not path.is_symlink()
     assert sim.ask(car="red", fault="link_drop", for_s=0)["ok"]
-    sim.popen.stdin.close()  # the end of stdin ends nothing
+    sim.popen.stdin.close()  # the end of stdin does not end the simulator
     with serial.Serial(str(path), timeout=PATIENCE) as port:
         assert port.read_until(b"#").endswith(b"#")
     sim.popen.send_signal(number)
@@ -356,7 +356,7 @@ def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
 
 @pytest.mark.parametrize("closed", [">&-", "<&-", ">/dev/full", "<&- >&-", ""])
 def test_the_cars_go_on_without_streams(closed: str, tmp_path: Path) -> None:
-    """A file that is opened may get the number of a stream that is closed.
+    """An opened file may get the descriptor of a closed stream.
 
     Without a redirection stdout is a pipe whose reader is gone.
     """
@@ -388,15 +388,15 @@ def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[SimProc
     started.append(sim)
     red, _, _ = (sim.line() for _ in range(3))
     with serial.Serial(red["link"].removeprefix("serial://"), timeout=PATIENCE) as port:
-        port.read_until(b"#")  # of the first, what came after the port was opened
+        port.read_until(b"#")  # the rest of the first frame
         assert b",GM11#" in port.read_until(b"#")
         assert sim.ask(lamp="beacon", on=False) == {"ok": True, "lamp": "beacon"}
         port.reset_input_buffer()
-        port.read_until(b"#")  # the one that may have begun before
+        port.read_until(b"#")  # a frame that may have begun before
         assert b",GM00#" in port.read_until(b"#")
         port.write(RUN)
         assert sim.ask(thing="cart", x_m=0.9, y_m=1) == {"ok": True, "thing": "cart"}
-        while sim.ask(car="red", ask="truth")["x_m"] < 1.0:  # where the cart was
+        while sim.ask(car="red", ask="truth")["x_m"] < 1.0:  # the place of the cart
             time.sleep(0.01)
     world = sim.ask(ask="world")
     assert world["things"]["cart"] == {
@@ -429,7 +429,7 @@ def test_faults_of_the_command_line_come_at_their_time(started: list[SimProcess]
     started.append(sim)
     sim.line()
     end = time.monotonic() + PATIENCE
-    gone = False  # long enough to be seen by who is kept from looking for a while
+    gone = False  # long enough for a poll that is delayed
     while not (gone and path.exists()):
         gone = gone or not path.exists()
         assert time.monotonic() < end
@@ -458,7 +458,7 @@ def test_it_ends_with_its_parent(started: list[SimProcess], tmp_path: Path) -> N
 
 
 def test_it_ends_if_its_parent_ended_before_it_looked() -> None:
-    """A supervisor that was killed while its processes started left them behind for ever."""
+    """A supervisor that was killed while its processes started used to leave them behind."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     command = [sys.executable, "-m", "gateway.sim", "--car", "red:arduino:tcp", "--no-truth"]

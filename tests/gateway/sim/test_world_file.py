@@ -1,4 +1,4 @@
-"""World files: what each field becomes, each fault with its line and column, and that no text is a traceback."""
+"""World files: the effect of each field, each fault with line and column, and no traceback for any text."""
 
 import random
 import subprocess

@@ -1,4 +1,4 @@
-"""`gateway monitor` as a process: what it shows of a car and of a file, what it keeps, how it ends."""
+"""`gateway monitor` as a process: its output for a car and for a file, its capture, its end."""
 
 import json
 import os
@@ -129,16 +129,16 @@ def test_live_and_file_show_the_same(start: Started, command: Command, tmp_path:
     monitor = _live(start, os.ttyname(device), "--raw", kept)
     wait_for(lambda: kept.exists() and kept.read_text(), "the monitor is there")
     wait_for(lambda: _is_raw(device), "the port is opened")
-    # What comes while it is opened is thrown away: newlines, which mean nothing, until one is kept.
+    # The system discards bytes during the opening of the port. Send newlines, which have no effect, until one arrives.
     wait_for(lambda: os.write(controller, b"\n") and list(read(kept)), "it reads")
     for piece in PIECES:
         os.write(controller, piece.data)
     live = _until(monitor, "imu")
     whole = b"".join(piece.data for piece in PIECES)
-    # What a device that goes had not handed over is gone, here as with a real one.
+    # Undelivered bytes of an unplugged device are lost, here as with a real one.
     wait_for(lambda: b"".join(piece.data for piece in read(kept)).lstrip(b"\n") == whole, "it has read all of it")
     os.close(device)
-    os.close(controller)  # as an unplugged device
+    os.close(controller)  # as with an unplugged device
     assert monitor.wait() == 1
     live += _until(monitor, "summary")
     assert "unplugged" in monitor.stderr.splitlines()[-1]
@@ -153,7 +153,7 @@ def _is_raw(device: int) -> bool:
 
 def test_a_pipe_that_closes_ends_it_quietly(simulate: Callable[..., Any], tmp_path: Path) -> None:
     _, [link] = simulate("red:arduino+imu:pty")
-    long = tmp_path / "long"  # its lines are more than a pipe holds
+    long = tmp_path / "long"  # its lines do not fit into a pipe
     writer = CaptureWriter(long, "link", "now")
     for second in range(2000):
         writer.add(CapturedBytes(float(second), MANUAL))

@@ -1,4 +1,4 @@
-"""`gateway scan` as a process: what it makes of cars, silence, other devices; that it only listens unless asked."""
+"""`gateway scan` as a process: cars, silence and other devices. It sends nothing without --probe."""
 
 import contextlib
 import json
@@ -26,11 +26,11 @@ UNKNOWN_STOP = [
     *(b"$0,0,0,0,0,0,0,0,0#", b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
     *(b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
 ]
-"""docs/reference/protocol.md#stops: what a car of an unknown platform is sent."""
+"""Frames for a car of an unknown platform (docs/reference/protocol.md#stops)."""
 
 
 class SpeakingStranger:
-    """A serial port whose device says what it is told to, and keeps what is sent to it."""
+    """A serial port whose device sends given bytes, and stores received ones."""
 
     def __init__(self) -> None:
         self._controller, self._device = pty.openpty()
@@ -57,7 +57,7 @@ class SpeakingStranger:
                 self.received += data
                 if self.echoes:
                     os.write(self._controller, data)
-            with contextlib.suppress(BlockingIOError):  # nobody reads it yet
+            with contextlib.suppress(BlockingIOError):  # no reader yet
                 os.write(self._controller, self.says)
 
 
@@ -88,7 +88,7 @@ def test_what_each_link_is(
     silent, other = stranger(), stranger()
     other.says = b"$GPGGA,123519,4807.038,N*47\r\n"
     monitor = start("monitor", "--link", green, "--json")
-    monitor.line()  # it has the port
+    monitor.line()  # the monitor has the port
     found, done = _scan(command, *links, silent.link, other.link, more=("--for", "8"))
     assert (done.returncode, done.stderr) == (0, "")
     assert {link: each["verdict"] for link, each in found.items()} == {
@@ -173,7 +173,7 @@ def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None
     controller, device = pty.openpty()
     scan = start("scan", "--json", "--link", os.ttyname(device), "--for", "100")
     wait_for(lambda: not termios.tcgetattr(device)[3] & termios.ICANON, "the port is being opened")
-    for _ in range(2):  # opening throws away what is there, once; what goes then is read
+    for _ in range(2):  # the opening discards the bytes of the first round
         os.write(controller, b"\n")
         wait_for(lambda: not select.select([device], [], [], 0)[0], "it is taken")
     os.close(device)

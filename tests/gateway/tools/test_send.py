@@ -1,4 +1,4 @@
-"""`gateway send` as a process: what reaches a car, what is refused and why, what it says the car may do then."""
+"""`gateway send` as a process: frames to a car, refused frames with reasons, and warnings about the car."""
 
 import subprocess
 import sys
@@ -69,7 +69,7 @@ def test_how_it_is_stopped_is_said_also_when_stdout_cannot_be_written(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        # What a shell makes of '$0,...' and '$4WD,...' in double quotes.
+        # A shell's expansion of '$0,...' and '$4WD,...' in double quotes.
         ("bash,0,1,0,0,0,0,0,0#", "put the frame in single quotes, '$0,0,1,0,0,0,0,0,0#'"),
         ("/usr/bin/zsh,0,1,0,0,0,0,0,0#", "put the frame in single quotes, '$0,0,1,0,0,0,0,0,0#'"),
         (",0,1,0,0,0,0,0,0", "put the frame in single quotes, '$<digit>,0,1,0,0,0,0,0,0#'"),

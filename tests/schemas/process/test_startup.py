@@ -1,4 +1,4 @@
-"""A process that is interrupted while it starts or ends, or has no stdout, ends without a traceback."""
+"""A process that is interrupted during its start or end, or has no stdout, ends without a traceback."""
 
 import subprocess
 import sys

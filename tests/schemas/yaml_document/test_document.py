@@ -1,4 +1,4 @@
-"""Files that people write: every fault at once, each at its line and column; and what would harm a reader refused."""
+"""Files of people: all faults are reported at once, with line and column, and harmful input is rejected."""
 
 import os
 from pathlib import Path

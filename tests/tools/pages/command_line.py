@@ -115,7 +115,7 @@ def escape(text: str) -> str:
 
 
 def _prose(text: str) -> str:
-    """Return help as Markdown: examples and what click shows as it is become blocks of code."""
+    """Return help as Markdown. Examples and other verbatim parts become blocks of code."""
     made = []
     for paragraph in re.split(r"\n\s*\n", text.strip()):
         lines = [line for line in paragraph.splitlines() if line.strip() != "\b"]

@@ -40,7 +40,7 @@ def _title(name: str) -> str:
 
 
 def _value(each: dict[str, Any], definitions: dict[str, Any]) -> str:
-    """Return what a field takes, in a few words."""
+    """Return a short text about the values of a field."""
     if "$ref" in each:
         name = each["$ref"].rpartition("/")[2]
         target = definitions.get(name, {})
@@ -115,7 +115,7 @@ def world_schema() -> dict[str, Any]:
 
 
 def problems(kind: str, text: str) -> list[str]:
-    """Return what the reader and the check of this kind of file find in a text."""
+    """Return the faults that the reader and the check of this kind of file find in a text."""
     try:
         if kind == "plan":
             return [str(each) for each in lint.check(parser.parse(text, "plan.yaml")) if each.severity == "error"]

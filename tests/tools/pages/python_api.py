@@ -1,6 +1,6 @@
 """The page docs/reference/python.md: the public names with their docstrings.
 
-Made of what the code says of itself: a docstring that is wrong there is wrong here, and mended in one place.
+It has the docstrings of the code, so a wrong docstring is corrected in one place.
 """
 
 import inspect
@@ -51,7 +51,7 @@ _ERRORS = (
     FormatMissing,
 )
 _HIDDEN = {"do", "ask", "call", "begin", "expression"}
-"""What the package's own parts use."""
+"""Methods for the package's own use."""
 _INTERNAL = {
     *((Lease, name) for name in ("check", "checked")),
     *((Session, name) for name in ("part", "lacking", "check", "rescue", "rows", "expected", "indexes", "selection")),
@@ -59,7 +59,7 @@ _INTERNAL = {
 
 
 def reference() -> str:
-    """The whole file."""
+    """Return the text of the page."""
     parts = [_HEAD]
     for name, each in _CLASSES:
         parts.append(f"## {name}\n\n{_text(each)}\n")
@@ -74,14 +74,14 @@ def reference() -> str:
 
 
 def _text(of: object) -> str:
-    """A docstring, without its indentation."""
+    """Return a docstring without its indentation."""
     words = inspect.getdoc(of)
     assert words, f"{of} has no docstring"
     return words
 
 
 def _methods(of: type) -> list[str]:
-    """Public methods and properties, in the order in which they are written; those of `CarCommands` last."""
+    """Return public methods and properties in the order of the source, those of `CarCommands` last."""
     found: dict[str, None] = {}
     for base in (each for each in of.__mro__ if each in (of, CarCommands)):
         for name, member in vars(base).items():
@@ -101,7 +101,7 @@ def _method(of: type, name: str) -> str:
 
 
 def _signature(function: Callable[..., object]) -> str:
-    """The parameters with their types as a reader writes them."""
+    """Return the parameters with their types, as a user writes them."""
     signature = inspect.signature(function)
     given = [each for each in signature.parameters.values() if each.name != "self"]
     words = [_parameter(each) for each in given]
@@ -119,13 +119,13 @@ def _parameter(each: inspect.Parameter) -> str:
 
 
 def _type(annotation: object) -> str:
-    """A type without the modules that its names come from."""
+    """Return a type without the modules of its names."""
     words = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     return "Outcome" if words == "~R" else re.sub(r"\b(?:\w+\.)+(?=\w)", "", words).strip("'")
 
 
 def _attributes(of: type) -> list[str]:
-    """The fields of a value, with the words that stand below each."""
+    """Return the fields of a class with their docstrings."""
     source = inspect.getsource(of)
     if not hasattr(of, "__dataclass_fields__"):
         return []
@@ -140,7 +140,7 @@ def _module(error: type) -> str:
 
 
 def _async(name: str) -> str:
-    """What of a class is called otherwise than its blocking twin; the rest has the same names and parameters."""
+    """Return the differences of a class to its blocking twin. All else has the same names and parameters."""
     each = getattr(aio, name)
     awaited = [
         f"`{method}`"

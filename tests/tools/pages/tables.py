@@ -29,7 +29,7 @@ _COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
 
 
 def key_table() -> str:
-    """Return the table of topics with how each is published, kept and shown."""
+    """Return the table of topics, with rate, cache and views of each."""
     rows = [
         "| key | message | what | units | rate | stale after | class | history | cache | Rerun entity |",
         "|---|---|---|---|---|---|---|---|---|---|",
@@ -53,7 +53,7 @@ def key_table() -> str:
 
 
 def verb_table() -> str:
-    """The table of commands, with the fields of each message."""
+    """Return the table of commands, with the fields of each message."""
     rows = ["| verb | fields | what |", "|---|---|---|"]
     for verb, row in COMMANDS.items():
         fields: Any = messages.message_class(row.message).DESCRIPTOR.fields
@@ -78,7 +78,7 @@ _STATES = {
     "raspberry_pi": "a Raspberry Pi car (the longest)",
     "unknown platform": "a car whose platform is not known (the longest)",
 }
-"""What the states of the distribution of stops are called here; of several rows that begin so it is the longest."""
+"""Name of each state of the distribution on the page. Of several rows with this beginning, the longest counts."""
 
 
 def stops() -> list[dict[str, str]]:
@@ -102,7 +102,7 @@ def _longest(name: str, column: str) -> float:
 
 
 def _shown_after(name: str) -> str:
-    """Return when the car had shown its stop, and how often it showed none."""
+    """Return the time at which the car had shown its stop, and the number of stops that it did not show."""
     rows = _rows(name)
     stops_shown, asked = sum(int(row["shown"]) for row in rows), sum(int(row["stops"]) for row in rows)
     if not stops_shown:
@@ -112,7 +112,7 @@ def _shown_after(name: str) -> str:
 
 
 def stop_table() -> str:
-    """How long a stop takes, by what the car is doing."""
+    """Return the table of the times of a stop, by the state of the car."""
     rows = ["| the car is | in the middle | worst seen | longest announced | shown after |", "|---|---|---|---|---|"]
     for name, words in _STATES.items():
         middle, worst, announced = (_longest(name, column) for column in ("p50_s", "worst_s", "announced_s"))
@@ -121,14 +121,14 @@ def stop_table() -> str:
 
 
 def evidence_table() -> str:
-    """Return the table of what shows a stop, from the table that the gateway runs on."""
+    """Return the table of evidence for a stop, from the gateway's own table."""
     rows = ["| stop | shown by | otherwise |", "|---|---|---|"]
     rows += [f"| {row.stop} | {row.shown_by or 'nothing'} | {row.otherwise} |" for row in EVIDENCE.values()]
     return "\n".join(rows)
 
 
 def trust_table() -> str:
-    """Return the states of trust, with the words that stand below each in the code."""
+    """Return the states of trust with their docstrings."""
     about = dict(re.findall(r'^    [A-Z_]+ = "(\w+)"\n    """(.+?)"""', inspect.getsource(CarTrust), re.MULTILINE))
     rows = ["| trust | motors | what the gateway believes |", "|---|---|---|"]
     rows += [f"| `{state}` | {TrustState(state).motors} | {about[state]} |" for state in CarTrust]
@@ -136,7 +136,7 @@ def trust_table() -> str:
 
 
 def transition_table() -> str:
-    """Return where each event leads from each state. A dot stands for no change."""
+    """Return the next state for each state and event. A dot means no change."""
     rows = [f"| what happens | {' | '.join(f'`{state}`' for state in CarTrust)} |", "|---" * (len(CarTrust) + 1) + "|"]
     for event in TrustEvent:
         to = [TRANSITIONS[state, event] for state in CarTrust]
@@ -146,7 +146,7 @@ def transition_table() -> str:
 
 
 def mode_table() -> str:
-    """Which pairs of mode asked and true mode are told apart, and how soon."""
+    """Return the table of pairs of commanded and true mode that readings distinguish, with the times."""
     groups: dict[tuple[str, str, str], dict[str, list[str]]] = {}
     for row in vectors.rows("mode_truth"):
         key = (row["verdict"], row["by"], row["within_s"])
@@ -187,7 +187,7 @@ def numbers() -> dict[str, str]:
 
 
 def report_table() -> str:
-    """Return what a car reports in each mode."""
+    """Return the table of a car's reports in each mode."""
     rows = ["| mode | number | what the car reports |", "|---|---|---|"]
     for mode in Mode:
         measured = sorted(MODES[mode].measures)
@@ -197,7 +197,7 @@ def report_table() -> str:
 
 
 def platform_table() -> str:
-    """Return what each kind of car knows."""
+    """Return the table of the abilities of each platform."""
     profiles: dict[str, Profile] = {kind: parse_platform(kind) for kind in Platform}
     rows = [f"| | {' | '.join(f'`{kind}`' for kind in profiles)} |", "|---" * (len(profiles) + 1) + "|"]
     every = sorted(set(chain.from_iterable(each.capabilities for each in profiles.values())))

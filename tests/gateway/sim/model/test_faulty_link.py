@@ -17,7 +17,7 @@ def line(seed: int = 1) -> FaultyLink:
 
 
 def both(link: FaultyLink, data: bytes, now: float) -> tuple[bytes, bytes]:
-    """The same bytes sent each way, and what of them is out at once: at the car, at the host."""
+    """Send the same bytes in both directions. Return the bytes that arrive at once at the car and at the host."""
     link.from_host(data, now)
     link.from_car(data, now)
     return b"".join(link.to_car(now)), b"".join(link.to_host(now))

@@ -57,7 +57,7 @@ async def test_a_frame_sent_while_blocked_is_obeyed_when_the_block_is_over(
     await car.wait(0.2)  # well before the first report
     await car.write(frame)
     obeyed = car.now + len(frame) / 960
-    # A close is obeyed in any mode, and sets the motors; the run before it makes that visible in mode 0.
+    # The car obeys a close in any mode, and stops its motors. A run before the close makes that visible in mode 0.
     await car.wait(len(frame) / 960)
     await car.write(b"$4WD,MODE10#" if "opened" in what else general(motion=2))
     await car.until(
@@ -75,7 +75,7 @@ def test_opening_times_are_those_of_the_table() -> None:
 async def test_the_report_itself_blocks(echo: bool, least: float, most: float) -> None:
     blocks = []
     for sent_at in range(60):
-        # A frame anywhere in a period is obeyed on time, or when the report that it met is over.
+        # The car obeys a frame at once, or after the report that it met.
         car = virtual(world=World.room() if echo else World.open_field())
         await car.wait(0.5 + sent_at / 40)
         start = car.now + len(RUN) / 960
@@ -386,10 +386,10 @@ async def test_a_brown_out_boots_to_mode_0_with_the_motors_off() -> None:
     await car.wait(0.1)
     car.car.brown_out(car.now)
     assert car.truth == Truth(Mode.MANUAL, 0, 0, False, False, "off", 90, 150, True)
-    await car.write(RUN)  # while it boots
+    await car.write(RUN)  # during the boot
     await car.wait(0.6)
     assert not car.truth.driving
-    await car.write(STOP)  # no half frame is left
+    await car.write(STOP)  # the buffer has no half frame
     await car.wait(0.1)
     assert not car.truth.driving
     await car.write(RUN)

@@ -1,4 +1,4 @@
-"""The infrared remote takes a car over in mode 1, and in no other."""
+"""The infrared remote takes a car over in mode 1 only."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Lamps, things and cars that meet: what the sensors make of them, and who gets past whom."""
+"""Lamps, objects and cars that meet: readings of the sensors, and collisions."""
 
 import copy
 import itertools
@@ -23,12 +23,12 @@ HAIR_M = 1e-6
 
 
 def before(x: float, y: float) -> World:
-    """A car in the middle, which looks along x, and another."""
+    """Return a world with a car in the middle, which looks along x, and another car."""
     return World(starts={"red": HOME, "green": Pose(x, y, 0.0)}, cars_meet=True)
 
 
 def lit(lamp: Lamp, *, walls: bool = False, car: bool = False, thing: MovingObject | None = None) -> World:
-    """A car in the middle, a lamp, and what may stand in between, at x = 0.4."""
+    """Return a world with a car in the middle, a lamp, and possibly an object in between, at x = 0.4."""
     return World(
         [(0.4, -0.1, 0.4, 0.1)] if walls else (),
         lamps=[lamp],
@@ -45,7 +45,7 @@ def cars(world: World, *names: str) -> dict[str, Firmware]:
 
 
 async def opened(world: World, mode: int) -> VirtualStranger:
-    """Red, with green before it, one turn after a mode was opened."""
+    """Return red, with green ahead, one turn after the opening of a mode."""
     car = VirtualStranger(cars(world, "red", "green")["red"])
     await car.write(opening(mode))
     await car.wait(opening_s(mode) + 0.08)
@@ -236,7 +236,7 @@ powers = st.integers(-255, 255)
 
 @st.composite
 def lively_worlds(draw: st.DrawFn) -> tuple[World, list[Pose]]:
-    """A room, things in it, and cars with room around them."""
+    """Draw a room with objects, and cars with room around them."""
     sides = st.tuples(places, places, places, places).filter(
         lambda wall: hypot(wall[2] - wall[0], wall[3] - wall[1]) > 0.1
     )

@@ -1,4 +1,4 @@
-"""The world: geometry, sensors, and that a tracking car tracks and an avoiding car avoids."""
+"""The world: geometry, sensors, a tracking car on its line, and an avoiding car without collisions."""
 
 import random
 from math import cos, hypot, pi, radians, sin

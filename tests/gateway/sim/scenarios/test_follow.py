@@ -18,10 +18,10 @@ from tests.support.virtual import Pair
 ROW = ("red", "green", "blue")
 WORLD = (EXAMPLES / "worlds" / "follow.yaml").read_text()
 NEAR_M = 0.45
-"""Beyond 0.42 m between their middles a follower's infrared has lost the one before it."""
+"""Maximum distance of two middles. Beyond 0.42 m, a follower's infrared loses the car ahead."""
 LOOK_S = 0.1
 STEP_S = 0.01
-"""The cars of one world move together in steps of this."""
+"""Time step in which all cars of one world move."""
 
 
 def spec() -> WorldSpec:
@@ -61,7 +61,7 @@ class Row:
             self.run(STEP_S)
 
     def go(self, *, late_s: float = 0.0) -> None:
-        """Red into light seeking, the others after it into following; until all are in it and what opened is over."""
+        """Bring red into light seeking, then the others into following. Wait until all modes are open."""
         for name, mode in zip(ROW, (Mode.LIGHT_SEEKING, Mode.FOLLOWING, Mode.FOLLOWING), strict=True):
             self.pairs[name].ask(SetMode(mode))
             self.run(late_s)

@@ -16,13 +16,13 @@ async def test_on_virtual_time(hazard: Hazard) -> None:
 
 
 STALL_S = 0.03
-"""Half of the shortest wait in a row, and less than any block: a machine that stalls for longer proves nothing."""
+"""Maximum stall of a valid row: half of the shortest wait in a row, and less than any block."""
 REPEATED_S = 90.0
-"""For so long a row is repeated while the machine stalls."""
+"""Maximum time for which a row is repeated while the machine stalls."""
 
 
 class Stalls:
-    """How long this process was kept from running."""
+    """Measures for how long this process did not run."""
 
     def __init__(self) -> None:
         self.worst = 0.0
@@ -60,7 +60,7 @@ async def play_once(hazard: Hazard) -> BaseException | None:
 
 @pytest.fixture(scope="module")
 def outcomes() -> dict[str, BaseException | None]:
-    """All rows at once, each on a simulator of its own: they wait far more than they work."""
+    """Run all rows at once, each on a simulator of its own, because they mostly wait. Return their errors."""
 
     async def everything() -> list[BaseException | None]:
         return await asyncio.gather(*(play(hazard) for hazard in HAZARDS))

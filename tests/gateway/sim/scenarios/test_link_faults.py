@@ -1,4 +1,4 @@
-"""Faults of the running simulator's links, as someone at a real pseudo terminal or socket meets them."""
+"""Faults of the running simulator's links, at the other end of a real pseudo terminal or socket."""
 
 import asyncio
 import socket
@@ -94,7 +94,7 @@ async def test_a_deaf_car_takes_what_is_written_and_drops_it(cars: Simulation) -
 async def test_a_mute_car_obeys(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.MUTE, "red"))
-        while port.read(4096):  # until nothing is on its way: what is, a reset would not throw away
+        while port.read(4096):  # until no byte is in transit, because a reset would not discard it
             pass
         port.write(opening(2))
         await until(lambda: cars.cars["red"].lost_bytes["host"] > 200, "it talks to nobody")
@@ -129,7 +129,7 @@ async def test_a_slow_link_trickles_both_ways(cars: Simulation) -> None:
 async def test_a_firehose_over_either_link(cars: Simulation) -> None:
     reader, writer = await asyncio.open_connection(*address(cars))
     with open_port(cars) as port:
-        # Until so much has come: what finds no room in a terminal while nobody reads is lost.
+        # Read until all bytes have arrived. Without a reader, bytes that do not fit into the terminal are lost.
         await cars.inflict(Fault(FaultKind.FIREHOSE, for_s=2 * PATIENCE, rate=1e6))
         await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=0))
         over_tcp, over_pty = bytearray(), bytearray()
@@ -147,7 +147,7 @@ async def test_a_frame_that_never_ends(cars: Simulation) -> None:
         await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=2 * PATIENCE, rate=50_000, flood=Flood.FRAME))
         data = bytearray()
         await until(lambda: data.extend(port.read(65536)) or len(data) > 5_000, "zeros")
-        _, begun, rest = bytes(data).partition(b"$4WD,CSB000")  # behind a reading of its own, if one was due
+        _, begun, rest = bytes(data).partition(b"$4WD,CSB000")  # after a reading of the car, if one was due
         assert begun
         assert rest.count(b"0") > 4_000
 
@@ -164,8 +164,7 @@ async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
 
 
 async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(cars: Simulation) -> None:
-    """The half frame is still in the car: the row of docs/reference/protocol.md#hazards in which the stop after it is
-    lost."""
+    """The car still has the half frame. A row of docs/reference/protocol.md#hazards: the stop after it is lost."""
     host, port = address(cars)
     reader, writer = await asyncio.open_connection(host, port)
     await cars.inflict(Fault(FaultKind.CUT_WRITE, "green", for_s=0.1, bytes=8))
@@ -179,7 +178,7 @@ async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(car
         while True:
             try:
                 return (await asyncio.open_connection(host, port))[1]
-            except ConnectionError:  # a reset: it was in the queue of a socket that was closed
+            except ConnectionError:  # a reset: the connection was in the queue of a closed socket
                 assert time.monotonic() < end
                 await asyncio.sleep(0.01)
 

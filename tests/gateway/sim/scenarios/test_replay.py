@@ -113,7 +113,7 @@ def test_over_a_pty_beside_a_car_with_a_fault(start: Any, kept: Path, tmp_path: 
     assert sim.line()["platform"] == "arduino"
     assert sim.line()["link"] == f"serial://{tmp_path / 'old'}"
     with serial.Serial(str(tmp_path / "old"), timeout=PATIENCE) as port:
-        # Bytes that a terminal might take for itself come through as they are, round after round.
+        # Control characters of terminals pass unchanged, in each round.
         assert len(port.read_until(BYTES)) < 10 * len(BYTES)
         assert port.read(len(BYTES)) == BYTES
         assert sim.ask(car="old", fault="mute")["ok"]
@@ -167,7 +167,7 @@ def test_what_cannot_be_played_is_one_line(kept: Path, tmp_path: Path, capsys: p
 
 
 def test_a_capture_of_a_car_plays_as_that_car(start: Any, tmp_path: Path) -> None:
-    """What a real host kept of a simulated car comes out again, byte for byte."""
+    """A host's capture of a simulated car plays again, byte for byte."""
     sim = start("--car", "red:arduino:tcp", "--fault", "red:garbage@0.2+50")
     with connect(sim.line()["link"]) as connection:
         got = read(connection, 100)

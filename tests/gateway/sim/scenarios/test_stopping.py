@@ -1,7 +1,7 @@
-"""The stops of docs/reference/protocol.md#stops, written by a stranger.
+"""The stops of docs/reference/protocol.md#stops, written independently of the gateway's code.
 
-Begun at random moments in every load: motors off in time and for good.
-The gateway's own recipes live in gateway.control and are tested there; here the car has to honour the table.
+Stops at random moments in every load turn the motors off in time and for good. The gateway's own sequences are tested
+with gateway.control. Here the simulated car must follow the table.
 """
 
 import random
@@ -20,7 +20,7 @@ REPORT = 0.04
 NO_ECHO = 1.0
 AVOIDANCE = 4.3
 THEORY = 7.3
-"""Of recovery, outside avoidance."""
+"""Maximum time of a recovery outside avoidance, in theory."""
 
 SOFT = ((0.0, STOP), (1.1, STOP))
 FULL = ((0.0, MODE00), (1.1, STOP))
@@ -37,14 +37,14 @@ Load = Callable[[VirtualStranger, random.Random], Awaitable[None]]
 
 
 async def driving(car: VirtualStranger, moments: random.Random) -> None:
-    """Nothing of ours can be in the buffer any more."""
+    """Drive until the buffer can have no byte of ours."""
     await car.wait(1.0 + moments.random())
     await car.write(RUN)
     await car.wait(1.2 + 2.5 * moments.random())
 
 
 def within(frame: bytes, block: float) -> Load:
-    """Anywhere in a block that is certain to run: the frame has left the buffer."""
+    """Return a load: a moment in a block that runs for sure, because its frame has left the buffer."""
 
     async def load(car: VirtualStranger, moments: random.Random) -> None:
         await driving(car, moments)
@@ -65,7 +65,7 @@ def in_mode(mode: int) -> Load:
 
 
 def then_half(before: Load, *frames: bytes) -> Load:
-    """And the link was lost within a frame, anywhere in it."""
+    """Return the load, with the link lost anywhere in a frame."""
 
     async def load(car: VirtualStranger, moments: random.Random) -> None:
         await before(car, moments)
@@ -83,7 +83,7 @@ class Case:
     load: Load
     bound: float
     worst_at_least: float = 0.0
-    """So that the car is not kinder than the measured one."""
+    """Minimum of the longest time, so that the simulated car is no easier than the measured one."""
     world: Callable[[], World] = World.room
     platform: str = "arduino"
     tcp: bool = False
@@ -94,13 +94,13 @@ class Case:
 
 
 def lit_room() -> World:
-    """A lamp that can be seen from everywhere, so that light seeking drives."""
+    """Return a world with a lamp that is visible everywhere, so that light seeking drives."""
     room = World.room()
     return World(room.walls, room.line, [Lamp(9.0, 0.0, reach_m=50.0, overhead=True)])
 
 
 def before_a_wall() -> World:
-    """What a car that has run for a second cannot but follow."""
+    """Return a world with a wall that a car follows after a run of a second."""
     return World([(0.4, -9.0, 0.4, 9.0)])
 
 
@@ -153,7 +153,7 @@ for _tcp in (False, True):
 
 
 async def stop(car: VirtualStranger, recipe: tuple[tuple[float, bytes], ...]) -> float:
-    """Seconds from the first byte to motors off; they must stay off."""
+    """Stop the car. Return the seconds from the first byte until the motors are off for good."""
     begun = car.now
     for at, frame in recipe:
         await car.wait(begun + at - car.now)
@@ -189,7 +189,7 @@ async def test_a_stop_begun_at_many_random_moments(case: Case) -> None:
 async def test_a_stop_and_mode00_every_1_1_s_keep_a_car_that_opens_a_mode_driving() -> None:
     """More frames are not better (docs/reference/protocol.md#stops).
 
-    In the one string that piles up the stop hides the digits, again and again.
+    All frames become one string, in which each stop hides the digits.
     """
     moments = random.Random(1)
     ran_on = 0
