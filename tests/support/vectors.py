@@ -24,5 +24,5 @@ def ids(table: list[dict[str, str]]) -> list[str]:
 
 
 def wire(text: str) -> bytes:
-    """Return the bytes of a cell, in which Python escapes such as \\r and \\xff are allowed."""
+    """Return the bytes of a cell. Python's escapes for control characters and bytes are allowed."""
     return text.encode("latin-1").decode("unicode_escape").encode("latin-1")

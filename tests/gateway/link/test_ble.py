@@ -223,7 +223,7 @@ async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_t
 
 
 async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(peer: BlePeer) -> None:
-    """bleak calls no callback. It reports a connection, also after the restart of the service."""
+    """Without a callback, bleak goes on to report a connection, also after the restart of the service."""
     link = await open_link(peer.url)
     peer.bluez.kill()
     with pytest.raises(LinkLost, match=r"is gone: .*ServiceUnknown"):

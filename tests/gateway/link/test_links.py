@@ -333,7 +333,7 @@ async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
 
 
 async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path) -> None:
-    """pyserial's own write would wait for a write_timeout, or spin. The best of several rounds counts."""
+    """The write of pyserial itself would wait for a write_timeout, or spin. The best of several rounds counts."""
     peer = PtyPeer(tmp_path)
     stood = []
     for _ in range(5):

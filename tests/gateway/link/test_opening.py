@@ -194,7 +194,7 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
 
 
 async def test_a_name_with_several_addresses_is_tried_on_each_and_says_why_in_the_same_words() -> None:
-    """asyncio's own text would be "Multiple exceptions", without the number that identifies a refusal."""
+    """The text of asyncio itself would be "Multiple exceptions", without the number that identifies a refusal."""
     with socket.socket() as taken, socket.create_server(("127.0.0.1", 0)) as server:
         taken.bind(("127.0.0.1", 0))
         nobody = (socket.AF_INET, taken.getsockname())

@@ -113,7 +113,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
 async def test_a_device_that_goes_while_the_ports_are_listed_costs_one_try(
     asked: str, failure: Exception, tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """pyserial reads a device's numbers from files that disappear with it. The next try must not hang."""
+    """The numbers of a device are in files that disappear with it. After a failed read, the next try must not hang."""
 
     def half_gone() -> list[ListPortInfo]:
         raise failure
