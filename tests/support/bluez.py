@@ -1,7 +1,7 @@
 """A fake BlueZ on a private D-Bus system bus, for bleak's own backend: Bluetooth on a computer without a radio.
 
 Its users set DBUS_SYSTEM_BUS_ADDRESS to `address`. This program is also the bus: it answers Hello, takes match rules,
-passes calls to org.bluez, and passes signals to their subscribers. So no dbus-daemon need be installed. The fake has
+passes calls to org.bluez, and passes signals to their subscribers. No dbus-daemon need be installed. The fake has
 the calls of bleak's backend, and the limits measured on the real BlueZ. BlueZ refuses a piece longer than the MTU
 allows. A connected module does not advertise. A connection outlives the program that made it.
 """
@@ -82,9 +82,9 @@ class Module:
     leaves: bool = True
     """False if BlueZ never answers a call of Disconnect."""
     takes: int | None = None
-    """Number of pieces that the module still takes. BlueZ never answers a later write."""
+    """Number of pieces that the module still takes (None: all). BlueZ never answers a later write."""
     refuses: int | None = None
-    """Number of pieces that the module still takes. BlueZ refuses a later write."""
+    """Number of pieces that the module still takes (None: all). BlueZ refuses a later write."""
     known: bool = False
     connected: bool = False
     notified: set[tuple["_Caller", str]] = field(default_factory=set)
@@ -194,7 +194,7 @@ class FakeBluez:
         self._do(work())
 
     def close(self) -> None:
-        """Close all connections to the bus."""
+        """Close the bus and all connections to it."""
 
         async def work() -> None:
             for wire in self._wires:
@@ -357,14 +357,14 @@ class FakeBluez:
         return "", []
 
     async def _notify(self, module: Module, data: bytes) -> None:
-        """Send one signal for all subscribers, if there are any."""
+        """Send each piece as one signal for all subscribers of a characteristic. Without a subscriber, send none."""
         for path in {path for _, path in module.notified}:
             for start in range(0, len(data), module.mtu - 3):
                 piece = data[start : start + module.mtu - 3]
                 await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
 
     async def _advertise(self) -> None:
-        """Report the modules that are on and not connected to all callers that scan."""
+        """Report each module that is on and not connected, if any caller scans."""
         if not any(caller.scans for caller in self._callers):
             return
         for module in self.modules:

@@ -1,6 +1,6 @@
 """Judges the claims of gateways about simulated cars by the cars' true motors and modes. Times: ns since the epoch.
 
-All processes of a test share one clock. So the judge compares the publishers' stamps after the run, and a message that
+All processes of a test share one clock, and the judge compares the publishers' stamps after the run. A message that
 arrives late on a busy machine is no fault.
 """
 
@@ -18,7 +18,7 @@ VERDICT_S: Final = 5.5
 STATE_S: Final = 1.5
 """Lifetime of a claim. Gateways publish each second, and a killed gateway claims nothing."""
 TRUTH_GAP_S: Final = 0.5
-"""Maximum interval between two truths. In a longer gap the true state is unknown. Normal are ten a second."""
+"""Maximum interval between two truths. In a longer gap, the true state is unknown. Simulators publish ten a second."""
 
 MOTORS: Final = "motors off, shown, while they run"
 VERDICT: Final = "mode confirmed, another is true"
@@ -39,7 +39,7 @@ class Span:
     value: str
 
     def shared_s(self, other: "Span") -> float:
-        """Return how long two spans overlap."""
+        """Return the overlap of two spans, s. A negative value is the gap between them."""
         return (min(self.end, other.end) - max(self.begin, other.begin)) / _S
 
 
@@ -60,7 +60,7 @@ class Claims:
 
     cars: dict[str, _CarClaims] = field(default_factory=dict)
     results: int = 0
-    """Number of stops that ended as complete."""
+    """Number of stops and e-stops that ended as complete."""
     shown: int = 0
     """Number of times that `motors` became `off` with the basis `shown`."""
     confirmed: int = 0

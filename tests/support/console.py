@@ -26,14 +26,14 @@ DESKTOP: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
 
 
 def find_chromium(playwright: Playwright) -> str:
-    """Return the path of the distribution's Chromium, else of Playwright's own. Fail with the installing command."""
+    """Return the path of the distribution's Chromium, else of Playwright's own. Fail with the command to type."""
     found = next(filter(None, map(shutil.which, CHROMIUM_NAMES)), playwright.chromium.executable_path)
     assert Path(found).exists(), "there is no Chromium: type `make browser`"
     return found
 
 
 def hold_until_driving(page: Page, judge: Judge) -> None:
-    """Hold the button of the pad until the car drives. After a stop, release it and press again."""
+    """Hold the button of the pad until the car drives. If it does not drive within 2 s, pause and press again."""
     for _ in range(10):
         page.locator("[data-motion=forward]").hover()
         page.mouse.down()
@@ -225,7 +225,7 @@ class ConsoleStage:
         return page.locator(f"[data-report='{before + 1}']")
 
     def stands(self, car: str = "red", *, since_ns: int | None = None) -> float:
-        """Wait until the car's true motors are off. Return the time from the moment to then, s."""
+        """Wait until the car's true motors are off. Return the time from `since_ns` (default: now), s."""
         return self.judges[car].wait_off(since_ns or time.time_ns(), watched_s=0.6)
 
 

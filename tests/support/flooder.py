@@ -15,7 +15,7 @@ from schemas.topics import Qos
 
 LARGE = 5_000_000
 NAMES = 200
-"""Number of names of tokens. With ever more names the hub becomes slow, and so does a process without a gateway."""
+"""Number of names of tokens. With ever more names, the hub becomes slow, and with the hub any other process."""
 AT_ONCE = 64
 """Maximum number of pending queries."""
 

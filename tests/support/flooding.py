@@ -31,13 +31,13 @@ class Flooded:
 
     published: int = 0
     frames: list[tuple[int, bytes]] = field(default_factory=list)
-    """Time (ns since the epoch) and bytes of each write to the car."""
+    """Time (ns since the epoch) and bytes of each read at the tap before the car."""
     apart_s: list[float] = field(default_factory=list)
-    """Time from each write to the next."""
+    """Time from each written frame to the next, by the stamps of frame/tx."""
     stopped_s: list[float] = field(default_factory=list)
     """Time from each request of a stop to its first frame on the wire."""
     drove_on_s: list[float] = field(default_factory=list)
-    """Times after the first stop at which motors went on: none, because no operator has paused."""
+    """Times at which motors went on, from one second after the first stop: none, because no operator has paused."""
     rss_mb: list[float] = field(default_factory=list)
     left_out: int = 0
 

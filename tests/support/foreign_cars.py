@@ -1,7 +1,7 @@
 """Cars of foreign programs behind wires with gaps, and the claims about them. Shared by tests/e2e and tests/soak.
 
-Each car's own program reports the true state (tests/e2e/strangers_car.py). A car stands if its motors are off in mode
-0.
+Each car's own program reports the true state (tests/e2e/strangers_car.py).
+A car stands if its motors are off in mode 0.
 """
 
 import contextlib
@@ -33,13 +33,13 @@ MODES: Final = {
     "following": 6,
 }
 FALSE_S: Final = 0.3
-"""Maximum time that a claim may be false."""
+"""Maximum time for which a claim may be false."""
 STANDS_S: Final = 12.0
 """Maximum time from a whole link to a car that stands."""
 SHOWN_S: Final = 40.0
 """Maximum time from a whole link to the evidence, on a busy machine."""
 WATCHED_S: Final = 3.0
-"""Minimum time for which a car must stand after a shown stop."""
+"""Minimum time for which a car must have stood to count as stopped."""
 ENTERED_S: Final = 10.0
 """Maximum time until a mode is open, on a busy machine."""
 STOP_BYTES: Final = 13
@@ -162,7 +162,7 @@ class ForeignCar:
         return found if began is None else [*found, (began, self.heard_until)]
 
     def stop_records(self, since: float) -> list[Any]:
-        """Return the last records of stops."""
+        """Return the records after this moment that end a stop."""
         with self._lock:
             return [
                 each
@@ -253,7 +253,7 @@ class ForeignCars:
         return iter(self.cars)
 
     def enter_modes(self, fleet: FleetProcesses | Up) -> None:
-        """Bring each car into the mode in which it is to be stopped.
+        """Bring each car into the mode in which the test stops the car.
 
         A gap may have left half a general stop in the car's buffer. That half swallows a command, so send it twice.
         """
@@ -315,7 +315,7 @@ class ForeignLot:
         }
 
     def ready(self) -> None:
-        """Wait until each car is in a known state."""
+        """Wait until the gateways claim that all motors are off."""
         for car in self.cars:
             self.fleet.ready(car.mode)
 

@@ -66,7 +66,7 @@ class GapProxy:
         self._thread.start()
 
     def arm(self, gap: ByteGap) -> None:
-        """Begin this gap with the gateway's next byte."""
+        """Prepare this gap. Its bytes and its length count from the gateway's next byte."""
         with self._lock:
             self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
             self._gap = gap
@@ -78,7 +78,7 @@ class GapProxy:
 
     @property
     def whole_at(self) -> float | None:
-        """Return the time since which the proxy passes everything again, s since the epoch; None before."""
+        """End of the gap, s since the epoch, also if it is in the future. None before the gateway's first byte."""
         return None if self._until == float("inf") else self._until
 
     def frames(self, since: float) -> list[tuple[float, bytes, bytes]]:

@@ -38,7 +38,7 @@ class Judge:
 
     @classmethod
     def follow(cls, bus: Bus, car: str = "red") -> "Judge":
-        """Subscribe to the truth, the frames and the states of a car."""
+        """Subscribe to the truth, the frames, the logs and the claims about the motors of a car."""
         judge = cls(car)
         bus.subscribe(f"fleet/{car}/sim/truth", judge._truth)
         bus.subscribe(f"fleet/{car}/frame/tx", judge._frame)

@@ -30,14 +30,14 @@ OPERATOR: Final = Path(__file__).parents[1] / "e2e" / "operator_that_dies.py"
 
 @dataclass(frozen=True, slots=True)
 class Took:
-    """The time for which a car went on, s, and its limit."""
+    """A measured time, s, and its limit."""
 
     took_s: float
     limit_s: float
 
     @property
     def late(self) -> bool:
-        """True if the car went on for too long."""
+        """True if the time exceeds its limit."""
         return self.took_s > self.limit_s
 
     def __str__(self) -> str:
@@ -73,7 +73,7 @@ class Operator:
 
     @property
     def limit_s(self) -> float:
-        """Maximum time from the kill: the drive's time to live, or 1 s if the token ends sooner; the block; 0.3 s."""
+        """Maximum time from the kill: the drive's time to live (with a token at most 1 s), the block, and 0.3 s."""
         told_s = min(self.duration_s, 1.0) if self.watched else self.duration_s
         return told_s + self.block_s + 0.3
 
@@ -103,7 +103,7 @@ def kill_operators(
         fleet.ready(each.car)
     started = {each: each.start(fleet) for each in operators}
     killed: dict[Operator, int] = {}
-    # Kill first the operators whose drive ends by itself. On a machine that stalls, the drive may be over before.
+    # Kill first the operators whose drive ends by itself. On a machine that stalls, the drive may end before the kill.
     for each, process in sorted(started.items(), key=lambda one: one[0].how != "command"):
         if each.also or each.how == "command":
             assert process.line()["status"] in TAKEN, each
@@ -148,8 +148,8 @@ MODE_DIGITS: Final = {
     "light_seeking": 5,
     "following": 6,
 }
-# Recovery (docs/reference/protocol.md#stops): idle 0.06 s, and a report in transit takes 0.04 s. Else the rest of the
-# block; in theory 7.3 s outside avoidance, which blocks 4.3 s.
+# Recovery (docs/reference/protocol.md#stops): an idle car takes 0.06 s, and a report in transit 0.04 s. A busy car
+# takes the rest of its block, in theory 7.3 s outside avoidance, which blocks for 4.3 s.
 DOINGS: Final = (
     Doing("a", "driving", 0.1),
     Doing("b", "driving with a servo on its way", 0.65 + 0.1),
@@ -166,7 +166,7 @@ MORE_DOINGS: Final = (
 
 
 def kill_gateways(fleet: FleetProcesses, doings: tuple[Doing, ...] = DOINGS) -> dict[str, Took]:
-    """Kill every gateway and start new ones. Return how soon each begins, and how long its car goes on from there."""
+    """Kill every gateway and start new ones. Return the delay of each recovery, and how long its car goes on."""
     judges = {each.car: Judge.follow(fleet.bus, each.car) for each in doings}
     _, links = fleet.simulate(*(f"{each.car}:arduino:pty" for each in doings), truth=True)
     where = dict(zip(judges, links, strict=True))
@@ -255,11 +255,11 @@ STOPPED: Final = {
     "following": "stm32",
     "raspberry_pi": "raspberry_pi",
 }
-"""Platform by mode: one car for each mode, and one whose program has only mode 0."""
+"""Platform by mode: a car for each mode but remote_control, and a car whose program has only mode 0."""
 
 
 def stop_in_every_mode(fleet: FleetProcesses, rounds: int, moments: random.Random) -> dict[str, list[Took]]:
-    """Send `stop` at random moments in each mode. Return how long the motors went on, and the announced worst case."""
+    """Send `stop` at random moments to each car of STOPPED. Return how long motors went on, and the announced time."""
     cars = {what: f"car{number}" for number, what in enumerate(STOPPED)}
     judges = {what: Judge.follow(fleet.bus, car) for what, car in cars.items()}
     specs = (f"{car}:{STOPPED[what]}:tcp" for what, car in cars.items())

@@ -32,7 +32,7 @@ class Told:
     recovered: int
     """Number of messages that were missed at first and backfilled."""
     missing_s: tuple[float, ...] = ()
-    """Time from the end of each interrupted session to the kill."""
+    """Time from the first message that an interrupted session lacks to the kill of its recorder."""
 
 
 def hub_killed(
@@ -109,8 +109,8 @@ def recorder_killed(
         assert not verdict.whole
         assert "it crashed" in verdict.ended, words
         assert (verdict.twice, verdict.missed, verdict.dropped) == ([], {}, {}), words
-        # The session has every message from its start to the kill. Backfilled messages from before its start may be
-        # missing, if the kill interrupted the backfill. `verify` names exactly these.
+        # The session has every message from its start to its last message. If the kill interrupted a backfill,
+        # messages from before the start may be missing. `verify` names exactly these.
         have = numbers([path])
         said = {(one["key"], number) for one in verdict.missing for number in range(one["first"], one["last"] + 1)}
         assert said == {

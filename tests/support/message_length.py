@@ -4,7 +4,7 @@ import tempfile
 from typing import Final
 
 LINE: Final = 160
-"""Characters of a line."""
+"""Number of characters of a line."""
 MAX_LINES: Final = 2
 
 
@@ -14,7 +14,7 @@ def count_lines(text: str) -> int:
 
 
 def too_long(printed: str) -> list[str]:
-    """Return the messages in what a command printed on stderr that are too long.
+    """Return the lines of a command's stderr that are too long.
 
     The temporary directory counts as `/tmp`: a test may not depend on the place of its clone.
     """

@@ -16,7 +16,7 @@ from tests.support.virtual import Pair
 LOOK_S = 0.2
 """Interval at which a gateway checks its states."""
 SETTLED_S = 2.5
-"""Time after the end of a mode in which its closing block may lose frames. Alarms in that time are not false."""
+"""Pause after a change of mode. The closing block may lose an earlier frame, and an alarm about that loss is true."""
 ALARMS = frozenset(
     {
         "mode_contradicted",

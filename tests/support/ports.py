@@ -12,7 +12,8 @@ from tests.support.scheduling import SUITE, SUITES
 FIRST, LAST = 10_000, 15_999
 """First and last port. They are below the ports that a system assigns by itself.
 
-A hub may take seconds to listen. In one of ten runs, the system gave a probed port to another process meanwhile."""
+A hub may take seconds to listen. When the system chose the ports, it gave a probed port to another process meanwhile,
+in one of ten runs of the suite."""
 
 
 def ports_of(worker: int, workers: int, suite: int = 0, suites: int = 1) -> range:

@@ -34,12 +34,12 @@ LONGEST_POLL_S = 0.05
 POLL_SHARE = 0.05
 """Poll interval of a wait, as a share of the time that has passed.
 
-A poll may be a query of the bus. With four workers, a hundred polls a second took half of two processors.
+A poll may be a query of the bus. With four workers, a hundred polls a second by each took half of two processors.
 """
 
 
 def wait_for(so: Callable[..., Any], what: str, seconds: float = PATIENCE_S) -> Any:
-    """Poll until the result is true; return that result. Fail after the timeout."""
+    """Poll until the result is true, and return that result. Fail after the timeout."""
     began = time.monotonic()
     while not (found := so()):
         waited_s = time.monotonic() - began
@@ -49,7 +49,7 @@ def wait_for(so: Callable[..., Any], what: str, seconds: float = PATIENCE_S) -> 
 
 
 class GatewayProcess:
-    """One `gateway` process."""
+    """One Python process: a gateway, a hub, a simulator or a command."""
 
     def __init__(self, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
         self.log = log
@@ -146,7 +146,7 @@ class FleetProcesses:
         return started
 
     def simulate(self, *cars: str, truth: bool = False, world: str = "room") -> tuple[GatewayProcess, list[str]]:
-        """Start simulated cars; return process and links. Without `truth` they only answer requests."""
+        """Start simulated cars. Return process and links. Without `truth`, no car publishes its true state."""
         described = [word for car in cars for word in ("--car", car)]
         published = () if truth else ("--no-truth",)
         sim = self.start("-m", "gateway.cli", "sim", *published, "--seed", "3", "--world", world, *described)
@@ -176,7 +176,7 @@ class FleetProcesses:
         return next((each for each in found if not isinstance(each, str)), None)
 
     def ready(self, car: str = "red") -> None:
-        """Wait until the car is in a known state."""
+        """Wait until the gateway claims that the motors are off."""
 
         def known() -> bool:
             safety = self.state("safety", car)
@@ -185,20 +185,20 @@ class FleetProcesses:
         wait_for(known, f"{car} is in a known state")
 
     def ask(self, verb: str, car: str = "red", **fields: Any) -> Any:
-        """Send a command as JSON; return the answer as a dict."""
+        """Send a command as JSON, and return the answer as a dict."""
         answers = self.ask_all(verb, car, **fields)
         assert len(answers) == 1, answers
         return answers[0]
 
     def ask_all(self, verb: str, car: str = "*", **fields: Any) -> list[Any]:
-        """Send a command as JSON to every matching car; return the answers."""
+        """Send a command as JSON to every matching car, and return the answers."""
         key, payload = f"fleet/{car}/@cmd/{verb}", json.dumps(fields).encode()
         answers = list(self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0))
         assert all(isinstance(answer, bus.Sample) for answer in answers), answers
         return [json.loads(answer.payload) for answer in answers if isinstance(answer, bus.Sample)]
 
     def left(self) -> list[str]:
-        """Return the processes that still run at this endpoint, by the system's own list."""
+        """Return the ids of processes at this endpoint that `start` has not started, by the system's own list."""
         listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
         mine = {str(process.pid) for process in self._started}
         found = [line.split(None, 1) for line in listed.splitlines()]
@@ -281,7 +281,7 @@ class TcpCar:
             self._turn.notify()
 
     def pour(self, data: bytes, per_s: float, seconds: float) -> int:
-        """Send data repeatedly; return the number of sent bytes."""
+        """Send data repeatedly at `per_s` bytes a second. Return the number of sent bytes."""
         began, sent = time.monotonic(), 0
         while (now := time.monotonic() - began) < seconds:
             while sent < now * per_s and time.monotonic() < began + seconds:

@@ -24,7 +24,7 @@ READING = b"$4WD,CSB33,PV8.2,GS214,LF0110,HW00,GM00#"
 
 
 class Load:
-    """Cars that track a line. For each frame, every car publishes a reading and the frame, on a thread of its own.
+    """Cars that track a line. For each frame, a car publishes a reading and the frame. Five cars share a thread.
 
     A publisher slower than its topic's rate (27 Hz) caches more than ten seconds.
     """
@@ -100,7 +100,7 @@ class Recording:
         self.session = Path(self.process.line()["session"])
 
     def end(self) -> Any:
-        """End the recorder by a signal; return its last line."""
+        """End the recorder by a signal, and return its last line."""
         assert self.process.end() == 0, self.process.stderr
         return self.process.line()
 

@@ -31,14 +31,16 @@ HELD: Final = "yellow"
 FILL_S: Final = 3.0
 """Maximum time until another free car fills a role, or until its only car fills it after a recovery (issue 5)."""
 NOTICED_S: Final = 4.5
-"""Maximum time to notice a reset. It takes three contradicting frames at one a second."""
+"""Maximum time to notice a reset. Three contradicting frames show a reset, one a second."""
 SHOWN_S: Final = 4.0
-"""Time for which a stop is shown before the mode is opened again: two pauses in the reports show it."""
+"""Maximum time until the car has shown the stop before the next mode. Two pauses in its reports show a stop."""
 IN_FORCE_S: Final = 3.5 + 1.0
-"""The longest opening (docs/reference/protocol.md#blocking-times), and one second (issue 5)."""
+"""Maximum time from a filled role to its mode: the longest opening (docs/reference/protocol.md#blocking-times), 1 s."""
 STRAY_S: Final = 2.5
-"""A misread MODE frame opens mode 0 for 2.3 s and keeps the motors on (docs/reference/protocol.md#hazards). Recovery
-stops them only after that."""
+"""Maximum time for which motors may be on in mode 0 without a drive.
+
+A misread MODE frame opens mode 0 for 2.3 s and keeps the motors on (docs/reference/protocol.md#hazards). Recovery stops
+the motors only after that time."""
 _FRAMES: Final = {encode(ModeOpen(mode)): mode for mode, _ in ROLES.values()}
 
 
@@ -84,11 +86,11 @@ class Watcher:
 
     @property
     def filled(self) -> bool:
-        """Return True if every role has its cars in its mode, and all other cars rest."""
+        """True if as many cars are truly in the mode of each role as the plan demands."""
         return all(len(self.truly(mode)) == count for mode, count in ROLES.values())
 
     def opened_after(self, moment_ns: int, mode: Mode) -> list[tuple[int, str]]:
-        """Return the times after a moment at which a car got the frame of a mode or truly entered it; each car once."""
+        """Return time and car of the openings of a mode after a moment, by frame or true mode, each car once."""
         with self._lock:
             found = {car: at for at, car, opened in reversed(self.frames) if at > moment_ns and opened is mode}
             for car in ABLE:
@@ -147,7 +149,7 @@ class Watcher:
 
 @dataclass(frozen=True, slots=True)
 class JudgedFault:
-    """One fault and its consequences, s after it. None: no role was left."""
+    """One fault and its consequences, s after the fault. None: the fault hit no car with a role."""
 
     what: str
     filled_s: float | None
@@ -173,12 +175,12 @@ class RoleStage:
         self.held_ns = 0
 
     def begin(self) -> None:
-        """Wait until the plan is in force. Then stop one car as a person, so that the car is on hold."""
+        """Wait until all cars are known. Stop one car as a person, for a hold. Wait until the plan is in force."""
         watcher, bus = self.watcher, self.up.bus
         wait_for(lambda: all(watcher.known_after(0, car, bus) for car in (*ABLE, HELD)), "all cars are known", 90.0)
         assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in TAKEN
         wait_for(lambda: watcher.filled, "the plan is in force", 90.0)
-        self.up.ready(HELD)  # the car may have had a role, which another car takes before the stop is complete
+        self.up.ready(HELD)  # its stop may take longer than the plan
         self.held_ns = time.time_ns()
 
     def strike(self, what: str) -> JudgedFault:
@@ -221,7 +223,7 @@ class RoleStage:
         wait_for(lambda: not self.up.exists(pid), f"{name} is gone")
 
     def judge(self) -> None:
-        """Fail if a car had two roles, a held car moved, or motors were on in mode 0 for too long."""
+        """Fail if a car had two roles, a held car moved, motors ran in mode 0 for long, or a role was filled late."""
         watcher = self.watcher
         assert not watcher.twice, f"two roles: {watcher.twice}"
         strays = {car: stray_s for car, stray_s in watcher.strays.items() if stray_s > STRAY_S}

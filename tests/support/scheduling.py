@@ -1,4 +1,4 @@
-"""Which worker of pytest-xdist runs which test: tests that compute have workers of their own, of low priority."""
+"""Assigns tests to workers of pytest-xdist. Tests that compute have workers of their own, of low priority."""
 
 import os
 from typing import Final
@@ -8,16 +8,16 @@ from xdist.scheduler.loadgroup import LoadGroupScheduling
 from xdist.workermanage import WorkerController
 
 FOREGROUND_PER_PROCESSOR: Final = 3.5
-"""Workers for tests of processes, for each processor. With four, simulated cars were late and tests of stops failed."""
+"""Workers per processor for tests of processes. With four, simulated cars were late and tests of stops failed."""
 SUITES: Final = "SUITES_AT_ONCE"
-"""Variable in the environment: how many suites share this machine (`make stress`). Each has its part of the workers."""
+"""Environment variable: number of suites that share this machine (`make stress`), each with its part of the workers."""
 SUITE: Final = "SUITE_NUMBER"
-"""Variable in the environment: the number of this suite, from 0. Each has its part of the ports."""
+"""Environment variable: index of this suite, from 0. Each suite has its part of the ports."""
 _PROCESSORS: Final = max(1, (os.cpu_count() or 1) // int(os.environ.get(SUITES, "1")))
 WORKERS: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS) + _PROCESSORS
-"""One more for each processor is in the background."""
+"""Number of workers. One for each processor is in the background."""
 _MIN_TESTS: Final = 1000
-"""With fewer tests no worker is in the background."""
+"""Minimum number of tests for workers in the background."""
 _LOWEST_PRIORITY: Final = 19
 
 _COMPUTING: Final = (
@@ -37,18 +37,18 @@ _COMPUTING: Final = (
     "tests/schemas/",
     "tests/test_",
 )
-"""Rooms of tests that compute on virtual time, or read files. The other tests wait for processes, cars and seconds."""
+"""Places of tests that compute on virtual time, or read files. All other tests wait for processes, cars and seconds."""
 _STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/replay/rerun/test_live.py")
-"""Files in these rooms that start processes. At low priority a Rerun viewer took longer than 40 s to go on."""
+"""Files in these places that start processes. At low priority, a Rerun viewer took longer than 40 s to go on."""
 
 
 def computes(nodeid: str) -> bool:
-    """Return True if a test computes only."""
+    """Return True if a test only computes."""
     return nodeid.startswith(_COMPUTING) and not nodeid.startswith(_STARTING)
 
 
 def in_background(worker: str, workers: int, tests: int) -> bool:
-    """Return True if this worker (`gw7`) of so many has low priority, and runs tests that compute only."""
+    """Return True if this worker (such as `gw7`) has low priority, and runs only tests that compute."""
     return tests >= _MIN_TESTS and workers == WORKERS and int(worker.removeprefix("gw")) >= workers - _PROCESSORS
 
 
@@ -62,13 +62,14 @@ def lower_priority(config: pytest.Config, tests: int) -> None:
 class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has no types
     """`--dist loadgroup` with workers in the background.
 
-    These use what the others leave of the processors. So both processors are busy and no simulated car is late.
+    Workers in the background use the processor time that the other workers leave. All processors
+    are busy, and no simulated car is late.
     """
 
     def _assign_work_unit(self, node: WorkerController) -> None:
         if in_background(node.gateway.id, self.numnodes, len(self.collection or ())):
-            # `computes` sorted the tests, so those that compute are last. Processes that a worker in the background
-            # started would be of low priority too, so it takes no others.
+            # tests/conftest.py has sorted the tests that compute to the end. Processes that a worker in the background
+            # started would have low priority, too. The worker takes no other tests.
             scope, unit = next(reversed(self.workqueue.items()))
             if not computes(next(iter(unit))):
                 node.shutdown()

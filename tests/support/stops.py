@@ -68,7 +68,7 @@ def on_black() -> World:
 
 
 class Flickering(World):
-    """The room, in which every second ranging gets no echo, as with slanted walls and curtains."""
+    """The room, in which half of the rangings get no echo, at random, as with slanted walls and curtains."""
 
     def __init__(self, seed: int = 1) -> None:
         room = echoing()
@@ -109,7 +109,7 @@ def steering(pair: Pair, moments: random.Random) -> None:
 
 
 def lossy(before: Load) -> Load:
-    """Return the load, with the car's readings lost from just before the stop."""
+    """Return the load, after which the car's readings are lost for two seconds."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         before(pair, moments)
@@ -309,7 +309,7 @@ def half(*whats: Drive | OneShot | SetMode) -> Load:
 
 
 def cut_off(before: Load) -> Load:
-    """Return the load, then a link that is lost and comes back. The stop is sent during the recovery."""
+    """Return the load, then a link that is lost and comes back. The stop follows at once, or within 6 s."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         before(pair, moments)
@@ -334,7 +334,7 @@ def half_closing(count: int) -> Load:
 
 
 def found(mode: Mode) -> Load:
-    """Return a load: a gateway without a configured platform finds a car in a mode."""
+    """Return a load: after a lost link, the gateway finds the car in a mode that it has not opened."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         driving(pair, moments)
@@ -410,7 +410,7 @@ class Seen:
     settled_s: float
     """Time until the car was also in mode 0, where only a command of ours turns them on."""
     complete_s: float
-    """Time until the final record, shown or sent; inf if the stop has none."""
+    """Time until the final record (shown or sent), inf if the stop failed or has none."""
     shown_s: float
     """Time until the car had shown that it stands, inf if it did not."""
     motors: str
@@ -452,8 +452,8 @@ def state_of(pair: Pair) -> str:
         return f"{kind[style]}{Mode.MANUAL}, {what}"
     if now < control.model.pacing.block_until:
         return f"{kind[style]}opening {mode}"
-    # docs/reference/protocol.md#blocking-times gives these one row, "up to 0.1 s per turn"; the infrared remote is
-    # taken as one of them.
+    # docs/reference/protocol.md#blocking-times gives these modes one row, "up to 0.1 s per turn". The infrared remote
+    # counts as one of them.
     return f"{kind[style]}in {'a mode that reads pins' if mode in READS_PINS else mode}"
 
 
@@ -516,7 +516,7 @@ class StopRow:
     """Median time until the stop was shown."""
     shown_worst_s: float
     worst_case: str
-    """The case with the longest time."""
+    """The case with the longest time, and its seed."""
 
 
 def rows(seen: Iterable[Seen]) -> list[StopRow]:

@@ -27,7 +27,7 @@ class Tap:
         self._thread.start()
 
     def stall(self) -> None:
-        """Take no more bytes from either end, without a sign to them."""
+        """Take no more bytes from either end, and close no connection."""
         self._flows.clear()
 
     def flow(self) -> None:

@@ -48,7 +48,7 @@ class Trouble:
     cars: tuple[str, ...]
     chance: random.Random
     kills: tuple[str, ...] = ("gateway", "hub", "coordinator")
-    """Kinds of processes that are killed now and then; empty for none."""
+    """Kinds of processes to kill now and then. Empty for none."""
     counts: Counter[str] = field(default_factory=Counter)
     driving: list[str] = field(default_factory=list)
     """Texts about cars that did not stand in time."""

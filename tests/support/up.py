@@ -73,7 +73,7 @@ class Up:
                 os.kill(pid, signal.SIGTERM)
 
     def left(self, *, ours: bool = False) -> list[int]:
-        """Return the processes that still run at this endpoint, by the system's own list. `ours`: without the hub."""
+        """Return the ids of other processes at this endpoint, by the system's own list. `ours`: without the hub."""
         return [pid for pid, words in self._mine() if not (ours and "schemas.bus.hub" in words)]
 
     def _mine(self) -> list[tuple[int, str]]:
@@ -102,7 +102,7 @@ class Up:
                 return said
 
     def simulator(self, **fields: Any) -> Any:
-        """Send a request to the simulator; return its answer."""
+        """Send a request to the simulator, and return its answer."""
         assert self.process.popen.stdin is not None
         self.process.popen.stdin.write(json.dumps(fields) + "\n")
         self.process.popen.stdin.flush()
@@ -121,7 +121,7 @@ class Up:
         return next((each for each in self.processes() if each.name == name), None)
 
     def running(self, name: str, but: int = 0) -> int:
-        """Wait until a process runs with another id than `but`. Return the id; 1 for a hub that a gateway started."""
+        """Wait until a process runs with another id than `but`. Return its id (1 for a hub that a gateway started)."""
 
         def pid() -> int | None:
             found = self.state(name)
@@ -141,7 +141,7 @@ class Up:
         return listed.stdout.strip()[:1] not in ("", "Z")
 
     def hub(self) -> int:
-        """Return the hub by the system's own list: the supervisor's, or one that a gateway started."""
+        """Return the id of the hub by the system's own list: the supervisor's, or a hub that a gateway started."""
 
         def one() -> int | None:
             return next((pid for pid, words in self._mine() if "schemas.bus.hub" in words), None)
@@ -156,11 +156,11 @@ class Up:
         return None
 
     def ready(self, car: str) -> None:
-        """Wait until the car is in a known state."""
+        """Wait until the gateway claims that the motors are off."""
         wait_for(lambda: (safety := self.get(f"{car}/state/safety")) and safety.motors == "off", f"{car} is ready")
 
     def ask(self, verb: str, car: str, **fields: Any) -> Any:
-        """Send a command as JSON; return the answer."""
+        """Send a command as JSON, and return the answer."""
         key = f"fleet/{car}/@cmd/{verb}"
         payload = json.dumps(fields).encode()
         (answer,) = self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0)

@@ -1,6 +1,6 @@
 """Reads tests/vectors/*.tsv: one row per line of the tables of docs/reference/protocol.md.
 
-Its `source` names the section and row.
+The column `source` names the section and the row.
 """
 
 from pathlib import Path

@@ -56,7 +56,7 @@ class Pair:
         self._touched = False
         """True if control got news since `_control_at` was computed."""
         self._awake = 0
-        """Number of turns of the loop without a sleep."""
+        """Number of consecutive turns of the loop without a sleep."""
         self.run(start_s, linked=False)
 
     def connect(self) -> None:
@@ -79,7 +79,7 @@ class Pair:
         return self
 
     def ask(self, what: Action, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
-        """Send a command, and run one turn."""
+        """Send a command, and write the frames that control has due."""
         self.number += 1
         command = Command(identity or f"c{self.number}", verb, sender or Sender(), what)
         answer = self.control.command(command, self.now)
@@ -94,7 +94,7 @@ class Pair:
             self.turn(end, linked=linked)
 
     def until(self, condition: Callable[..., bool], seconds: float) -> float:
-        """Let time pass until a condition holds. Return how long that took; fail if it takes longer than `seconds`."""
+        """Let time pass until a condition holds. Return the time that passed. Fail after `seconds`."""
         began = self.now
         end = began + seconds
         self._touched = True

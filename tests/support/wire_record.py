@@ -1,6 +1,7 @@
-"""`gateway sim` that also notes what reaches its cars: `python -m tests.support.wire_record FILE SIM-ARGUMENTS`.
+"""`gateway sim` with a record of the bytes to its cars: `python -m tests.support.wire_record FILE SIM-ARGUMENTS`.
 
-A line of the file is a time (ns since the epoch), a car, and bytes in hex, or `blocked` or `free`: the car's program.
+Each line of the file has a time (ns since the epoch), a car, and the bytes in hex. If the car's program becomes blocked
+or free, its line has `blocked` or `free` in place of bytes.
 """
 
 import argparse
@@ -44,7 +45,7 @@ def note_all(file: TextIO) -> None:
 
 
 class WireRecord:
-    """The lines of one car in order."""
+    """The lines of a record, by car and in order."""
 
     def __init__(self, file: Path) -> None:
         self._file = file.open()
@@ -57,7 +58,7 @@ class WireRecord:
         self._file.close()
 
     def read(self) -> None:
-        """Read what is new."""
+        """Read the new lines of the file."""
         *lines, self._rest = (self._rest + self._file.read()).split("\n")
         for line in lines:
             at, car, what = line.split()
@@ -67,7 +68,7 @@ class WireRecord:
             self._blocks.setdefault(car, [(0, False)]).append((int(at), what == "blocked"))
 
     def first_after(self, car: str, moment_ns: int) -> int | None:
-        """Return when the first bytes after a moment reached a car."""
+        """Return the time at which the first bytes after a moment reached a car, None if none did."""
         times = self._bytes.get(car, [])
         index = bisect_left(times, moment_ns)
         return times[index] if index < len(times) else None
@@ -77,7 +78,7 @@ class WireRecord:
         return self._blocks.get(car, [(0, False)])[-1][1]
 
     def was_blocked(self, car: str, begin_ns: int, end_ns: int) -> bool:
-        """Return True if a block of the car's program ran at any time in between."""
+        """Return True if the car's program was blocked at any time between two moments."""
         blocks = self._blocks.get(car, [(0, False)])
         running = blocks[bisect_left(blocks, (begin_ns, False)) - 1][1]
         return running or any(on for at, on in blocks if begin_ns <= at <= end_ns)

@@ -1,4 +1,4 @@
-"""Hides what the extras install from the process that imports this module."""
+"""Hides the packages of the extras from the process that imports this module."""
 
 import importlib.abc
 import sys
@@ -12,7 +12,7 @@ HIDDEN = frozenset(
 
 
 class Hidden(importlib.abc.MetaPathFinder):
-    """Finds no module of an extra."""
+    """Fails the import of each module of an extra."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> None:
         if fullname.partition(".")[0] in HIDDEN:

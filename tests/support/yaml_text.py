@@ -1,4 +1,4 @@
-"""A YAML text as a model, for the tests of models and of the document."""
+"""Reads a YAML text into a model, for the tests of models and of the document."""
 
 from typing import TypeVar
 
@@ -10,7 +10,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_yaml(text: str, source: str, model: type[Model]) -> Model:
-    """Read a model from a text; raise BadFile."""
+    """Read a model from a text. Raise BadFile for its faults."""
     document = Document(text, source)
     found = document.validate(model)
     document.raise_faults()
