@@ -1,4 +1,4 @@
-"""Collects tests, spreads them over workers, sets the timeout of Hypothesis' examples, and restores SIGINT."""
+"""Collects tests, spreads them over workers, removes the deadline of Hypothesis' examples, and restores SIGINT."""
 
 import gc
 import signal
@@ -10,8 +10,8 @@ from xdist.remote import Producer
 
 from tests.support import scheduling
 
-# By default, Hypothesis fails an example that takes 200 ms, or a second to make. A stall of the machine is no fault of
-# the product. pytest's timeout ends an endless example.
+# By default, Hypothesis fails an example that takes 200 ms, and a test whose examples take a second to generate. A
+# stall of the machine is no fault of the product. pytest's timeout ends an endless example.
 settings.register_profile(
     "patient",
     parent=settings(),

@@ -63,7 +63,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def fault(target: Path, anchor: str) -> str:
-    """Return an error if the page or its heading does not exist; empty if both do."""
+    """Return an error if the page or its heading does not exist, else an empty text."""
     if not target.exists():
         return f"no file {target.relative_to(ROOT) if target.is_relative_to(ROOT) else target}"
     if anchor and anchor not in anchors(target):
@@ -165,13 +165,13 @@ NOUNS: Final = re.compile(
     r"\b(?:the|a|an|of|what (?:is|was)) (?:heard|told|asked|said|shown|kept|held|given|begun|wanted|found)\b"
     r"(?= (?:is|was|and|or|of)\b|[.,;:])"
 )
-"""Participles as nouns: rule 10 of words."""
+"""Participles as nouns, which no page and no message has."""
 BRITISH: Final = re.compile(r"(?i)\b(?:colour\w*|metres?|behaviour|neighbour\w*|grey|licence)\b")
 
 
 @pytest.mark.parametrize("page", [README, *DOCS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_words_are_plain(page: Path) -> None:
-    """No page uses a participle as a noun, or a synonym of a word of the glossary."""
+    """No page has a participle as a noun, a synonym of a word of the glossary, or British spelling."""
     glossary = GLOSSARY.read_text(encoding="utf-8")
     rows = re.findall(r"^\| [^|]+ \| [^|]+ \| ([^|]+?) ?\|$", glossary, re.MULTILINE)
     refused = {word.strip() for row in rows for word in row.split(",")} - {"", "instead of"}

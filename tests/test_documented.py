@@ -65,7 +65,7 @@ def test_each_argument_of_gateway_has_its_words() -> None:
 
 
 def shell_lines() -> Iterator[tuple[str, str]]:
-    """Yield each command line of README, docs and issue templates, with its place."""
+    """Yield each command line of README and docs, with its page."""
     for path in (ROOT / "README.md", *sorted(DOCS.rglob("*.md"))):
         for block in SHELL.findall(path.read_text(encoding="utf-8")):
             for line in block.splitlines():
@@ -187,7 +187,7 @@ def test_each_event_is_documented() -> None:
 
 
 def environment_variables() -> Iterator[str]:
-    """Yield each variable that the code reads, and each of ours that it names."""
+    """Yield each variable that the code reads, and each of the fleet's own variables that the code names."""
     for _, tree in product_trees():
         for node in ast.walk(tree):
             words = ast.unparse(node) if isinstance(node, ast.Call | ast.Subscript) else ""

@@ -5,7 +5,7 @@ import pytest
 
 @pytest.mark.xdist_group("together")
 def test_groups_are_in_force(request: pytest.FixtureRequest) -> None:
-    """With a newer pytest, `--dist loadgroup` groups no tests, without a warning (pytest-xdist#1386)."""
+    """`--dist loadgroup` groups tests. With a newer pytest, it groups none, without a warning (pytest-xdist#1386)."""
     if getattr(request.config.option, "loadgroup", False):
         assert request.node.nodeid.endswith("@together"), "xdist_group has no effect with this pytest: see constraints"
 

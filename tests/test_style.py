@@ -1,4 +1,4 @@
-"""Tests rules of names and imports that no linter has. CONTRIBUTING.md explains them."""
+"""Tests rules of names, imports and messages that no linter has. CONTRIBUTING.md explains them."""
 
 import ast
 import re
@@ -148,7 +148,7 @@ def test_no_more_imports_are_lazy() -> None:
 
 
 def messages_with_lines(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield all texts of a module but docstrings and help, with their lines. A value counts as a name of 12 letters."""
+    """Yield line and text of all strings but docstrings and help. A value in a text counts as 12 letters."""
     no_message: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) or (isinstance(node, ast.keyword) and node.arg in ("epilog", "help")):

@@ -1,4 +1,4 @@
-"""Time from the start of a command to its end, in absolute times. The floor is a Python that does nothing."""
+"""Time from the start of a command to its end, with absolute goals. The floor is a Python that does nothing."""
 
 import subprocess
 import sys

@@ -11,7 +11,7 @@ from tests.support.processes import PATIENCE_S
 
 COMMANDS = 30
 GAP_S = 0.1
-"""Interval of the commands, over the 60 ms for which a motion is in flight. So pacing delays none of them."""
+"""Interval of the commands, over the 60 ms for which a motion is in flight. Pacing delays none of them."""
 TURNS = cycle([("left", b"$3,0,0,0,0,0,0,0,0#"), ("right", b"$4,0,0,0,0,0,0,0,0#")])
 
 

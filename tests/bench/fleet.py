@@ -20,7 +20,7 @@ from tests.support.up import Up
 
 SIZES = (1, 50, 100)
 GOALS = 50
-"""Number of cars for queries and stops. A small round has only this size."""
+"""Number of cars for queries and stops. A small round has one car."""
 QUERIES = 40
 STOPS = 12
 WINDOW_S = 5.0
@@ -83,7 +83,7 @@ class _Fleet:
         return statistics.fmean(_pss_mb(pid) for pid in self.pids())
 
     def queries(self) -> list[float]:
-        """Return the times of wildcard queries for one reading of every car, until the last answer, ms."""
+        """Return the times of wildcard queries for one state of every car, until the last answer, ms."""
         times = []
         for _ in range(self.scale.count(QUERIES, 3)):
             began = perf_counter()
@@ -93,7 +93,7 @@ class _Fleet:
         return times
 
     def track(self, client: Fleet) -> None:
-        """Bring all cars into tracking. Raspberry Pi cars stay in mode 0."""
+        """Bring all cars but Raspberry Pi cars into tracking."""
         outcomes = [client.car(car).mode("tracking") for car in client.cars() if self._may_track(car)]
         assert all(outcome.ok for outcome in outcomes), [outcome for outcome in outcomes if not outcome.ok]
 

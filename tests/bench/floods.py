@@ -1,7 +1,7 @@
 """`stop` while the bus is flooded: time from the request to the first frame on the tty, and the gateway's memory.
 
-The floor is the same gateway without a flood. The goal of each is 50 ms more at most. The output also has the time in
-which a bare process answers under the same flood of tokens: most of the work for a token is Zenoh's own.
+The floor is the same gateway without a flood. The goal of each is 50 ms more at most. For floods of
+tokens, the output also has the time in which a bare process answers. Most of the work for a token is Zenoh's own.
 """
 
 import json
@@ -22,7 +22,7 @@ WARM_S = 2.0
 RESTED_S = 2.5
 """Time after which a stop is over, so that the next request joins no other stop."""
 KEPT = 1500
-"""Values of each reading that a gateway caches."""
+"""Number of values of each reading that a gateway caches."""
 REPORT_S = 0.04
 LONGEST_FRAME = 26
 CLOSE = b"$4WD,MODE00#"
@@ -62,7 +62,7 @@ class _Car:
 
 
 def _drives(here: Stage, sender: str) -> bool:
-    """Request a drive. Return True if the gateway carries it out."""
+    """Request a drive. Return True if the gateway accepts the request."""
     fields = {"motion": "forward", "duration_s": 10, "sender": sender, "kind": "person"}
     drive = here.session.get("fleet/red/@cmd/drive", payload=json.dumps(fields), timeout=PATIENCE_S)
     return any(reply.ok is not None and json.loads(reply.ok.payload.to_bytes())["status"] in TAKEN for reply in drive)

@@ -18,18 +18,18 @@ RATE_HZ = 25
 WINDOW_S = 8.0
 COMMANDS = 30
 HOUR = 3600 * RATE_HZ
-"""Frames in an hour of tracking."""
+"""Number of frames in an hour of tracking."""
 SETTLED = HOUR // 10
 """Number of frames after which every ring of 1,500 readings is full."""
 AT_ONCE = 100
 LOST_AFTER_S = 3.0
-"""Time after which uncounted frames are dropped frames. `state/link` comes once a second."""
+"""Time after which frames that `state/link` lacks count as dropped. `state/link` comes once a second."""
 
 
 def cpu_s(process: GatewayProcess) -> float:
     """Return the CPU time, user and system: on Linux by the scheduler's own count, elsewhere by `ps` in hundredths.
 
-    The ticks of /proc/PID/stat take 10 ms, and miss most of the threads that run for a fraction of one.
+    The ticks of /proc/PID/stat take 10 ms, and miss most of the threads that run for a fraction of a tick.
     """
     threads = list(Path(f"/proc/{process.pid}/task").glob("*/schedstat"))
     if threads:

@@ -28,12 +28,12 @@ class Scale:
 
 FULL = Scale(runs=5)
 SMALL = Scale(runs=1, share=0.01)
-"""One round of seconds that shows that a benchmark runs. Its figures have no meaning."""
+"""One round, which takes seconds and shows that a benchmark runs. Its figures have no meaning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One line of the table; `ours` and `floor` have one value per run."""
+    """One line of the table. `ours` and `floor` have one value per run."""
 
     name: str
     ours: tuple[float, ...]
@@ -78,7 +78,7 @@ class Measured:
 
 
 def in_turns(scale: Scale, ours: Callable[[], T], floor: Callable[[], T]) -> tuple[list[T], list[T]]:
-    """Run both in turns and return the results of each. The order alternates, and an extra turn warms both up."""
+    """Run both in turns and return the results of each. The order alternates. If runs > 1, a turn warms both up."""
     if scale.runs > 1:
         ours(), floor()
     mine: list[T] = []

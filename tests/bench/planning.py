@@ -1,4 +1,4 @@
-"""Time of one decision of the coordinator for 50 cars and 20 rules. The floor reads each reading once."""
+"""Time of one decision of the coordinator for 50 cars and 20 rules. The floor only reads the readings of each rule."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -28,7 +28,7 @@ STEPS = 100
 
 
 def _pictures(count: int) -> list[FleetSnapshot]:
-    """Return snapshots with new readings of every car. Every second one has one car more or less."""
+    """Return snapshots with new readings of every car. In every second snapshot, one car is on hold."""
     found = []
     for number in range(count):
         readings = {

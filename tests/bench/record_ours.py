@@ -1,6 +1,6 @@
 """The recorder in a process of its own, for the benchmark `record`. Arguments: endpoint, fleet, directory.
 
-Its lines are those of floors/record.py.
+Its lines of input and output are those of floors/record.py.
 """
 
 import json

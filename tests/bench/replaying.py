@@ -17,7 +17,7 @@ SHORTEST_S = 20
 
 
 def write_session(path: Path, seconds: int) -> int:
-    """Write a session of three cars; return its number of messages."""
+    """Write a session of three cars, and return its number of messages."""
     made = Made(path, Writer)
     for index, car in enumerate(CARS):
         drive_about(made, car, index, seconds)
@@ -26,7 +26,7 @@ def write_session(path: Path, seconds: int) -> int:
 
 
 def import_s(source: Path, directory: Path) -> float:
-    """Export with Rerun's own importer; return the time that it took."""
+    """Export with Rerun's own importer, and return the time of the export."""
     began = perf_counter()
     stream = rrc.McapReader(source).stream()
     stream.write_rrd(directory / "floor.rrd", application_id="floor", recording_id="floor")

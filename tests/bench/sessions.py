@@ -36,7 +36,7 @@ def _long(path: Path, size: int, rate: int) -> int:
             for _ in range(rate):
                 number += 1
                 at_ns += 1_000_000_000 // rate
-                # Random, so that it does not shrink: field 5, bytes.
+                # Field 5, bytes. Compression cannot shrink random bytes.
                 payload = b"\x2a\x50" + os.urandom(80)
                 writer.add_message(channels[number % KEYS], at_ns, payload, at_ns, number // KEYS)
             writer.flush()

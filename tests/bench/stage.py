@@ -1,4 +1,4 @@
-"""The stage of a benchmark: a hub of its own, processes, a PTY. All started processes are ended."""
+"""The stage of a benchmark: a hub of its own, processes, a PTY. Its end ends all started processes."""
 
 import contextlib
 import os
@@ -43,7 +43,7 @@ class Tty:
         os.write(self._car, data)
 
     def read(self, timeout_s: float = PATIENCE_S) -> bytes:
-        """Wait for bytes, and return them; empty after the timeout."""
+        """Wait for bytes and return them. Return empty bytes after the timeout."""
         ready, _, _ = select.select([self._car], [], [], timeout_s)
         return os.read(self._car, 4096) if ready else b""
 

@@ -1,6 +1,6 @@
 """Time from a gateway's start to its liveliness token, and its memory. The floor is a process that declares a token.
 
-The time of the first answer to a query after the token is measured, too: a token alone serves nobody.
+The benchmark also measures the time of the first answer to a query after the token. A token alone serves nobody.
 """
 
 import subprocess

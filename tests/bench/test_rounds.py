@@ -1,4 +1,4 @@
-"""Runs one small round of each benchmark, as `python -m tests.bench --small` does. No speed is asserted."""
+"""Runs one small round of each benchmark, as `python -m tests.bench --small` does. No test asserts a speed."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""Floor: a query is answered at once. Arguments: endpoint, key, and what tokens are watched meanwhile."""
+"""Floor: a process answers queries at once. Arguments: endpoint, key, and key expressions of tokens to watch."""
 
 import sys
 import threading

@@ -1,4 +1,4 @@
-"""A session at the hub, with what makes it comparable: timestamps, no shared memory, no scouting."""
+"""A session at the hub that is comparable with ours: timestamps, no shared memory, no scouting."""
 
 import json
 

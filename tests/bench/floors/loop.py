@@ -1,7 +1,7 @@
-"""Floor: a loop reads a port and publishes messages as the gateway's. Arguments: endpoint, port, key.
+"""Floor: a loop reads a port and publishes messages like the gateway's. Arguments: endpoint, port, key.
 
-Nothing is decoded and nothing controlled. Two for each frame, a reading and the raw frame, and five states a second:
-built, stamped, numbered and put as there.
+The loop decodes nothing and controls nothing. It publishes a reading and the raw frame for each frame, and five states
+a second. It builds, stamps, numbers and puts messages as the gateway does.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """Floor: a subscriber's callback that calls `add_message`. Arguments: endpoint, key expression, file.
 
-A line on stdin, the number of messages that were published, ends it once it has them, or after ten seconds.
-It answers with its number of messages and the CPU seconds that they cost, as JSON.
+A line on stdin has the number of published messages. The process ends when it has received that many, or after ten
+seconds. It prints its number of messages and their CPU time, s, as JSON.
 """
 
 import json
@@ -34,7 +34,7 @@ with opened(endpoint) as session, Path(path).open("wb") as file:
     writer = Writer(file)
     writer.start()
     subscriber = session.declare_subscriber(expression, add)
-    list(session.liveliness().get("bench/nobody"))  # what was declared is known when this is answered
+    list(session.liveliness().get("bench/nobody"))  # the hub answers after it has the subscription
     print(json.dumps({"ready": True}), flush=True)
     before = time.process_time()
     published = int(sys.stdin.readline())

@@ -1,4 +1,4 @@
-"""Floor: what comes from a serial port is put on the bus, as it came. Arguments: endpoint, port, key."""
+"""Floor: a process puts the bytes of a serial port on the bus unchanged. Arguments: endpoint, port, key."""
 
 import sys
 
