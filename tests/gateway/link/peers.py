@@ -28,7 +28,7 @@ class Peer(ABC):
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Send all bytes. The call blocks while the link takes none."""
+        """Send all bytes. Block while the link takes none."""
 
     @abstractmethod
     def receive(self, size: int) -> bytes:
@@ -85,7 +85,7 @@ class PtyPeer(Peer):
         os.close(slave)
 
     def stall(self) -> None:
-        pass  # no reader: the buffer is full
+        pass  # without a reader, the buffer fills
 
     def close(self) -> None:
         self.die()
@@ -131,7 +131,7 @@ class TcpPeer(Peer):
         pass  # the server always listens
 
     def stall(self) -> None:
-        pass  # no reader: the buffer is full
+        pass  # without a reader, the buffer fills
 
     def close(self) -> None:
         if self._peer is not None:
@@ -143,7 +143,7 @@ class BlePeer(Peer):
     """A module of a private BlueZ."""
 
     def __init__(self) -> None:
-        from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as its parts
+        from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as dbus_fast
 
         self.module = Module(free_address(), "BT04")
         self.bluez = FakeBluez(self.module)
@@ -170,7 +170,7 @@ class BlePeer(Peer):
         self.stall_after(0)
 
     def stall_after(self, pieces: int) -> None:
-        """Take this number of further pieces."""
+        """Take `pieces` more pieces, then no more."""
         self.module.takes = pieces
         ble.BLE_WRITE_TIMEOUT_S = self._write_s  # type: ignore[misc]
 
@@ -184,7 +184,7 @@ class BlePeer(Peer):
 
 
 async def settled() -> None:
-    """Wait until bleak has noticed the end of its bus, of which it keeps one per loop."""
+    """Wait until all other tasks have ended. bleak keeps one bus per loop, and must notice the end of the bus."""
     async with asyncio.timeout(PATIENCE_S):
         while others := asyncio.all_tasks() - {asyncio.current_task()}:
             await asyncio.wait(others)

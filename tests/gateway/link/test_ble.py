@@ -132,7 +132,7 @@ async def test_by_name(peer: BlePeer) -> None:
 
 
 async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
-    """Another gateway is connected to one of them. This one does not advertise, but counts."""
+    """Another gateway is connected to one of them. The connected module does not advertise, but counts."""
     first = await open_link(peer.url)
     other = Module(free_address(), "BT04")
     peer.bluez.modules.append(other)
@@ -153,7 +153,7 @@ async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
 
 
 async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """BlueZ answers neither Connect nor Disconnect. bleak alone would wait without an end."""
+    """BlueZ answers neither Connect nor Disconnect. bleak alone would wait forever."""
     monkeypatch.setattr(ble, "DISCONNECT_TIMEOUT_S", 0.2)
     peer.module.connects = peer.module.leaves = False
     await refused(peer, timeout_s=0.5)
@@ -223,7 +223,7 @@ async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_t
 
 
 async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(peer: BlePeer) -> None:
-    """Without a callback, bleak goes on to report a connection, also after the restart of the service."""
+    """No callback of bleak reports the end of the service. After the restart, bleak still reports a connection."""
     link = await open_link(peer.url)
     peer.bluez.kill()
     with pytest.raises(LinkLost, match=r"is gone: .*ServiceUnknown"):
@@ -250,7 +250,7 @@ async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
 
 
 async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: BlePeer) -> None:
-    """Radio has no flow control. The link still returns the received bytes, then the cause of its end."""
+    """Radio has no flow control. The link still returns the received bytes, then raises the cause of its end."""
     size = MAX_BUFFERED_BYTES + 20_000
     peer.module.mtu = 515
     await asyncio.to_thread(peer.send, b"x" * size)
@@ -277,13 +277,13 @@ async def test_opening_that_is_given_up_leaves_nothing(peer: BlePeer) -> None:
             await asyncio.sleep(0)
         opening.cancel()
         try:
-            await (await opening).close()  # the link opened before the close
+            await (await opening).close()  # the link had opened before the cancellation
         except asyncio.CancelledError:
             given_up += 1
         assert not peer.module.waiting
     assert given_up
     async with asyncio.timeout(PATIENCE_S):
-        while len(open_descriptors()) > len(before):  # this process also has the other ends
+        while len(open_descriptors()) > len(before):  # this process also has the descriptors of the other ends
             gc.collect()
             await asyncio.sleep(0.01)
     link = await open_link(peer.url)

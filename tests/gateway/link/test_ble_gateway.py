@@ -12,7 +12,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
 
 REPEAT_S = 5.0
-"""Time after which the driver of a car that stands repeats the drive."""
+"""Timeout for the car to drive. After it, `drive` repeats the request."""
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
 
@@ -41,7 +41,7 @@ def sim(fleet: FleetProcesses, peer: BlePeer) -> GatewayProcess:
 
 
 def drive(fleet: FleetProcesses, sim: GatewayProcess) -> None:
-    """Drive, and repeat the request until the car drives: a busy car loses frames, here one behind a color."""
+    """Request a drive until the car drives. A busy car loses frames, here the drive after a color."""
 
     def is_driving() -> bool:
         answer = fleet.ask("drive", motion="forward", duration_s=10, sender="mia", kind="person")

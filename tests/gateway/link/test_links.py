@@ -333,7 +333,10 @@ async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
 
 
 async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path) -> None:
-    """The write of pyserial itself would wait for a write_timeout, or spin. The best of several rounds counts."""
+    """The write of pyserial itself would wait for a write_timeout, or spin.
+
+    The best of several rounds counts, because the machine may be busy.
+    """
     peer = PtyPeer(tmp_path)
     stood = []
     for _ in range(5):
@@ -371,7 +374,7 @@ async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: P
 @pytest.mark.parametrize("says", [b"", FRAME])
 @pytest.mark.parametrize("reset", [False, True])
 async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes, reset: bool) -> None:
-    """A car has one client. A car that has sent bytes before its end has other reasons."""
+    """A car has one client. A car that sends bytes and then closes the connection has other reasons."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = await open_link(TcpUrl("127.0.0.1", server.getsockname()[1]))
         peer, _ = server.accept()
@@ -388,7 +391,7 @@ async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes
 
 
 async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
-    """A delayed frame would go out in one segment with the next one, and a car obeys only the first."""
+    """A delayed frame would go out in one segment with the next frame. A car obeys only the first of the two."""
     peer = TcpPeer()
     assert isinstance(peer.url, TcpUrl)
     ours = socket.create_connection((peer.url.host, peer.url.port))
@@ -403,7 +406,7 @@ async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it(
     peer.close()
 
 
-@pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # there the car refuses
+@pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # over TCP, the car refuses
 async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
     with pytest.raises(Busy, match="in use by "):
         await open_link(peer.url)
@@ -415,7 +418,7 @@ async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
 
 
 async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
-    """A read blocks one thread, and never the loop."""
+    """A link has one thread. A read blocks that thread, and never the loop."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)
     assert [thread.name for thread in link_threads()] == [f"read {peer.url}"]
@@ -430,7 +433,10 @@ async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
 
 
 async def test_what_a_stuck_port_never_took_is_thrown_away(tmp_path: Path) -> None:
-    """Otherwise the port is still full at its next opening. Bytes that the other end has taken stay there."""
+    """A stuck link discards unsent bytes when it closes. Otherwise the port is still full at its next opening.
+
+    Bytes that the other end has taken stay there.
+    """
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)
     await until_lost(lambda: link.write(FRAME))

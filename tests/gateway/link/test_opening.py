@@ -214,7 +214,7 @@ print(*(name in sys.modules for name in ("serial", "serial.tools", "bleak")))
 
 
 def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
-    """A fleet starts up to a hundred gateways."""
+    """A fleet starts up to a hundred gateways, and each would pay for an unused import."""
     peer = PtyPeer(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
         for url, said in (

@@ -73,7 +73,7 @@ def test_none_or_several_is_one_line(url: UsbUrl, there: list[UsbSerialPort], wo
 
 @pytest.fixture
 def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Return a function that sets the system's list of ports, in pyserial's own type. The list never has a PTY."""
+    """Return a function that sets the system's list of ports, in pyserial's own type. A real list has no PTY."""
 
     def listed(*ports: UsbSerialPort) -> None:
         found = []
@@ -166,7 +166,7 @@ async def test_another_device_that_comes_in_its_place_is_not_commanded(named: st
 
 
 async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
-    """The device is unplugged, or has no description."""
+    """The path is gone, or leads to a device that the system does not describe."""
     peer = PtyPeer(tmp_path)
     plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
