@@ -129,7 +129,7 @@ def _closes(mode: int) -> None:
         await car.wait(opening_s(mode) + 0.3)
         await car.write(MODE00)
         await car.until(lambda truth: not truth.driving and truth.mode == "manual", within=4.4)
-        assert car.truth.blocked  # the beep; its second is measured in test_firmware.py
+        assert car.truth.blocked  # the beep. test_firmware.py measures its second.
         await awake(car)
         assert not car.truth.driving
 
@@ -368,7 +368,7 @@ async def pi_short(car: Stranger) -> None:
 @hazard("over Bluetooth a half frame ended by a lone # kills the program", platform="raspberry_pi")
 async def pi_lone_hash(car: Stranger) -> None:
     await drive(car)
-    await car.write(b"#")  # without a pending frame it has no effect
+    await car.write(b"#")  # without a pending frame, a # has no effect
     await car.wait(0.2)
     assert car.truth.alive
     assert car.truth.driving

@@ -38,7 +38,7 @@ def opening(mode: int) -> bytes:
 
 
 def opening_s(mode: int) -> float:
-    """Return the time of an opening (docs/reference/protocol.md#blocking-times)."""
+    """Return the seconds for which opening a mode blocks a car (docs/reference/protocol.md#blocking-times)."""
     return 2.1 + 0.2 * (mode + 1)
 
 
@@ -180,7 +180,7 @@ class WireStranger:
         host, _, port = self._car.url.removeprefix("tcp://").rpartition(":")
         try:
             _, writer = await asyncio.open_connection(host, int(port))
-        except (ConnectionRefusedError, ConnectionResetError):  # reset: it was in a closed socket's queue
+        except (ConnectionRefusedError, ConnectionResetError):  # reset: it was queued at a closed socket
             return True
         writer.close()
         return False

@@ -396,7 +396,7 @@ def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[SimProc
         assert b",GM00#" in port.read_until(b"#")
         port.write(RUN)
         assert sim.ask(thing="cart", x_m=0.9, y_m=1) == {"ok": True, "thing": "cart"}
-        while sim.ask(car="red", ask="truth")["x_m"] < 1.0:  # the place of the cart
+        while sim.ask(car="red", ask="truth")["x_m"] < 1.0:  # past the place where the cart was
             time.sleep(0.01)
     world = sim.ask(ask="world")
     assert world["things"]["cart"] == {
@@ -429,7 +429,7 @@ def test_faults_of_the_command_line_come_at_their_time(started: list[SimProcess]
     started.append(sim)
     sim.line()
     end = time.monotonic() + PATIENCE
-    gone = False  # long enough for a poll that is delayed
+    gone = False  # the drop of 3 s is long enough for a delayed poll
     while not (gone and path.exists()):
         gone = gone or not path.exists()
         assert time.monotonic() < end

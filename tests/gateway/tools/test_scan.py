@@ -1,4 +1,4 @@
-"""`gateway scan` as a process: cars, silence and other devices. It sends nothing without --probe."""
+"""`gateway scan` as a process: cars, silence and other devices. Without --probe, the scan sends nothing."""
 
 import contextlib
 import json
@@ -26,7 +26,7 @@ UNKNOWN_STOP = [
     *(b"$0,0,0,0,0,0,0,0,0#", b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
     *(b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
 ]
-"""Frames for a car of an unknown platform (docs/reference/protocol.md#stops)."""
+"""Stop frames for a car of an unknown platform (docs/reference/protocol.md#stops)."""
 
 
 class SpeakingStranger:

@@ -188,7 +188,7 @@ async def test_more_than_64_bytes_while_blocked_are_lost() -> None:
     await car.wait(1.5)
     assert not car.truth.driving
     assert car.car.lost_bytes == 15
-    await car.write(b"," * 14 + b"#")  # "$1,0" is there; any rest completes it
+    await car.write(b"," * 14 + b"#")  # the car has "$1,0", and any rest completes the frame
     await car.until(lambda truth: truth.driving)
 
 

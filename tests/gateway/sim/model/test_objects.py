@@ -45,7 +45,7 @@ def cars(world: World, *names: str) -> dict[str, Firmware]:
 
 
 async def opened(world: World, mode: int) -> VirtualStranger:
-    """Return red, with green ahead, one turn after the opening of a mode."""
+    """Open a mode on red, and wait for the first reading in this mode. Return red."""
     car = VirtualStranger(cars(world, "red", "green")["red"])
     await car.write(opening(mode))
     await car.wait(opening_s(mode) + 0.08)

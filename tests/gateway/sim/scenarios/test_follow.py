@@ -18,7 +18,7 @@ from tests.support.virtual import Pair
 ROW = ("red", "green", "blue")
 WORLD = (EXAMPLES / "worlds" / "follow.yaml").read_text()
 NEAR_M = 0.45
-"""Maximum distance of two middles. Beyond 0.42 m, a follower's infrared loses the car ahead."""
+"""Maximum distance between the middles of neighbors. Beyond 0.42 m, a follower's infrared loses the car ahead."""
 LOOK_S = 0.1
 STEP_S = 0.01
 """Time step in which all cars of one world move."""

@@ -16,13 +16,14 @@ async def test_on_virtual_time(hazard: Hazard) -> None:
 
 
 STALL_S = 0.03
-"""Maximum stall of a valid row: half of the shortest wait in a row, and less than any block."""
+"""Maximum stall at which a failure counts. It is half of the 60 ms between two frames, and less than any block of a
+row. After a longer stall, `play` repeats the row."""
 REPEATED_S = 90.0
 """Maximum time for which a row is repeated while the machine stalls."""
 
 
 class Stalls:
-    """Measures for how long this process did not run."""
+    """The longest time for which this process did not run."""
 
     def __init__(self) -> None:
         self.worst = 0.0
@@ -77,7 +78,7 @@ def test_over_the_wire(hazard: Hazard, outcomes: dict[str, BaseException | None]
 
 
 async def test_without_echo_a_run_and_a_stop_60_ms_apart_lose_the_stop_about_every_second_time() -> None:
-    """docs/reference/protocol.md#hazards: 6 times in 10."""
+    """The car loses the stop 6 times in 10 (docs/reference/protocol.md#hazards)."""
     moments = random.Random(5)
     lost = 0
     for _ in range(400):

@@ -129,7 +129,7 @@ async def test_a_slow_link_trickles_both_ways(cars: Simulation) -> None:
 async def test_a_firehose_over_either_link(cars: Simulation) -> None:
     reader, writer = await asyncio.open_connection(*address(cars))
     with open_port(cars) as port:
-        # Read until all bytes have arrived. Without a reader, bytes that do not fit into the terminal are lost.
+        # Read all the time, until enough bytes have arrived. Without a reader, a full terminal loses bytes.
         await cars.inflict(Fault(FaultKind.FIREHOSE, for_s=2 * PATIENCE, rate=1e6))
         await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=0))
         over_tcp, over_pty = bytearray(), bytearray()
@@ -164,7 +164,7 @@ async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
 
 
 async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(cars: Simulation) -> None:
-    """The car still has the half frame. A row of docs/reference/protocol.md#hazards: the stop after it is lost."""
+    """The car still has the half frame, and loses the stop after it (docs/reference/protocol.md#hazards)."""
     host, port = address(cars)
     reader, writer = await asyncio.open_connection(host, port)
     await cars.inflict(Fault(FaultKind.CUT_WRITE, "green", for_s=0.1, bytes=8))

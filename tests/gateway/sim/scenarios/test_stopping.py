@@ -37,14 +37,17 @@ Load = Callable[[VirtualStranger, random.Random], Awaitable[None]]
 
 
 async def driving(car: VirtualStranger, moments: random.Random) -> None:
-    """Drive until the buffer can have no byte of ours."""
+    """Drive, and wait until the car must have read the frame."""
     await car.wait(1.0 + moments.random())
     await car.write(RUN)
     await car.wait(1.2 + 2.5 * moments.random())
 
 
 def within(frame: bytes, block: float) -> Load:
-    """Return a load: a moment in a block that runs for sure, because its frame has left the buffer."""
+    """Return a load that ends at a random moment of a block.
+
+    The block runs for sure, because its frame has left the buffer.
+    """
 
     async def load(car: VirtualStranger, moments: random.Random) -> None:
         await driving(car, moments)
@@ -65,7 +68,7 @@ def in_mode(mode: int) -> Load:
 
 
 def then_half(before: Load, *frames: bytes) -> Load:
-    """Return the load, with the link lost anywhere in a frame."""
+    """Return a load that ends with a half frame, as after the loss of a link."""
 
     async def load(car: VirtualStranger, moments: random.Random) -> None:
         await before(car, moments)
@@ -100,7 +103,7 @@ def lit_room() -> World:
 
 
 def before_a_wall() -> World:
-    """Return a world with a wall that a car follows after a run of a second."""
+    """Return a world with a wall that a car must follow in mode 6 after a run of a second."""
     return World([(0.4, -9.0, 0.4, 9.0)])
 
 
@@ -189,7 +192,7 @@ async def test_a_stop_begun_at_many_random_moments(case: Case) -> None:
 async def test_a_stop_and_mode00_every_1_1_s_keep_a_car_that_opens_a_mode_driving() -> None:
     """More frames are not better (docs/reference/protocol.md#stops).
 
-    All frames become one string, in which each stop hides the digits.
+    All frames become one string, in which each stop hides the mode digits.
     """
     moments = random.Random(1)
     ran_on = 0
