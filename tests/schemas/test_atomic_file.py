@@ -1,4 +1,4 @@
-"""Files are replaced whole or not at all."""
+"""A write replaces a whole file, or leaves the old one."""
 
 from pathlib import Path
 

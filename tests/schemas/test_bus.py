@@ -1,4 +1,4 @@
-"""The bus on real Zenoh sessions: hub, publications, queries, tokens, and the time without a hub."""
+"""The bus on real Zenoh sessions: hub, publications, queries, tokens, and behavior without a hub."""
 
 import asyncio
 import os
@@ -107,7 +107,7 @@ def test_ctrl_c_does_not_interrupt_a_declaration(endpoint: str) -> None:
 
 
 def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str) -> None:
-    """Zenoh answers a watcher's query with the tokens until now. So a coordinator once saw no car."""
+    """Zenoh answers a watcher's query with the tokens that have arrived, so a coordinator once saw no car."""
     there = {"fleet/red", "fleet/green", "fleet/blue"}
     with bus.Bus.open(endpoint) as cars:
         for token in there:

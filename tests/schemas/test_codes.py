@@ -1,4 +1,4 @@
-"""Each code of a reason or an event has its row and its section for troubleshooting, which quotes real texts."""
+"""Each code of a reason or event has a row in its table and a section for troubleshooting, with real quotations."""
 
 import ast
 import re
@@ -34,7 +34,7 @@ def logged() -> set[tuple[str, str]]:
 
 
 def templates() -> list[re.Pattern[str]]:
-    """Return a pattern for each text of at least three words in the source."""
+    """Return a pattern for each text of 3 to 59 words in the source."""
     found = []
     for tree in trees():
         for node in ast.walk(tree):
@@ -71,7 +71,7 @@ def test_each_quoted_message_is_in_the_source() -> None:
     quoted = re.findall(r"^> (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     assert len(quoted) > 10
     known = templates()
-    # A message may be made of several texts, and a quotation may end early: half of it in one text is enough.
+    # A message may have several texts, and a quotation may end early. Half of a quotation in one text is enough.
     strange = [
         text
         for text in quoted

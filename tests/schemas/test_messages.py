@@ -1,4 +1,4 @@
-"""Every topic and command has a message; payloads are read as protobuf or JSON."""
+"""Every topic and command has a message. Payloads are protobuf or JSON."""
 
 import json
 

@@ -1,6 +1,6 @@
 """Pictures of every page of the console, of simulated cars: `python -m tests.tools.console_pictures DIRECTORY`.
 
-Each page comes in light on a desktop. The pages that one drives with come in dark on a phone, too.
+Each page has a light picture on a desktop. The pages of ON_PHONES also have a dark picture on a phone.
 """
 
 import sys
@@ -60,7 +60,7 @@ def take_pictures(stage: ConsoleStage, scratch: Path, directory: Path) -> None:
     stage.person.ask(mode_request("light_seeking"), ["blue"])
     pairing = CliRunner().invoke(cli, ["console", "pair", "group_a"], env=stage.fleet.environment)
     assert NetworkDevice(port).pair(pairing.output.split(" type ")[1][:9])["ok"]
-    # Nothing of the computer that takes the pictures is in them.
+    # The pictures show other texts instead of this computer's directory, address and link.
     address = find_line(stage.console, r"On the network: (https://.*)")
     texts = [(str(scratch), "/home/mia/my-cars"), (address, "https://192.168.1.5:7443"), (link, "/dev/ttyUSB0")]
     time.sleep(SETTLE_S)
@@ -81,7 +81,7 @@ def take_pictures(stage: ConsoleStage, scratch: Path, directory: Path) -> None:
 
 
 def pair_page(stage: ConsoleStage, port: int, options: dict[str, Any]) -> Page:
-    """Open the only page that a device sees that is not paired."""
+    """Open the pairing page, the only page that an unpaired device sees."""
     shown = options or {"viewport": {"width": 640, "height": 400}}
     page = stage.browser.new_context(ignore_https_errors=True, **shown).new_page()
     page.goto(f"https://127.0.0.1:{port}/pair")
@@ -89,7 +89,7 @@ def pair_page(stage: ConsoleStage, port: int, options: dict[str, Any]) -> Page:
 
 
 def prepare(page: Page, name: str, link: str) -> None:
-    """Do what a person does first on a page."""
+    """Do the first steps of a person on a page."""
     match name:
         case "drive":
             page.locator("input[name=select-red]").check()

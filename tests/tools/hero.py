@@ -1,9 +1,9 @@
 """The README's animation and `fleet up` as SVG: `python -m tests.tools.hero DIRECTORY [SESSION]`.
 
-Without a session, it records one (about a minute): `fleet up --sim 3` with a plan, while somebody stops a car and
-resumes it. `hero.webp` has the simulated world from above, the commands, the plan's roles, and the table of `fleet up`;
-`up.svg` has that table. Cars are drawn from `sim/truth`, walls and line from `@sim/world`, and the table by the code of
-`fleet up` from the same messages.
+Without SESSION, the tool records a session (about a minute): `fleet up --sim 3` with a plan, a stop and a resume of a
+car. `hero.webp` has the simulated world from above, the commands, the plan's roles, and the table of `fleet up`.
+`up.svg` has only the table. The cars come from `sim/truth`, walls and line from `@sim/world`. The code of `fleet up`
+draws the table from the same messages.
 """
 
 import io
@@ -139,7 +139,7 @@ def states(session: Session, count: int) -> Iterator[State]:
 
 
 class Painter:
-    """Draws frames."""
+    """Draws the frames of the animation."""
 
     def __init__(self) -> None:
         fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
@@ -231,7 +231,7 @@ def _mixed(tint: tuple[int, ...], share: float, ground: tuple[int, ...] = GROUND
 
 
 def record(directory: Path) -> Path:
-    """Record a session below a directory, and return it."""
+    """Record a session below a directory, and return its path."""
     plan = Path(fleet.examples.__file__).parent / "plans" / "2-line-guide.yaml"
     environment = os.environ | {
         "FLEET_ENDPOINT": free_endpoint(),

@@ -1,7 +1,7 @@
 """Pictures of a session in Rerun's viewer, without a screen: `python -m tests.tools.screenshots SESSION DIRECTORY`.
 
-They are `car.png` (the lanes of the last car) and, of simulated cars, `world.png`. Needs a Vulkan
-driver that draws in software where there is no graphics card (Debian: `mesa-vulkan-drivers`).
+The pictures are `car.png` (the lanes of the last car) and, of simulated cars, `world.png`. Without a graphics card,
+they need a Vulkan driver that draws in software (Debian: `mesa-vulkan-drivers`).
 """
 
 import contextlib
@@ -24,7 +24,7 @@ AT: Final = 0.75
 UP_WITHIN_S: Final = 30.0
 DRAWN_WITHIN_S: Final = 120.0
 SETTLE_S: Final = 1.0
-"""Time between two equal pictures that show the end of drawing. The viewer has no sign of it."""
+"""Time between two equal pictures that show the end of drawing. The viewer does not report this end."""
 DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 COLOURS: Final = 255
 WORLD: Final = "World, from above"
@@ -47,7 +47,10 @@ class Shown:
 
 
 def software_driver() -> str | None:
-    """Return the installed driver that needs no card. Without its name, Vulkan would try a broken card first."""
+    """Return the installed driver that needs no card, None if there is none.
+
+    Without its name, Vulkan would try a broken card first.
+    """
     found = [str(each) for place in DRIVERS for each in sorted(Path(place).glob("lvp_icd*.json"))]
     return found[0] if found else None
 
@@ -58,7 +61,7 @@ def take(rrd: Path, out: Path, view: str = "") -> Shown:
     with tempfile.TemporaryDirectory() as home, _viewer(port, Path(home)) as viewer:
         try:
             png, shown = _look(_connect(viewer, port), rrd, view)
-        except (RuntimeError, OSError, ValueError):  # the viewer's errors without an answer
+        except (RuntimeError, OSError, ValueError):  # the viewer does not answer, or no longer
             viewer.wait(SETTLE_S)
             raise NoPicture(
                 "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
@@ -104,7 +107,10 @@ def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
 
 
 def _loaded(client: Any) -> Any:
-    """Wait until the viewer has a whole recording, whose time has an end. Return the viewer's state."""
+    """Wait until the viewer has loaded the whole recording. Return the viewer's state.
+
+    A partly loaded recording already has a time with an end.
+    """
     deadline = time.monotonic() + UP_WITHIN_S
     while (state := client.get_state()).loading or not (
         state.recordings and state.recordings[0].timelines and state.views
@@ -116,7 +122,7 @@ def _loaded(client: Any) -> Any:
 
 
 def _drawn(client: Any, view_id: str | None) -> bytes:
-    """Return a picture, once two in a row are equal."""
+    """Return a picture once two in a row are equal, or the last picture at the deadline."""
     deadline = time.monotonic() + DRAWN_WITHIN_S
     last = _screenshot(client, view_id, deadline)
     while time.monotonic() < deadline:
@@ -129,7 +135,10 @@ def _drawn(client: Any, view_id: str | None) -> bytes:
 
 
 def _screenshot(client: Any, view_id: str | None, deadline: float) -> bytes:
-    """Return a picture. The viewer gives up after five seconds, too soon on a busy machine without a card: retry."""
+    """Return a picture. Retry until the deadline.
+
+    The viewer gives up after five seconds, too soon on a busy machine without a card.
+    """
     while True:
         try:
             png: bytes = client.take_screenshot(view_id)
@@ -169,7 +178,7 @@ def _connect(viewer: Viewer, port: int) -> Any:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
-        except (RuntimeError, OSError, ValueError):  # the errors before the viewer answers
+        except (RuntimeError, OSError, ValueError):  # the viewer does not answer yet
             if viewer.wait(VIEWER_POLL_INTERVAL_S) is not None or time.monotonic() > deadline:
                 raise
         else:

@@ -1,7 +1,7 @@
 """The site: `python -m tests.tools.site DIRECTORY` lays out its sources there, for `zensical build`.
 
-CONTRIBUTING.md and CHANGELOG.md are pages of the site, too. The configuration lies above the pages, or it would be
-published.
+CONTRIBUTING.md and CHANGELOG.md are pages of the site, too. The configuration is above the pages, or the build
+would publish it.
 """
 
 import shutil

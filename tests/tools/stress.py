@@ -1,11 +1,11 @@
-"""Runs the suite twice at once while its processes are paused at random: `make stress` (POSIX).
+"""Runs the suite twice at once, and pauses its processes at random: `make stress` (POSIX).
 
-On a busy machine, any process may be late at any line. A pause has the same effect. All processes of both suites are
-paused but the two controllers of pytest: workers, hubs, gateways, cars, and processes that a test left behind.
+On a busy machine, any process may be late at any line. A pause has the same effect. The tool pauses all processes of
+both suites except the two controllers of pytest: workers, hubs, gateways, cars, and processes that a test left behind.
 A seed repeats the times and the draws, not the processes that run at those times.
 
-Each suite has half of the workers. With all of them, twice the processes of `make test` would share the processors, and
-cars would be late without a pause.
+Each suite has half of the workers. With all workers, twice the processes of `make test` would share the processors,
+and cars would be late without a pause.
 
 The tool never resumes a process that a test itself has stopped. Tests stop a process by
 `tests.support.processes.freeze`, which waits for the end of a pause.
@@ -33,18 +33,18 @@ SUITES = ("first", "second")
 RUN = "STRESS_RUN"
 """Variable in the environment of all processes of a run. A hub is no descendant of its test, so only this finds it."""
 PAUSE_S = (0.010, 0.900)
-"""Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
+"""Range of the length of a pause. Zenoh drops a session after 2 s of silence, longer than any pause."""
 CONTROL_PAUSE_S = (0.010, 0.300)
 """Range of the pauses of a gateway or simulator. A gap of 0.5 s in a gateway's loop ends a drive
-(docs/explanation/how-it-works.md). A car shows its stop by a pause of its reports. So longer pauses would rightly fail
+(docs/explanation/how-it-works.md). A car shows its stop by a pause of its reports. Longer pauses would rightly fail
 each test that drives. Tests of these rules stop the process themselves."""
 GAP_S = (0.0, 2.0)
-"""Range from the begin of a pause to the begin of the next: a test of some seconds sees about one.
+"""Range of the time between the starts of two pauses. A test of some seconds sees about one pause.
 
-With 0 to 0.4 s two to five of 13,000 tests failed, by several pauses within one limit.
+With 0 to 0.4 s, two to five of 13,000 tests failed, by several pauses within one limit.
 """
 LOOK_S = 1.0
-"""Interval at which the processes of the run are listed."""
+"""Interval of listing the processes of the run."""
 TURN_S = 0.01
 
 
@@ -88,7 +88,7 @@ class Pauses:
                 return
             least, most = CONTROL_PAUSE_S if in_control(process) else PAUSE_S
             seconds = least + share * (most - least)
-            self._paused[process] = now + seconds  # first, so that an interrupt here leaves nothing paused
+            self._paused[process] = now + seconds  # first, so that `resume_all` resumes it after an interrupt
             process.suspend()
             self.count += 1
             self.total_s += seconds
@@ -101,12 +101,12 @@ class Pauses:
 
 
 def in_control(process: psutil.Process) -> bool:
-    """Return True if this is a gateway or a simulator, however it was started."""
+    """Return True if a process is a gateway or a simulator, started as a module or as a command."""
     return any(word in ("gateway.cli", "gateway.sim") or Path(word).name == "gateway" for word in process.cmdline())
 
 
 def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
-    """Return the processes of a run but those that are spared."""
+    """Return the processes of a run whose ids are not in `spared`."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error):  # the process has ended, or belongs to another user
@@ -121,7 +121,7 @@ def _start(name: str, tests: list[str], directory: Path) -> subprocess.Popen[byt
     with (directory / f"{name}.log").open("wb") as log:
         number, suites = str(SUITES.index(name)), str(len(SUITES))
         environment = os.environ | {RUN: str(directory), scheduling.SUITE: number, scheduling.SUITES: suites}
-        # In a session of its own, so that a Ctrl-C reaches a suite once, from here.
+        # A suite has its own session, and gets a Ctrl-C only from this tool, once.
         return subprocess.Popen(
             words, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
         )
@@ -132,7 +132,7 @@ def _ended(*_: int | FrameType | None) -> NoReturn:
 
 
 def main() -> int:
-    """Run both suites; 0 if both pass."""
+    """Run both suites. Return 0 if both pass, else 1."""
     parser = argparse.ArgumentParser(prog="python -m tests.tools.stress", description=__doc__)
     parser.add_argument("tests", nargs="*", default=["tests"], help="what pytest runs (default tests)")
     parser.add_argument("--seed", type=int, help="repeats the times and draws of a run (default a new one)")

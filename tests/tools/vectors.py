@@ -1,6 +1,6 @@
-"""tests/vectors/stops.tsv: the distribution of stops; `make vectors` writes it.
+"""The distribution of stops, tests/vectors/stops.tsv: `make vectors` writes the file.
 
-Control and the simulated cars play it on virtual time, so that each machine writes the same table.
+The controller and the simulated cars run on virtual time, so that each machine writes the same table.
 """
 
 from pathlib import Path

@@ -27,7 +27,7 @@ def test_what_comes_while_it_is_held_back_counts_when_all_is_done(number: signal
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_counts_also_where_a_shell_had_it_ignored(number: signal.Signals) -> None:
-    """A shell ignores SIGINT for its background processes. A handler that raises SIGINT would then have no effect."""
+    """A shell starts background processes with SIGINT ignored. A handler that raises SIGINT then has no effect."""
 
     def work() -> None:
         with signals.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):

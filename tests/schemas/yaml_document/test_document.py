@@ -1,4 +1,4 @@
-"""Files of people: all faults are reported at once, with line and column, and harmful input is rejected."""
+"""YAML files of users: the reader reports all faults at once, with line and column, and rejects harmful input."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Write the generated pages and parts: `python -m tests.tools.pages`."""
+"""Write the generated pages and parts, and delete stale pages: `python -m tests.tools.pages`."""
 
 from tests.tools.pages.build import expected, stale_pages
 

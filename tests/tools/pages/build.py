@@ -49,7 +49,7 @@ PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
 
 
 def expected() -> dict[Path, str]:
-    """Return the text that each page with something generated should have."""
+    """Return the expected text of each page with generated parts."""
     made = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md")) if path.parent != CLI}
     made = {path: text for path, text in made.items() if "<!-- begin:" in text or "<!-- n:" in text}
     for name, (page, make) in PARTS.items():

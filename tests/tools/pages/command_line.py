@@ -32,7 +32,7 @@ def commands() -> Iterator[tuple[str, click.Command]]:
 
 
 def subcommands(name: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
-    """Yield a command and those below it, with their words on the command line."""
+    """Yield a command and its subcommands, with their words on the command line."""
     yield name, command
     if isinstance(command, click.Group):
         for below in command.list_commands(click.Context(command)):
@@ -67,7 +67,7 @@ def headings() -> dict[str, list[str]]:
 
 
 def _page(command: click.Command, name: str) -> str:
-    """Return a page: the command, and below it those of a group."""
+    """Return a page: the command, then the subcommands of a group."""
     parts = []
     for words, each in subcommands(name, command):
         level = "#" if words == name else "##"

@@ -1,4 +1,4 @@
-"""The generated tables of docs/: topics, commands, stops, evidence, modes and platforms; and the numbers in prose."""
+"""The generated tables of docs/: topics, commands, stops, evidence, modes and platforms, and the numbers in prose."""
 
 import csv
 import inspect
@@ -78,7 +78,7 @@ _STATES = {
     "raspberry_pi": "a Raspberry Pi car (the longest)",
     "unknown platform": "a car whose platform is not known (the longest)",
 }
-"""Name of each state of the distribution on the page. Of several rows with this beginning, the longest counts."""
+"""Name of each state of the distribution on the page. Of several rows with this beginning, the longest time counts."""
 
 
 def stops() -> list[dict[str, str]]:
@@ -88,7 +88,7 @@ def stops() -> list[dict[str, str]]:
 
 
 def _rows(name: str) -> list[dict[str, str]]:
-    """Return the rows of this name."""
+    """Return the rows of this state, or of the group of states that begins with this name."""
     grouped = name in ("opening", "raspberry_pi", "unknown platform")
     named = [row for row in stops() if row["state"] == name]
     begun = [row for row in stops() if row["state"].startswith(name)]
@@ -96,7 +96,7 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 
 def _longest(name: str, column: str) -> float:
-    """Return the longest of the rows of this name; 0 if no stop of theirs has such a time."""
+    """Return the longest time of a column in the rows of this name, 0 if no row has a time."""
     times = [float(row[column]) for row in _rows(name)]
     return max((each for each in times if each != float("inf")), default=0.0)
 
