@@ -1,4 +1,4 @@
-"""The lease of a car: `with fleet.car("red").lease() as car`. At the end of the block, the car stops.
+"""The lease of a car: `with fleet.car("red").lease() as car`. The block's end stops the car if the lease is not lost.
 
 `Lease` acquires, renews and releases it. `LeaseMonitor` detects its loss from the gateway's messages (pure).
 """
@@ -21,11 +21,14 @@ LEASE_RENEWAL_INTERVAL_S: Final = 0.8
 SAFETY_RETRY_DELAY_S: Final = 0.2
 """Delay before a gateway that did not answer is queried again."""
 _STOP_NOT_NEEDED: Final = frozenset({"leased", "lent", "paused", "estopped", "superseded"})
-"""Reasons that make the final stop unnecessary: another sender has or stops the car."""
+"""Reasons that make the final stop unnecessary: another sender has the car, or has stopped it."""
 
 
 class LeaseMonitor:
-    """Detects that another sender has taken or stopped the car. A lost lease stays lost."""
+    """Detects the loss of a lease: another holder, a stop by another sender, an e-stop, a loan or a pause.
+
+    A lost lease stays lost.
+    """
 
     def __init__(self, car: str, sender: str) -> None:
         self.lost = ""
@@ -104,7 +107,7 @@ class Lease:
         if outcome.ok:
             return outcome
         self._monitor.on_outcome(outcome)
-        if outcome.reason == "superseded":  # the message that shows by whom may still be on its way
+        if outcome.reason == "superseded":  # the message with the new holder may not have arrived
             self._query()
         if self._monitor.lost:
             raise LeaseLost(outcome, self._monitor.lost)
@@ -132,12 +135,12 @@ class Lease:
         while not self._over.wait(LEASE_RENEWAL_INTERVAL_S) and not self._monitor.lost:
             try:
                 (outcome,) = self._fleet.ask(lease_request(), [self._name])
-            except (BusError, RuntimeError):  # the fleet was closed: its token is gone, too
+            except (BusError, RuntimeError):  # the Fleet is closed, and so is its token
                 return
             self._monitor.on_outcome(outcome)
 
     def _query(self) -> None:
-        """Query the car's safety state. A stalled gateway is queried again for a while."""
+        """Query the car's safety state. Repeat for OUTCOME_MARGIN_S while the gateway does not answer."""
         until = time.monotonic() + OUTCOME_MARGIN_S
         while not (readings := self._fleet.get(f"{self._name}/state/safety")) and time.monotonic() < until:
             time.sleep(SAFETY_RETRY_DELAY_S)

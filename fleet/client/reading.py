@@ -53,7 +53,7 @@ class Reading:
     def __getitem__(self, field: str) -> Any:
         """Return a field by name, such as `range_m` or `hold.by`. None if it was not measured or is not set.
 
-        For a repeated field or a submessage, return True if it is set. Raises KeyError, which lists the fields.
+        For a repeated field or a submessage, return whether it is set. Raises KeyError, which lists the fields.
         """
         known = fields_of(type(self.value))
         if field not in known:
@@ -103,11 +103,11 @@ class Reading:
 
 
 ReadingFilter: TypeAlias = Callable[[Reading], bool | None]
-"""Returns True if a stream shall contain the reading."""
+"""Returns True for a reading of a stream. False, and None for unknown, drop the reading."""
 
 
 def reading_of(sample: Sample) -> Reading:
-    """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is no message of ours."""
+    """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is no message of this schema."""
     return Reading.of(sample.key, sample.message(), sample.time_ns)
 
 
@@ -122,7 +122,7 @@ class Watch:
         self.dropped = 0
         """Number of samples dropped from the full queue."""
         self.unreadable = 0
-        """Number of samples that are no message of ours."""
+        """Number of samples that are no message of this schema."""
 
     def begin(self, subscribe: Callable[[Callable[[Sample], None]], Callable[[], object]]) -> Self:
         """Subscribe. `subscribe` returns the function that ends the subscription."""

@@ -92,7 +92,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
 
 
 def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
-    """Return the row of a car in `fleet list`, which is also its JSON object. readings: its latest ones, by topic."""
+    """Return the row of a car in `fleet list`, for the table and for JSON. readings: its latest ones, by topic."""
     values = {topic: reading.value for topic, reading in readings.items()}
     measured = readings.get("sensor/battery")
     link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
@@ -125,7 +125,7 @@ def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
 
 
 def _unheard(link: str, last_rx_s: float | None, motors: str) -> bool:
-    """Return True if the link is open and the car should be heard, but is not."""
+    """Return True if the link is open and the car is silent: stale, without any byte, or unknown for too long."""
     if link == "lost":
         return False
     return link == "stale" or last_rx_s is None or (motors == "unknown" and last_rx_s > _UNHEARD_S)
@@ -228,7 +228,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     """Print new values as they come, until Ctrl-C.
 
     CONDITION compares fields of one message (range_m < 0.3), with and, or, not and parentheses. A yes/no field stands
-    alone. A comparison with a value that was not measured is false.
+    alone. A comparison with a value that was not measured is unknown. Only readings with a true CONDITION are shown.
     """
     written = check_key(written_out(keyexpr, fleet))
     if when is not None:
@@ -363,7 +363,7 @@ def wait(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Wait until CONDITION is true for KEY and print the reading. A current reading counts if it is fresh.
+    """Wait until CONDITION is true for KEY and print the reading. The latest reading counts unless it is stale.
 
     With a wildcard any key will do. CONDITION is as in `fleet watch --when`. With --ready, wait for cars instead: a car
     is ready when its link is open and the state of its motors is known.

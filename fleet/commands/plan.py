@@ -63,14 +63,14 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
 
 
 def _no_plan(client: Fleet) -> str:
-    """Say that no plan is running, and what starts one. `fleet up` does only if the fleet is not up already."""
+    """Return a text: no plan is running, and which command starts one. Name `fleet up` only if no supervisor runs."""
     is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
     other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"
     return f"{NO_PLAN}{other}."
 
 
 def _people(client: Fleet, cars: Sequence[str]) -> dict[str, list[str]]:
-    """Return who stopped, paused, borrowed or drives each of these cars (none: all), and what ends that."""
+    """Return by car who stopped, paused, borrowed or drives it, and what ends that. Empty `cars`: all cars."""
     found = {}
     for car in cars or ["*"]:
         for reading in client.get(f"{car}/state/safety") if car == "*" or keys.is_name(car) else ():
@@ -182,7 +182,7 @@ def show(client: Fleet, *, as_json: bool) -> None:
 @json_option
 @with_client
 def restart(client: Fleet, *, as_json: bool) -> None:
-    """Begin the plan in force anew, with its first phase and without its memory. Also after `fleet plan stop`."""
+    """Restart the plan in force with its first phase, and discard its state. This also ends `fleet plan stop`."""
     _request(client, PlanRequest.RESTART, as_json=as_json)
 
 
@@ -190,7 +190,7 @@ def restart(client: Fleet, *, as_json: bool) -> None:
 @json_option
 @with_client
 def next_phase(client: Fleet, *, as_json: bool) -> None:
-    """Go on to the next phase of the plan, now. Refused if the plan has no phases, or no further one."""
+    """Go on to the next phase of the plan, now. Refused if the plan has no phases, or is in its last one."""
     _request(client, PlanRequest.NEXT, as_json=as_json)
 
 
@@ -198,10 +198,10 @@ def next_phase(client: Fleet, *, as_json: bool) -> None:
 @json_option
 @with_client
 def stop(client: Fleet, *, as_json: bool) -> None:
-    """Let go of all cars: the plan brings those that it commands to rest, and decides nothing more.
+    """Stop the plan. The coordinator brings the cars that it commands to rest, and makes no more decisions.
 
     The cars get no hold: anyone may drive them at once. Cars that a person has stopped or drives stay as they are.
-    `fleet plan restart` or `fleet plan set` goes on. A coordinator that is restarted stays stopped.
+    Go on with `fleet plan restart` or `fleet plan set`. Under one `fleet up`, a restarted coordinator stays stopped.
     """
     _request(client, PlanRequest.STOP, as_json=as_json)
 

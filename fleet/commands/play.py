@@ -158,7 +158,7 @@ def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
 
 
 def _fleets(session: "Session", about: "SessionSummary") -> list[str]:
-    """Return the recorded fleet's name, then other fleets' names in keys."""
+    """Return the recorded fleet's name, then other fleets' names in keys. Without any, return the default fleet."""
     described = [session.description.fleet] if session.description is not None and session.description.fleet else []
     of_keys = (key.fleet for key in map(keys.parse, about.keys) if key is not None)
     return list(dict.fromkeys([*described, *of_keys])) or [keys.DEFAULT_FLEET]

@@ -14,14 +14,14 @@ MAX_OPEN_GAPS: Final = 256
 MAX_LISTED_GAPS: Final = 1000
 """Maximum gaps of one publisher to list. Later ones are only counted."""
 MAX_EARLY_BACKFILLS: Final = 512
-"""Maximum backfilled messages to remember whose originals may still arrive: twice the cache of a publisher."""
+"""Maximum backfilled messages to remember whose originals may still arrive: about twice a publisher's cache."""
 _MODULO: Final = 1 << 32
 _BACKWARD: Final = 1 << 31
 
 
 @dataclass(slots=True)
 class Gap:
-    """Missing messages `first` to `last`, and the receive times between which they should have come."""
+    """Missing messages `first` to `last`. `PublisherSequence` also sets the receive times before and after the gap."""
 
     first: int
     last: int
@@ -51,7 +51,7 @@ def _fill(gaps: list[Gap], number: int) -> bool:
 class SequenceTracker:
     """Tracks the live and backfilled messages of one key. Numbers count from 1, modulo 2^32.
 
-    The caller of each message first compares with `last`: a consecutive number needs no call.
+    Call `add_live` only if the number does not follow `last` of its sender.
     """
 
     __slots__ = ("_early", "_first", "_gaps", "_lost", "last")
@@ -118,7 +118,7 @@ class SequenceTracker:
             del self._early[next(iter(self._early))]
 
     def _begin(self, sender: Hashable, number: int) -> None:
-        """Add a sender. Its first number does not show how many messages came before."""
+        """Add a sender. Messages before its first number precede this recording, and are no gap."""
         if len(self.last) >= MAX_TRACKED_SOURCES:
             oldest = next(iter(self.last))
             self._forget(oldest)
@@ -155,9 +155,9 @@ class PublisherSequence:
     """Tracks the recorded messages of one publisher on one key."""
 
     restarts: bool = False
-    """True if the count may restart. Then a lower number is a new start, else a duplicate.
+    """True if the count may restart. Then a number that neither grows nor fills a gap is a new start, else a duplicate.
 
-    The `seq` of a payload never restarts within one `boot_id`. The number of Zenoh restarts with each publisher.
+    The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher.
     """
     first: int = 0
     last: int = 0

@@ -119,7 +119,7 @@ class CarBody:
         return x, y, heading
 
     def _look(self, now: float) -> None:
-        """Bring every visible car to `now`."""
+        """Bring this car to `now`, and in a lively world all cars."""
         self._move(now)
         if self._world.lively:
             for other in self._world.bodies:
