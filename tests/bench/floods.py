@@ -11,7 +11,7 @@ from time import perf_counter, sleep
 
 from tests.bench.measured import Measured, Scale
 from tests.bench.stage import READING, Arrival, Stage, Tty, frames, stage
-from tests.support.processes import PATIENCE_S, TAKEN, wait_for
+from tests.support.processes import CLOSING_S, PATIENCE_S, REPORT_S, TAKEN, wait_for
 
 FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
 RATES = {"history": 330.0, "operators": 1200.0, "cars": 1200.0, "large": 20.0, "drives": 10_000.0}
@@ -19,19 +19,16 @@ RATES = {"history": 330.0, "operators": 1200.0, "cars": 1200.0, "large": 20.0, "
 TOKENS = ("operators", "cars")
 STOPS = 5
 WARM_S = 2.0
-RESTED_S = 2.5
-"""Time after which a stop is over, so that the next request joins no other stop."""
+ROUND_S = 6.0
+"""Time of a drive and its stop, until the stop is shown."""
 KEPT = 1500
 """Number of values of each reading that a gateway caches."""
-REPORT_S = 0.04
 LONGEST_FRAME = 26
 CLOSE = b"$4WD,MODE00#"
-CLOSING_S = 1.0
-"""Time for which a car is silent while it closes a mode."""
 
 
 class _Car:
-    """The car's end of a tty: reports, and is silent for a second after `MODE00`."""
+    """The car's end of a tty: it reports as in mode 0, and each `MODE00` delays the next report by a second."""
 
     def __init__(self, port: Tty) -> None:
         self._port = port
@@ -42,7 +39,7 @@ class _Car:
         self._thread.start()
 
     def _run(self) -> None:
-        silent_until = due = perf_counter()
+        due = perf_counter()
         came = b""
         while not self._over.is_set():
             came = came[-LONGEST_FRAME:] + self._port.read(max(0.0, due - perf_counter()))
@@ -50,15 +47,20 @@ class _Car:
             if CLOSE in came:
                 came = b""
                 self.stops.append(now)
-                silent_until = now + CLOSING_S
+                due += CLOSING_S
             if now >= due:
                 due = now + REPORT_S
-                if now >= silent_until:
-                    self._port.write(READING)
+                self._port.write(READING)
 
     def close(self) -> None:
         self._over.set()
         self._thread.join()
+
+
+def _is(here: Stage, motors: str, basis: str) -> bool:
+    """Return True if the gateway claims this of the motors, on this basis."""
+    safety = here.fleet.state("safety")
+    return safety is not None and (safety.motors, safety.motors_basis) == (motors, basis)
 
 
 def _drives(here: Stage, sender: str) -> bool:
@@ -72,9 +74,10 @@ def _stops(here: Stage, car: _Car, count: int) -> tuple[tuple[float, ...], tuple
     """Drive and stop. Return the times from each stop's request to the tty, ms, and those of a bare query before."""
     times, bare = [], []
     for number in range(count):
-        sleep(RESTED_S)
-        wait_for(lambda number=number: _drives(here, f"bench{number}"), "it drives: at rest nothing has to be stopped")
-        sleep(0.2)
+        # A request before the evidence would only join the stop that goes on.
+        wait_for(lambda: _is(here, "off", "shown"), "the stop before is shown")
+        wait_for(lambda number=number: _drives(here, f"bench{number}"), "the drive is accepted")
+        wait_for(lambda: _is(here, "on", ""), "the car drives")
         began = perf_counter()
         assert next(iter(here.session.get("bench/answer", timeout=PATIENCE_S))).ok is not None
         bare.append((perf_counter() - began) * 1e3)
@@ -105,7 +108,7 @@ def run(scale: Scale) -> list[Measured]:
             (floor, bare_floor), held = _stops(here, car, count), (gateway.rss_mb(),)
             for kind, rate in rates.items():
                 flooders = 3 if kind == "drives" else 1
-                seconds = warm_s + count * (RESTED_S + 1.0)
+                seconds = warm_s + count * ROUND_S
                 flood = [
                     here.fleet.start(str(FLOODER), kind, str(rate / flooders), str(seconds)) for _ in range(flooders)
                 ]
