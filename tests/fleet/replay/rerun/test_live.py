@@ -186,19 +186,25 @@ def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
             freeze(viewer.pid)
             try:
 
-                def full() -> bool:
+                def stalled() -> bool:
                     publish(fleet.bus, "red", range(1000))
-                    following.step()
-                    return following.dropped > 2000
+                    return len(following._queue) == 500 and following.step() == 0
+
+                def more_dropped() -> bool:
+                    publish(fleet.bus, "red", range(1000))  # Zenoh may drop some of them under load
+                    return following.dropped > dropped + 2000
 
                 # A running viewer may take longer than this to acknowledge its data, so only a stopped one gets so
                 # little time.
                 with monkeypatch.context() as hurried:
                     hurried.setattr(live, "VIEWER_FLUSH_TIMEOUT_S", 0.2)
-                    wait_for(full, "what comes is left out")
+                    wait_for(stalled, "the buffers to the viewer are full, and so is the queue")
+                    dropped = following.dropped
+                    wait_for(more_dropped, "further messages are dropped")
+                    assert len(following._queue) == 500
             finally:
                 os.kill(viewer.pid, signal.SIGCONT)
-            wait_for(following.step, "it goes on when the viewer does")
+            wait_for(lambda: following.step() == 500, "it sends the queue when the viewer goes on")
 
 
 def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
