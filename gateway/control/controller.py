@@ -7,6 +7,7 @@ than one frame in flight.
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import assert_never
 
 from gateway.control import arbiter
 from gateway.control.car_model import CarModel
@@ -232,6 +233,8 @@ class Controller:
                 pending.frames.append(General(Motion.STOP, speed=step))
             case Find():
                 pending.frames.extend(frame for frame in self._blinks() if self.model.profile.refusal(frame) is None)
+            case _:
+                assert_never(what)
         self._queue.one_shots.append(pending)
         return self._queued(pending, now)
 

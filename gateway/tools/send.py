@@ -23,6 +23,7 @@ from gateway.protocol.frames import (
     encode,
     parse_sent,
 )
+from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.tools import cli_support
@@ -45,7 +46,7 @@ _STOP: Final = encode(General(Motion.STOP)).decode()
 _MANUAL: Final = encode(ModeClose()).decode()
 _FORMS: Final = (
     f"nine digits as in '{_STOP}', '$4WD,PTZ<0..180>#', '$4WD,CLR<0..255>,CLG<0..255>,CLB<0..255>#', "
-    "'$4WD,MODE<0..6><0 or 1>#', or '$4WD,ServoJ1<0..180>,J2...,J6<0..180>#'"
+    f"'$4WD,MODE<0..{max(row.digit for row in MODES.values())}><0 or 1>#', or '$4WD,ServoJ1<0..180>,J2...,J6<0..180>#'"
 )
 _PLACES: Final = ("motion", "rotate", "whistle", "speed", "servo", "sing", "light", "fan", "servo reset")
 # The rest of a frame after a shell has replaced its `$0` or `$4` by the shell's name or by nothing.

@@ -183,7 +183,7 @@ const common = (cars, field) => cars[0][field].filter((word) => cars.every((car)
 
 const Modes = ({ cars }) => html`<ul class="modes">
   ${common(cars, "modes").map((mode) => {
-    const [name, words] = modes[mode];
+    const [name, words] = modes[mode] ?? [mode, modes.unknown[1]];
     const asked = cars.every((car) => car.mode.asked === mode);
     return html`<li key=${mode}>
       <button data-mode=${mode} aria-pressed=${asked} aria-describedby=${`mode-${mode}`}
