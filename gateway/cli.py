@@ -7,6 +7,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from gateway.control.people import NO_PEOPLE, People
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
@@ -169,19 +170,17 @@ def _run(arguments: argparse.Namespace) -> int:
     parent = watched_pid(arguments.parent)
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.link import BadUrl, LinkError, parse_url
-    from gateway.protocol.platforms import parse_platform_option
+    from gateway.protocol.platform_name import parse_option
     from schemas.bus import BadEndpoint, Bus, BusError
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
-        url, (profile, auto) = parse_url(arguments.link), parse_platform_option(arguments.platform)
+        url, (platform, auto) = parse_url(arguments.link), parse_option(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
     speed_max = arguments.speed_max
     low_v, critical_v = arguments.battery_low_v, arguments.battery_critical_v
     try:
-        from gateway.control.people import NO_PEOPLE, People
-
         listed = arguments.people_only or arguments.person
         people = People.parse(arguments.person or ()) if listed else NO_PEOPLE
     except ValueError as error:
@@ -207,6 +206,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             from gateway.car import Settings, serve
             from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
+            from gateway.protocol.platforms import parse_platform
             from schemas.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
@@ -214,7 +214,7 @@ def _run(arguments: argparse.Namespace) -> int:
             settings = Settings(
                 car,
                 url,
-                profile,
+                parse_platform(platform),
                 auto,
                 fleet,
                 state_dir,

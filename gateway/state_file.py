@@ -6,7 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from gateway.control.commands import SenderKind
+from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from schemas.atomic_file import write_atomically
 

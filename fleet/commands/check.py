@@ -26,7 +26,7 @@ from fleet.policy.plan.lint import check as find_findings
 from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
-from gateway.protocol.platforms import Platform
+from gateway.protocol.platform_name import Platform
 from schemas import bus
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text

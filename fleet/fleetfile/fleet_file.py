@@ -24,7 +24,8 @@ from fleet.fleetfile.models import (
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
-from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_platform_option
+from gateway.protocol.platform_name import AUTO, Platform, parse_option
+from gateway.protocol.platforms import parse_platform
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.links import BadLink
 from schemas.yaml_document.document import BadFile, Document, read_text
@@ -161,7 +162,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 def profile_capabilities(platform: str) -> frozenset[str]:
     """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
-    _, auto = parse_platform_option(platform)
+    _, auto = parse_option(platform)
     kinds = [kind for kind in Platform if kind is not Platform.UNKNOWN] if auto else [platform.partition("+")[0]]
     options = platform.partition("+")[1] + platform.partition("+")[2]
     profiles = [parse_platform(f"{kind}{options}") for kind in kinds]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from fleet.fleetfile.fleet_file import FleetCar
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
-from gateway.protocol.platforms import Platform
+from gateway.protocol.platform_name import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 from schemas.process import port_lock
 from schemas.suggestion import how_to_install

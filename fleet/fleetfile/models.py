@@ -11,7 +11,8 @@ from pydantic import AfterValidator, Field
 
 from fleet.links import parse_fleet_link
 from gateway.protocol.enums import Mode
-from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_platform_option
+from gateway.protocol.platform_name import AUTO, OPTIONS, Platform, parse_option
+from gateway.protocol.platforms import parse_platform
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.links import BadLink
@@ -66,7 +67,7 @@ def validate_link(text: str) -> str:
 
 def validate_platform(text: str) -> str:
     """Return a platform (or auto) if it is valid; raises ValueError."""
-    parse_platform_option(text)
+    parse_option(text)
     return text
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fleet.links import parse_fleet_link
-from gateway.protocol.platforms import AUTO, Platform
+from gateway.protocol.platform_name import AUTO, Platform
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process.stdio import printable
 

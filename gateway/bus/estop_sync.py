@@ -10,7 +10,8 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gateway.control.commands import Command, EmergencyStop, Pause, Resume, SenderKind, Unpause
+from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
+from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, PersistedSafety
 from schemas import bus, keys, messages
 from schemas.commands import COMMANDS

@@ -25,13 +25,12 @@ from gateway.control.commands import (
     Pause,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
 )
+from gateway.control.people import Sender, SenderKind
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages

@@ -20,14 +20,12 @@ from gateway.control.commands import (
     Pause,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, PersonRole
+from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ArmSet, General, Ptz

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.commands import Phase, Reason, Sender
+from gateway.control.commands import Phase, Reason
+from gateway.control.people import Sender
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.protocol.enums import Motion

@@ -3,19 +3,9 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+from gateway.control.people import Sender
 from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import Frame
-from schemas.keys import person_of
-
-
-class SenderKind(StrEnum):
-    """The kind of a sender, which is its rank. Each outranks those below it."""
-
-    LEAD = "lead"
-    """A person whom the people table of the gateway names as a lead. No command may claim it."""
-    PERSON = "person"
-    SCRIPT = "script"
-    COORDINATOR = "coordinator"
 
 
 class Reason(StrEnum):
@@ -56,19 +46,6 @@ class Phase(StrEnum):
     EXPIRED = "expired"
     FAILED = "failed"
     REJECTED = "rejected"
-
-
-@dataclass(frozen=True, slots=True)
-class Sender:
-    """The sender of a command."""
-
-    name: str = "anonymous"
-    kind: SenderKind = SenderKind.SCRIPT
-
-    @property
-    def person(self) -> str:
-        """Return the person: `group_a` of `group_a@host-4711`."""
-        return person_of(self.name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,8 +30,6 @@ from gateway.control.commands import (
     Phase,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
@@ -41,7 +39,7 @@ from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import Executor
-from gateway.control.people import NO_PEOPLE, People
+from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences

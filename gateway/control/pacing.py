@@ -8,7 +8,8 @@ from typing import Final
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S, Gate
 from gateway.protocol.enums import ServoAction
 from gateway.protocol.frames import ArmSet, Frame, General
-from gateway.protocol.platforms import Platform, Profile, StopStyle
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import Profile, StopStyle
 
 FLIGHT_S: Final = 0.06
 """Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""

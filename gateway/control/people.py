@@ -1,4 +1,4 @@
-"""The people of the fleet, as the gateway of one car knows them: who may drive this car, and who is a lead. Pure.
+"""The senders of commands, and the people as the gateway of one car knows them: who may drive it, who is a lead. Pure.
 
 Without a table every person may drive every car, and nobody is a lead. A name on the bus is a convention: the gateway
 checks nobody's identity.
@@ -9,8 +9,30 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Self
 
-from gateway.control.commands import Sender, SenderKind
 from schemas.keys import NAME_RULE, is_name, person_of
+
+
+class SenderKind(StrEnum):
+    """The kind of a sender, which is its rank. Each outranks those below it."""
+
+    LEAD = "lead"
+    """A person whom the people table of the gateway names as a lead. No command may claim it."""
+    PERSON = "person"
+    SCRIPT = "script"
+    COORDINATOR = "coordinator"
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """The sender of a command."""
+
+    name: str = "anonymous"
+    kind: SenderKind = SenderKind.SCRIPT
+
+    @property
+    def person(self) -> str:
+        """Return the person: `group_a` of `group_a@host-4711`."""
+        return person_of(self.name)
 
 
 class PersonRole(StrEnum):

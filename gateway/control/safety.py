@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.control.commands import Sender, SenderKind
+from gateway.control.people import Sender, SenderKind
 
 LEASE_S: Final = 2.0
 """Duration of a lease after the drive (docs/explanation/who-may-drive.md#lease)."""

@@ -12,18 +12,9 @@ from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
 from gateway.protocol.events import Sensors
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES
+from gateway.protocol.platform_name import OPTIONS, Platform, parse_name
 from gateway.protocol.sensor_fields import ATTRIBUTES
 from gateway.protocol.timing import RASPBERRY_PI_FAN_S, block_s
-from schemas.suggestion import did_you_mean
-
-
-class Platform(StrEnum):
-    """The program that runs on a car."""
-
-    ARDUINO = "arduino"
-    STM32 = "stm32"
-    RASPBERRY_PI = "raspberry_pi"
-    UNKNOWN = "unknown"
 
 
 class StopStyle(StrEnum):
@@ -33,8 +24,6 @@ class StopStyle(StrEnum):
     RASPBERRY_PI = "raspberry_pi"
     UNKNOWN = "unknown"
 
-
-OPTIONS: Final = frozenset({"arm", "imu"})
 
 _FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 _VERTICAL: Final = frozenset({ServoAction.VERTICAL_UP, ServoAction.VERTICAL_DOWN, ServoAction.VERTICAL_RESET})
@@ -243,29 +232,9 @@ class Profile:
         return f"they know {', '.join(sorted(words))}" if words else "they know none"
 
 
-AUTO: Final = "auto"
-
-
-def parse_platform_option(text: str) -> tuple[Profile, bool]:
-    """Return the profile, and True if the gateway has to detect the platform: `auto` starts as `unknown`."""
-    text = text.lower()
-    auto = text.partition("+")[0] == AUTO
-    try:
-        return parse_platform(text.replace(AUTO, Platform.UNKNOWN, 1) if auto else text), auto
-    except ValueError as error:
-        raise ValueError(f"{error} Leave it out to detect it.") from None
-
-
 def parse_platform(text: str) -> Profile:
     """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu` in any case; raise ValueError."""
-    kind, *options = text.lower().split("+")
-    if kind not in set(Platform):
-        hint = did_you_mean(kind, Platform) or f"There are {', '.join(Platform)}."
-        raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
-    for option in options:
-        if option not in OPTIONS:
-            raise ValueError(f'Unknown option "+{option[:40]}" of a platform. There are +arm and +imu.')
-    return _profile(Platform(kind), frozenset(options))
+    return _profile(*parse_name(text))
 
 
 # docs/reference/protocol.md#platforms

@@ -3,7 +3,8 @@
 import random
 from dataclasses import dataclass
 
-from gateway.control.commands import EmergencyStop, Find, OneShot, Phase, Resume, Sender, SetMode, Stop
+from gateway.control.commands import EmergencyStop, Find, OneShot, Phase, Resume, SetMode, Stop
+from gateway.control.people import Sender
 from gateway.protocol.enums import Mode
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport

@@ -14,22 +14,12 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from gateway.control.commands import (
-    Action,
-    Command,
-    Drive,
-    EmergencyStop,
-    OneShot,
-    Phase,
-    Reason,
-    Sender,
-    SetMode,
-    Stop,
-)
+from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import CarTrust
 from gateway.control.events import CommandRecord
+from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed, General, Ptz

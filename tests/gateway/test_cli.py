@@ -86,10 +86,11 @@ def test_a_limit_out_of_range_is_told_with_the_range(command: Command, option: s
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_run_imports_none_of_the_other_commands() -> None:
-    """A fleet starts `gateway run` up to a hundred times."""
+def test_run_imports_little_before_it_joins_the_bus() -> None:
+    """A fleet starts `gateway run` up to a hundred times. The wrong limit ends it after all its checks."""
     program = (
-        "import sys; sys.argv = ['gateway', 'run', '--car', 'red', '--link', 'nothing']\n"
+        "import sys\n"
+        "sys.argv = ['gateway', 'run', '--car', 'red', '--link', 'tcp://h:9', '--person', 'ann', '--speed-max', '2']\n"
         "import gateway.cli\n"
         "try: gateway.cli.main()\n"
         "finally: print(*sys.modules)\n"
@@ -97,6 +98,7 @@ def test_run_imports_none_of_the_other_commands() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     imported = set(done.stdout.split())
-    assert "gateway.link" in imported
+    assert {"gateway.bus.service", "gateway.link", "gateway.control.people"} <= imported
     assert not [name for name in imported if name.startswith(("gateway.sim", "gateway.capture", "gateway.tools"))]
     assert not imported & {"asyncio", "bleak", "serial"}
+    assert not imported & {"logging", "gateway.control.commands", "gateway.protocol.platforms"}, "13 ms of a start"

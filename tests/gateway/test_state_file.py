@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.commands import SenderKind
+from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from gateway.state_file import SafetyStateFile
 

@@ -15,7 +15,8 @@ from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ColorLed, General, ModeOpen, Ptz, encode
-from gateway.protocol.platforms import Platform, StopStyle
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import StopStyle
 from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import Transport

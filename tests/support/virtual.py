@@ -3,9 +3,10 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Action, Answer, Command, Phase, Sender
+from gateway.control.commands import Action, Answer, Command, Phase
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, Level, LogRecord
+from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build

@@ -32,7 +32,8 @@ from fleet.policy.plan.plan import (
 )
 from fleet.policy.snapshot import ALIASES, NAMES
 from gateway.protocol.enums import Mode
-from gateway.protocol.platforms import OPTIONS, parse_platform
+from gateway.protocol.platform_name import OPTIONS
+from gateway.protocol.platforms import parse_platform
 from schemas import keys
 from schemas.colors import parse_color
 from schemas.yaml_document.document import BadFile, Document

@@ -16,7 +16,8 @@ from fleet.policy.assignment import assign
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Role, Rule
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
-from gateway.protocol.platforms import OPTIONS, Platform, Profile, parse_platform
+from gateway.protocol.platform_name import OPTIONS, Platform
+from gateway.protocol.platforms import Profile, parse_platform
 
 ANY_CAR: Final = "a car"
 """Name for a car that neither a fleet file nor the plan names."""

@@ -9,7 +9,8 @@ from typing import Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import ArmReading, Event, ImuReading, Sensors
-from gateway.protocol.platforms import Platform, Profile, parse_platform
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import Profile, parse_platform
 
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""

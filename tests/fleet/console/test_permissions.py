@@ -17,13 +17,11 @@ from gateway.control.commands import (
     OneShot,
     Pause,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People
+from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, Safety
 from gateway.protocol.enums import Light, Mode, Motion, SpeedStep
 from gateway.protocol.frames import General, Ptz

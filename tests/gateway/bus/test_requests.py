@@ -20,12 +20,11 @@ from gateway.control.commands import (
     OneShot,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
 )
+from gateway.control.people import Sender, SenderKind
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from schemas import messages

@@ -22,13 +22,12 @@ from gateway.control.commands import (
     Pause,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
 )
+from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz

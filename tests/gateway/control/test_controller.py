@@ -19,13 +19,13 @@ from gateway.control.commands import (
     Phase,
     Reason,
     Resume,
-    Sender,
     SetMode,
     Stop,
 )
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.events import FrameOrigin
+from gateway.control.people import Sender
 from gateway.control.safety import Hold, PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S

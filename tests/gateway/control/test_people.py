@@ -20,14 +20,12 @@ from gateway.control.commands import (
     Phase,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People
+from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed

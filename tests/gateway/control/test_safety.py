@@ -5,7 +5,7 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.commands import Sender, SenderKind
+from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import (
     MAX_ENDED_ESTOPS,
     MAX_ENDED_PAUSES,

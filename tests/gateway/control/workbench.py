@@ -2,16 +2,17 @@
 
 from collections.abc import Callable
 
-from gateway.control.commands import Action, Answer, Command, Phase, Reason, Sender, SenderKind
+from gateway.control.commands import Action, Answer, Command, Phase, Reason
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
-from gateway.control.people import NO_PEOPLE, People
+from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
-from gateway.protocol.platforms import Platform, parse_platform
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
 from tests.support.virtual import SHORTEST_S
 

@@ -8,7 +8,8 @@ from gateway.protocol.decoder import Decoder, Sensors
 from gateway.protocol.enums import Mode, SpeedStep
 from gateway.protocol.frames import ArmSet, parse_sent
 from gateway.protocol.modes import MODES
-from gateway.protocol.platforms import Platform, StopStyle, parse_platform
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
 from tests.support.vectors import ids, rows, wire
 

@@ -19,7 +19,8 @@ from gateway.control.stops.evidence import EVIDENCE
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.enums import Mode
 from gateway.protocol.modes import MODES
-from gateway.protocol.platforms import Platform, Profile, parse_platform
+from gateway.protocol.platform_name import Platform
+from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from tests.support import vectors

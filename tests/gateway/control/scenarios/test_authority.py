@@ -11,12 +11,11 @@ from gateway.control.commands import (
     Phase,
     Reason,
     Resume,
-    Sender,
-    SenderKind,
     SetMode,
     Stop,
     TakeLease,
 )
+from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, PersistedSafety
 from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import ColorLed

@@ -5,7 +5,8 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.platforms import parse_platform, parse_platform_option
+from gateway.protocol.platform_name import parse_option
+from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from tests.support.virtual import Pair
 
@@ -13,8 +14,8 @@ from tests.support.virtual import Pair
 def paired(platform: str) -> Pair:
     transport = Transport.TCP if platform == "raspberry_pi" else Transport.SERIAL
     pair = Pair(platform, transport=transport)
-    profile, auto = parse_platform_option("auto")
-    pair.control = Controller("red", profile, auto=auto)
+    name, auto = parse_option("auto")
+    pair.control = Controller("red", parse_platform(name), auto=auto)
     pair.connect()
     return pair
 
@@ -62,17 +63,6 @@ def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
     other.connect()
     assert other.control.model.profile.name == "unknown"
     other.until(lambda: other.control.model.profile.name == "raspberry_pi", 30.0)
-
-
-@pytest.mark.parametrize(("told", "name"), [("auto", "unknown"), ("auto+arm", "unknown+arm"), ("stm32", "stm32")])
-def test_auto_is_the_unknown_platform_until_then(told: str, name: str) -> None:
-    profile, auto = parse_platform_option(told)
-    assert (profile.name, auto) == (name, told.startswith("auto"))
-
-
-def test_a_platform_that_is_none_says_which_there_are() -> None:
-    with pytest.raises(ValueError, match=r'Unknown platform "uno"\. .* Leave it out to detect it\.'):
-        parse_platform_option("uno")
 
 
 def test_a_contradicted_profile_is_told_of_once() -> None:
