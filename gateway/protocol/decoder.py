@@ -73,7 +73,7 @@ class Decoder:
             else:
                 pos = self._outside(data, pos, now, events)
         if size:
-            self._silence_s = self._ending_silence_s()
+            self._silence_s = self._ending_silence_s() if buffer else inf
         return events
 
     def tick(self, now: float) -> list[Event]:
@@ -105,8 +105,6 @@ class Decoder:
         return self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
 
     def _ending_silence_s(self) -> float:
-        if not self._buffer:
-            return inf
         whole = self._buffer[0] != _START or is_complete(self._buffer)
         return MISSING_END_SILENCE_S if whole else CUT_FRAME_SILENCE_S
 
