@@ -162,10 +162,10 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 def profile_capabilities(platform: str) -> frozenset[str]:
     """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
-    _, auto = parse_option(platform)
-    kinds = [kind for kind in Platform if kind is not Platform.UNKNOWN] if auto else [platform.partition("+")[0]]
-    options = platform.partition("+")[1] + platform.partition("+")[2]
-    profiles = [parse_platform(f"{kind}{options}") for kind in kinds]
+    name, auto = parse_option(platform)
+    kind, plus, options = name.partition("+")
+    kinds = [each for each in Platform if each is not Platform.UNKNOWN] if auto else [kind]
+    profiles = [parse_platform(f"{each}{plus}{options}") for each in kinds]
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 
 

@@ -105,6 +105,7 @@ class Decoder:
         return self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
 
     def _ending_silence_s(self) -> float:
+        """Return the silence that ends the buffered bytes; there is at least one."""
         whole = self._buffer[0] != _START or is_complete(self._buffer)
         return MISSING_END_SILENCE_S if whole else CUT_FRAME_SILENCE_S
 

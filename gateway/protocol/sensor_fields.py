@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-BITS_2: Final = {b"%d%d" % (a, b): (bool(a), bool(b)) for a in (0, 1) for b in (0, 1)}
-BITS_4: Final = {left + right: (*BITS_2[left], *BITS_2[right]) for left in BITS_2 for right in BITS_2}
+_BITS_2: Final = {b"%d%d" % (a, b): (bool(a), bool(b)) for a in (0, 1) for b in (0, 1)}
+_BITS_4: Final = {left + right: (*_BITS_2[left], *_BITS_2[right]) for left in _BITS_2 for right in _BITS_2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +37,9 @@ SENSOR_FIELDS: Final = (
     SensorField("range", "range_cm", b"CSB", rb"[0-9]+(?:\.[0-9]+)?", float, 1200.0),
     SensorField("battery", "voltage_v", b"PV", rb"[0-9]+(?:\.[0-9]+)?", float, 12.0),
     SensorField("grayscale", "grayscale", b"GS", rb"[0-9]+", int, 1023),
-    SensorField("line", "line", b"LF", rb"[0-9]{4}", BITS_4.get),
-    SensorField("obstacle", "obstacle", b"HW", rb"[0-9]{2}", BITS_2.get),
-    SensorField("light", "light", b"GM", rb"[0-9]{2}", BITS_2.get),
+    SensorField("line", "line", b"LF", rb"[0-9]{4}", _BITS_4.get),
+    SensorField("obstacle", "obstacle", b"HW", rb"[0-9]{2}", _BITS_2.get),
+    SensorField("light", "light", b"GM", rb"[0-9]{2}", _BITS_2.get),
 )
 ATTRIBUTES: Final = {field.measurement: field.attribute for field in SENSOR_FIELDS}
 
