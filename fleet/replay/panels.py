@@ -12,7 +12,7 @@ from typing import Final
 
 from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from schemas import keys
-from schemas.topics import TOPICS
+from schemas.topics import CAR_TOPICS, TOPICS, Topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,11 +146,12 @@ MAIN_PANELS: Final = (
 )
 """First page of a car's tab, in two columns."""
 
-MORE_PANELS: Final = (
+_SENSOR_PANELS: Final = (
     Panel("Gyroscope", curves=tuple(Curve("sensor/imu", f"gyro_{a}_raw", f"{a} (raw)") for a in "xyz")),
     Panel("Acceleration", curves=tuple(Curve("sensor/imu", f"accel_{a}_raw", f"{a} (raw)") for a in "xyz")),
     Panel("Arm", curves=tuple(Curve("sensor/arm", f"joint_deg[{n}]", f"J{n + 1} (deg)") for n in range(6))),
-    Panel("Grayscale", curves=(Curve("sensor/grayscale", "raw", "grayscale (raw)"),)),
+)
+_STATE_PANELS: Final = (
     Panel("Speed (estimate)", curves=(Curve("state/motion", "speed", "speed (0 to 1)"),)),
     Panel("Servo", curves=(Curve("state/motion", "servo_deg!", "number sent (deg)"),)),
     Panel(
@@ -184,6 +185,20 @@ MORE_PANELS: Final = (
     ),
     Panel("Raw frames", texts=("frame/rx", "frame/tx")),
 )
+_DRAWN: Final = frozenset[str]().union(*(panel.topics for panel in MAIN_PANELS + _SENSOR_PANELS))
+
+
+def _plain_panel(topic: Topic) -> Panel:
+    """Return the panel of a sensor without a row of its own: a curve per field with a unit, a track per word."""
+    name = topic.name.removeprefix("sensor/").replace("_", " ")
+    curves = tuple(Curve(topic.name, field, f"{name} ({field.replace('_', ' ')})") for field in topic.units)
+    return Panel(name.capitalize(), curves, _tracks(topic.name, name, *topic.words))
+
+
+_PLAIN_PANELS: Final = tuple(
+    _plain_panel(topic) for topic in CAR_TOPICS if topic.family == "sensor" and topic.name not in _DRAWN
+)
+MORE_PANELS: Final = _SENSOR_PANELS + _PLAIN_PANELS + _STATE_PANELS
 """Second page of a car's tab."""
 
 CAR_PANELS: Final = MAIN_PANELS + MORE_PANELS

@@ -13,9 +13,11 @@ from gateway.control.events import Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import Finding, StopCase
-from gateway.protocol.enums import Mode
-from gateway.protocol.events import Cause, Event, Rejected, Sensors
+from gateway.protocol.enums import Cause, Mode
+from gateway.protocol.events import Event, Rejected
+from gateway.protocol.modes import only_candidate
 from gateway.protocol.platforms import StopStyle
+from gateway.protocol.sensors import Sensors
 
 STALL_S: Final = 0.5
 """Maximum gap of the loop while a motion is held. After a longer one it stops the car
@@ -67,7 +69,7 @@ class CarMonitor:
         if model.trust.state is CarTrust.UNHEARD:
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
-        if event.signature is Mode.MANUAL:
+        if only_candidate(event) is Mode.MANUAL:
             self._on_report(event, now)
         self._log_delivery(finding, now)
         self._stops.on_finding(finding, event.at, now)
@@ -195,6 +197,6 @@ class CarMonitor:
             return
         pending, sent_at = mode_sent
         what = pending.command.what
-        if isinstance(what, SetMode) and event.signature is what.mode and event.at > sent_at + FLIGHT_S:
+        if isinstance(what, SetMode) and only_candidate(event) is what.mode and event.at > sent_at + FLIGHT_S:
             self._executor.mode_sent = None
             self._log.record(pending, Phase.EFFECT_SEEN, now, evidence=(self.model.mode.evidence,))

@@ -13,8 +13,17 @@ import re
 from math import inf
 from typing import Final
 
-from gateway.protocol.events import ArmReading, Cause, Echo, Event, ImuReading, Reject, Rejected, Sensors
-from gateway.protocol.parser import fullmatch_sensors, is_complete, match_ended_sensors, parse, read_sensors
+from gateway.protocol.enums import Cause
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
+from gateway.protocol.parser import parse
+from gateway.protocol.sensors import (
+    Reject,
+    Sensors,
+    fullmatch_sensors,
+    is_complete,
+    match_ended_sensors,
+    read_sensors,
+)
 
 __all__ = [
     "ArmReading",

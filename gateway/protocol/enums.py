@@ -84,6 +84,18 @@ class SpeedStep(StrEnum):
         return 1 if self is SpeedStep.UP else 2
 
 
+class Cause(StrEnum):
+    """Why bytes are not a reading (docs/reference/protocol.md#bad-input)."""
+
+    NO_START = "no_start"
+    OVERLONG = "overlong"
+    UNKNOWN_WORD = "unknown_word"
+    MISSING_WORD = "missing_word"
+    BAD_NUMBER = "bad_number"
+    OUT_OF_RANGE = "out_of_range"
+    TRUNCATED = "truncated"
+
+
 _MOTION_DIGITS = {
     Motion.STOP: (0, 0),
     Motion.FORWARD: (1, 0),

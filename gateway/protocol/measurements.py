@@ -4,13 +4,11 @@ The level of the battery is an estimate of the gateway and is not set here.
 """
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, Sensors
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
 from gateway.protocol.platforms import Profile
+from gateway.protocol.sensors import SENSOR_FIELDS, Fields, Sensors
 
-Value = bool | int | float | tuple[float, ...]
-Fields = dict[str, Value]
-
-_LINE = ("left_outer", "left_inner", "right_inner", "right_outer")
+_PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.published) for each in SENSOR_FIELDS)
 _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", "accel_z_raw")
 
 
@@ -49,19 +47,9 @@ def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str
 def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
     names = profile.measured(event, confirmed)
     topics: dict[str, Fields] = {}
-    if "range" in names and event.range_cm is not None:
-        # A range of 0 is no echo, not a distance (docs/reference/protocol.md#ranges).
-        topics["sensor/range"] = (
-            {"no_echo": False, "range_m": round(event.range_cm / 100, 4)} if event.range_cm else {"no_echo": True}
-        )
-    if "battery" in names and event.voltage_v is not None:
-        topics["sensor/battery"] = {"voltage_v": event.voltage_v}
-    if "grayscale" in names and event.grayscale is not None:
-        topics["sensor/grayscale"] = {"raw": event.grayscale}
-    if "line" in names and event.line is not None:
-        topics["sensor/line"] = dict(zip(_LINE, event.line, strict=True))
-    if "obstacle" in names and (obstacle := profile.obstacle(event, confirmed)) is not None:
-        topics["sensor/obstacle"] = {"left": obstacle[0], "right": obstacle[1]}
-    if "light" in names and event.light is not None:
-        topics["sensor/light"] = {"left": event.light[0], "right": event.light[1]}
+    for name, attribute, topic, published in _PUBLISHED:
+        if name in names:
+            # What the bits of the obstacle sensors mean depends on the platform and the mode.
+            value = profile.obstacle(event, confirmed) if name == "obstacle" else getattr(event, attribute)
+            topics[topic] = published(value)
     return topics

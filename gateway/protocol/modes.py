@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Final
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.sensor_fields import SENSOR_FIELDS, sensors_pattern
+from gateway.protocol.sensors import SENSOR_FIELDS, Sensors, sensors_pattern
 
 EVERY_MEASUREMENT: Final = frozenset(field.measurement for field in SENSOR_FIELDS)
 
@@ -68,10 +68,20 @@ SILENT_MODES: Final = frozenset(mode for mode, row in MODES.items() if row.is_si
 _SIGNED: Final = tuple((mode, row, row.signature) for mode, row in MODES.items() if row.signature is not None)
 
 
+def candidate_modes(frame: Sensors) -> tuple[Mode, ...]:
+    """Return the modes whose sensors frame has this text, by its filler; never empty, in order of digit."""
+    return _candidates(frame.raw, frame.terminated, frame.by_silence)
+
+
+def only_candidate(frame: Sensors) -> Mode | None:
+    """Return the only mode whose sensors frame has this text. None if there are several."""
+    candidates = candidate_modes(frame)
+    return candidates[0] if len(candidates) == 1 else None
+
+
 # The control code looks at one event several times: the cache makes all but the first look free.
 @lru_cache(maxsize=8)
-def matching_modes(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:  # noqa: FBT001 - two facts of a frame
-    """Return the modes whose sensors frame has this text, by its filler; never empty, in order of digit."""
+def _candidates(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:  # noqa: FBT001 - two facts of a frame
     found = [(mode, row) for mode, row, signature in _SIGNED if signature.fullmatch(raw)]
     if not found:
         return (Mode.MANUAL,)

@@ -4,16 +4,13 @@
 """
 
 import re
-from typing import Any, Final
+from typing import Final
 
-from gateway.protocol.events import ArmReading, Cause, Event, ImuReading, Reject, Rejected, Sensors
-from gateway.protocol.sensor_fields import SENSOR_FIELDS, sensors_pattern
+from gateway.protocol.enums import Cause
+from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected
+from gateway.protocol.sensors import SENSOR_FIELDS, Reject, match_ended_sensors, read_sensors
 
 JOINT_MAX: Final = 180.0  # docs/reference/protocol.md#ranges: "ranges a reading must be in"
-
-_SENSORS_TEXT: Final = sensors_pattern()
-match_ended_sensors = re.compile(_SENSORS_TEXT + rb"#").match
-fullmatch_sensors = re.compile(_SENSORS_TEXT).fullmatch
 
 _SENSORS: Final = tuple(field.word for field in SENSOR_FIELDS)
 _ARM: Final = (b"J1", b"J2", b"J3", b"J4", b"J5", b"J6")
@@ -25,33 +22,6 @@ _NUMBER: Final = {
     **dict.fromkeys(_ARM, _UNSIGNED),
     **dict.fromkeys(_IMU, _SIGNED),
 }
-# Unpacked by hand below: a loop over the table would take 1.5 us more per frame, a third of the decoding.
-_RANGE, _BATTERY, _GRAYSCALE, _LINE, _OBSTACLE, _LIGHT = SENSOR_FIELDS
-_CSB_MAX, _PV_MAX, _GS_MAX = _RANGE.maximum or 0.0, _BATTERY.maximum or 0.0, _GRAYSCALE.maximum or 0.0
-# Bound here once: CPython 3.11 takes longer for a method of an imported name in the function.
-_read_line, _read_obstacle, _read_light = _LINE.read, _OBSTACLE.read, _LIGHT.read
-assert tuple(field.attribute for field in SENSOR_FIELDS) == Sensors._fields[2:8], (
-    "Sensors: the table's fields, in order"
-)
-
-
-def read_sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, by_silence: bool = False) -> Sensors:
-    """Return the reading of a match of a sensors pattern; reject each field that is out of range."""
-    csb, pv, gs, lf, hw, gm = texts = found.groups()
-    range_cm, voltage_v, grayscale = float(csb), float(pv), int(gs)
-    line, obstacle, light = _read_line(lf), _read_obstacle(hw), _read_light(gm)
-    reading = Sensors(found[0], at, range_cm, voltage_v, grayscale, line, obstacle, light, (), terminated, by_silence)
-    if range_cm <= _CSB_MAX and voltage_v <= _PV_MAX and grayscale <= _GS_MAX and line and obstacle and light:
-        return reading
-    rejected = [(field, text) for field, text in zip(SENSOR_FIELDS, texts, strict=True) if not field.accepts(text)]
-    rejects = tuple(Reject(field.word.decode(), text.decode()) for field, text in rejected)
-    without: dict[str, Any] = dict.fromkeys((field.attribute for field, _ in rejected), None)
-    return reading._replace(rejects=rejects, **without)
-
-
-def is_complete(raw: bytes | bytearray) -> bool:
-    """Return True if these bytes are a whole sensors frame that only lacks its `#`."""
-    return _SENSORS[-1] in raw and fullmatch_sensors(raw) is not None
 
 
 def parse(raw: bytes, at: float) -> Event:

@@ -9,11 +9,10 @@ from functools import cache
 from typing import Final
 
 from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
-from gateway.protocol.events import Sensors
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES
+from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
 from gateway.protocol.platform_name import OPTIONS, Platform, parse_name
-from gateway.protocol.sensor_fields import ATTRIBUTES
+from gateway.protocol.sensors import ATTRIBUTES, Sensors
 from gateway.protocol.timing import RASPBERRY_PI_FAN_S, block_s
 
 
@@ -151,7 +150,7 @@ class Profile:
         The confirmed `mode` decides between the candidates. If it is none of them, the frame may be a corrupted frame
         of that mode, until three frames in a row contradict it.
         """
-        candidates = event.candidates
+        candidates = candidate_modes(event)
         if mode is None:
             return candidates
         return (mode,) if mode in candidates else (*candidates, mode)
@@ -188,7 +187,7 @@ class Profile:
         """Return the contradictions between this frame and the platform, for a person. None found proves nothing."""
         if self.kind is Platform.UNKNOWN:
             return ()
-        candidates = event.candidates
+        candidates = candidate_modes(event)
         found: list[str] = []
         if self.modes.isdisjoint(candidates):
             found.append(f"a reading of mode {' or '.join(candidates)}, which {self._these} do not have")

@@ -10,9 +10,11 @@ from gateway.control.stops.sequences import STOP_REPORT_TIMEOUT_S, UNKNOWN
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import Event, Sensors
+from gateway.protocol.events import Event
 from gateway.protocol.frames import encode
+from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile
+from gateway.protocol.sensors import Sensors
 from gateway.tools import cli_support
 from gateway.tools.discovery import SerialPort
 from gateway.tools.statistics import LinkStatistics
@@ -110,5 +112,5 @@ class LinkProbe:
     def _count(self, events: Sequence[Event]) -> None:
         for event in events:
             self.statistics.count(event, self._profile)
-            if isinstance(event, Sensors) and event.candidates == (Mode.MANUAL,):
+            if isinstance(event, Sensors) and candidate_modes(event) == (Mode.MANUAL,):
                 self.answered = True

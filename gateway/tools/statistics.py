@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gateway.control.estimate.platform import PlatformDetector
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Reject, Rejected, Sensors
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
 from gateway.protocol.measurements import measured
+from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile, parse_platform
+from gateway.protocol.sensors import Reject, Sensors
 
 
 @dataclass(slots=True)
@@ -30,7 +32,7 @@ class LinkStatistics:
         match event:
             case Sensors():
                 self.kinds["sensors"] += 1
-                self.modes[" or ".join(event.candidates)] += 1
+                self.modes[" or ".join(candidate_modes(event))] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
                 self.contradictions.update(profile.contradictions(event))
             case ArmReading():
@@ -115,7 +117,7 @@ def _measured(event: Sensors, profile: Profile) -> dict[str, Any]:
                 fields["grayscale"] = values["raw"]
             case _:
                 fields |= values
-    fields["modes"] = list(event.candidates)
+    fields["modes"] = list(candidate_modes(event))
     if contradictions := profile.contradictions(event):
         fields["contradicts"] = list(contradictions)
     return fields | _rejected(event.rejects)

@@ -3,7 +3,7 @@
 import random
 
 from gateway.protocol.decoder import Decoder, Echo, Rejected
-from gateway.protocol.events import Sensors
+from gateway.protocol.sensors import Sensors
 from tests.fuzz.controller import MANUAL, READINGS
 
 FRESH = 2_000

@@ -7,8 +7,9 @@ from gateway.control.commands import Action, ChangeSpeed, Drive, Fan, Find, OneS
 from gateway.control.estimate.link_health import LinkHealth, LinkState
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
-from gateway.protocol.events import Event, Sensors
+from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, General, Ptz
+from gateway.protocol.sensors import Sensors
 from gateway.sim.model.raspberry_pi import Transport
 from tests.support.truth import WORLDS
 from tests.support.virtual import Pair

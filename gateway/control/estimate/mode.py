@@ -11,9 +11,9 @@ from typing import Final
 
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import Sensors
-from gateway.protocol.modes import SILENT_MODES
+from gateway.protocol.modes import SILENT_MODES, candidate_modes
 from gateway.protocol.platforms import Profile
+from gateway.protocol.sensors import Sensors
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
 
 CONTRADICTING_FRAMES: Final = 3
@@ -111,7 +111,7 @@ class ModeEstimator:
         self._heard_at = at
         if not counts:
             return
-        candidates = event.candidates
+        candidates = candidate_modes(event)
         self._set_candidates(candidates)
         if self.asked is None:
             return

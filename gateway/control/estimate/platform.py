@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import ArmReading, Event, ImuReading, Sensors
+from gateway.protocol.events import ArmReading, Event, ImuReading
+from gateway.protocol.modes import candidate_modes, only_candidate
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, parse_platform
+from gateway.protocol.sensors import Sensors
 
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
@@ -101,7 +103,7 @@ class PlatformDetector:
         observed = self.profile.contradictions(event)
         if not observed and not self._against:
             return ()
-        in_manual = event.signature is Mode.MANUAL
+        in_manual = only_candidate(event) is Mode.MANUAL
         for words in observed:
             self._against.setdefault(words, _PlatformEvidence())
         affected = [words for words in self._against if in_manual or words in observed]
@@ -126,9 +128,9 @@ class PlatformDetector:
 
     def _detect(self, event: Sensors) -> None:
         """Detect the platform from the first evidence."""
-        if len(event.candidates) > 1:
+        if len(candidate_modes(event)) > 1:
             return
-        in_manual = event.signature is Mode.MANUAL
+        in_manual = only_candidate(event) is Mode.MANUAL
         constants = b",PV8.4,GS0," in event.raw and b"." not in event.raw.partition(b",PV")[0]
         shown = {
             _MODE_READINGS: not in_manual,

@@ -10,7 +10,8 @@ from enum import StrEnum
 from typing import Final
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import Sensors
+from gateway.protocol.modes import candidate_modes
+from gateway.protocol.sensors import Sensors
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
 
 # A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
@@ -267,14 +268,14 @@ class StopEvidence:
 
     def is_settled(self, event: Sensors) -> bool:
         """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
-        return event.at - self._foreign_at >= SETTLED_S or Mode.MANUAL not in event.candidates
+        return event.at - self._foreign_at >= SETTLED_S or Mode.MANUAL not in candidate_modes(event)
 
     def on_reading(self, event: Sensors) -> Finding:
         """Record a reading. Return what it shows."""
         at, quiet_s = event.at, event.at - self._last_at
         self._last_at = at
         self.settles_at = None
-        if Mode.MANUAL not in event.candidates:
+        if Mode.MANUAL not in candidate_modes(event):
             self._other_mode(at)
             return Finding.NOTHING
         self._shapes = 0

@@ -22,7 +22,7 @@ import serial
 from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import Sensors
+from gateway.protocol.sensors import Sensors
 from schemas.links import TcpUrl
 from tests.gateway.link.peers import (
     BlePeer,

@@ -7,7 +7,7 @@ import pytest
 from gateway.protocol.decoder import Decoder, Sensors
 from gateway.protocol.enums import Mode, SpeedStep
 from gateway.protocol.frames import ArmSet, parse_sent
-from gateway.protocol.modes import MODES
+from gateway.protocol.modes import MODES, candidate_modes, only_candidate
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
@@ -75,8 +75,8 @@ def test_recovery_waits_longer_than_any_mode_opens() -> None:
 @pytest.mark.parametrize("row", PLACEHOLDERS, ids=ids(PLACEHOLDERS))
 def test_what_is_measured(row: dict[str, str], platform: Platform) -> None:
     event, profile = sensors(wire(row["bytes"]), row["ended"]), parse_platform(platform)
-    assert event.candidates == tuple(map(Mode, row["candidates"].split()))
-    assert event.signature == (event.candidates[0] if len(event.candidates) == 1 else None)
+    assert candidate_modes(event) == tuple(map(Mode, row["candidates"].split()))
+    assert only_candidate(event) == (candidate_modes(event)[0] if len(candidate_modes(event)) == 1 else None)
     assert profile.measured(event) == set((ALL if row[platform] == "all" else row[platform]).split())
     obstacle = None if row["obstacle"] == "-" else tuple(bit == "1" for bit in row["obstacle"])
     assert profile.obstacle(event) == obstacle

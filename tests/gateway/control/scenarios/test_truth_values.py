@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from gateway.control.commands import Drive, Fan, SetMode, Stop
 from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.events import Event, Sensors
-from gateway.protocol.parser import fullmatch_sensors, read_sensors
+from gateway.protocol.events import Event
 from gateway.protocol.platforms import parse_platform
+from gateway.protocol.sensors import Sensors, fullmatch_sensors, read_sensors
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
 

@@ -28,8 +28,9 @@ from gateway.control.stops.evidence import (
     StopEvidence,
 )
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.events import Cause, Rejected, Sensors
+from gateway.protocol.enums import Cause, Mode, Motion
+from gateway.protocol.events import Rejected
+from gateway.protocol.sensors import Sensors
 from gateway.sim.model.world import World
 from tests.gateway.control.workbench import Workbench
 from tests.support.virtual import Pair
