@@ -21,9 +21,9 @@ from fleet.client.commands import (
     estop_request,
     lend_request,
     pause_request,
+    plain_request,
     resume_request,
     stop_request,
-    unpause_request,
 )
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.outcome import Outcome
@@ -141,7 +141,7 @@ class Fleet:
 
     async def unpause(self) -> list[Outcome]:
         """End the pause of the fleet. No car moves."""
-        return await self.ask(unpause_request())
+        return await self.ask(plain_request("unpause"))
 
     async def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
         """Lend these cars to a person: until then only that person and leads drive them."""

@@ -12,8 +12,16 @@ import click
 from click.shell_completion import BashComplete, FishComplete, add_completion_class
 
 from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
+from schemas import commands
 from schemas.process import startup, stdio
 from schemas.suggestion import how_to_install, misspelled
+
+
+def _plain_commands(section: str) -> dict[str, tuple[str, str]]:
+    """Return the subcommands under a heading that a row of `schemas.commands` describes."""
+    rows = [row for row in commands.COMMANDS.values() if row.section == section]
+    return {row.subcommand: (f"fleet.commands.actuators:{row.subcommand}", row.summary) for row in rows}
+
 
 COMMANDS: Final = {
     "Start here": {
@@ -63,12 +71,12 @@ COMMANDS: Final = {
         "pause": ("fleet.commands.people:pause", "Stop all cars; nobody but a lead moves one until `unpause`."),
         "unpause": ("fleet.commands.people:unpause", "End the pause. No car moves by it."),
         "lend": ("fleet.commands.people:lend", "Lend cars to a person for a time."),
-        "identify": ("fleet.commands.actuators:identify", "Blink and beep, without moving."),
+        **_plain_commands("Drive"),
     },
     "Lights and parts": {
         "light": ("fleet.commands.actuators:light", "Light up in a color: fleet light red cyan"),
         "led": ("fleet.commands.actuators:led", "Set the color LED: fleet led red '#ff8000'"),
-        "whistle": ("fleet.commands.actuators:whistle", "Sound once."),
+        **_plain_commands("Lights and parts"),
         "servo": ("fleet.commands.actuators:servo", "Move a servo."),
         "arm": ("fleet.commands.actuators:arm", "Move the six joints of the arm."),
         "fan": ("fleet.commands.actuators:fan", "Switch the fan."),
@@ -150,9 +158,9 @@ class _LazyGroup(CommandGroup):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
         width = max(map(len, _FUNCTIONS))
-        for section, commands in COMMANDS.items():
+        for section, subcommands in COMMANDS.items():
             with formatter.section(section):
-                formatter.write_dl([(name.ljust(width), words) for name, (_, words) in commands.items()])
+                formatter.write_dl([(name.ljust(width), words) for name, (_, words) in subcommands.items()])
 
 
 @click.group(

@@ -1,4 +1,4 @@
-"""The one table of commands: verb, message, description, whether it takes a wildcard, maximum age. Pure."""
+"""The one table of commands: verb, message, description, text of the outcome, wildcard, maximum age, limits. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,17 +12,30 @@ class CommandType:
 
     verb: str
     about: str
+    effect: str = ""
+    """Text of the outcome when its frames were sent. Empty if `fleet.client.effects` has its texts."""
     ttl_s: float = 2.0
     """Default of the maximum age at arrival (docs/reference/commands.md#payload)."""
     wildcard: bool = False
     """True if one query may address several cars (docs/reference/keys.md#command-keys)."""
     stops: bool = False
     """True if it needs no payload, and stops the car even if the payload is invalid."""
+    max_duration_s: float = 0.0
+    """Maximum of its field `duration_s`. 0 if it has none, or if each gateway has a limit of its own."""
+    subcommand: str = ""
+    """Its subcommand of `fleet`, if this row says all about it: cars, and `--for` if there is a maximum duration."""
+    section: str = ""
+    """Heading of the subcommand in `fleet --help`."""
 
     @property
     def message(self) -> str:
         """The full name of the payload's message."""
         return f"fleet.v1.{self.verb.capitalize()}Command"
+
+    @property
+    def summary(self) -> str:
+        """The description as a sentence."""
+        return f"{self.about[:1].upper()}{self.about[1:]}."
 
 
 _ROWS: Final = (
@@ -31,14 +44,14 @@ _ROWS: Final = (
         "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
         ttl_s=0.5,
     ),
-    CommandType("mode", "bring the car into a mode; `manual` closes whatever is open"),
-    CommandType("led", "the color LED, 0..255 each"),
-    CommandType("light", "the light's color, or `off`"),
-    CommandType("servo", "move a servo a step, or the front one to `deg` (0..180)"),
-    CommandType("arm", "six joints, 0..180 degrees each (option `+arm`)"),
-    CommandType("whistle", "sound once"),
-    CommandType("speed", "one step `up` or `down`: cars have no absolute speed"),
-    CommandType("fan", "toggle; `on` or `off` while its state is known"),
+    CommandType("mode", "bring the car into a mode; `manual` closes whatever is open", "switching to mode{detail}"),
+    CommandType("led", "the color LED, 0..255 each", "LED set"),
+    CommandType("light", "the light's color, or `off`", "light set to{detail}"),
+    CommandType("servo", "move a servo a step, or the front one to `deg` (0..180)", "servo set"),
+    CommandType("arm", "six joints, 0..180 degrees each (option `+arm`)", "arm set"),
+    CommandType("whistle", "sound the whistle once", "whistled", subcommand="whistle", section="Lights and parts"),
+    CommandType("speed", "one step `up` or `down`: cars have no absolute speed", "speed one step{detail}"),
+    CommandType("fan", "toggle; `on` or `off` while its state is known", "fan{detail}"),
     CommandType("stop", "stop, and hold the car against the coordinator", wildcard=True, stops=True),
     CommandType(
         "estop",
@@ -48,10 +61,21 @@ _ROWS: Final = (
     ),
     CommandType("resume", "end the e-stops of these ids; without ids, the hold; `all` ends both", wildcard=True),
     CommandType("pause", "stop, and let only leads move the cars of the fleet until `unpause`", wildcard=True),
-    CommandType("unpause", "end the pause of the fleet; move nothing", wildcard=True),
-    CommandType("lend", "let only one person drive the car for `duration_s`, or `end` that"),
-    CommandType("lease", "reserve the car for a moment, or release it"),
-    CommandType("find", "blink and beep, without moving"),
+    CommandType("unpause", "end the pause of the fleet; move nothing", "{words}", wildcard=True),
+    CommandType(
+        "lend",
+        "let only one person drive the car for `duration_s`, or `end` that",
+        "{words}",
+        max_duration_s=86_400.0,
+    ),
+    CommandType("lease", "reserve the car for a moment, or release it", "done"),
+    CommandType(
+        "find",
+        "blink and beep, without moving: shows which car is which",
+        "blinked and beeped",
+        subcommand="identify",
+        section="Drive",
+    ),
 )
 
 COMMANDS: Final[Mapping[str, CommandType]] = MappingProxyType({row.verb: row for row in _ROWS})

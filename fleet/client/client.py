@@ -34,9 +34,9 @@ from fleet.client.commands import (
     estop_request,
     lend_request,
     pause_request,
+    plain_request,
     resume_request,
     stop_request,
-    unpause_request,
 )
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.lease import Lease
@@ -257,7 +257,7 @@ class Fleet:
 
     def unpause(self) -> list[Outcome]:
         """End the pause of the fleet. No car moves."""
-        return self.ask(unpause_request())
+        return self.ask(plain_request("unpause"))
 
     def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
         """Lend these cars to a person: until then only that person and leads drive them."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 from fleet.client.outcome import Until
-from schemas import keys
+from schemas import keys, messages
+from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 
 R = TypeVar("R")
@@ -112,9 +113,9 @@ def light_request(light: str) -> CommandRequest:
     return CommandRequest("light", pb.LightCommand(light=light))
 
 
-def whistle_request() -> CommandRequest:
-    """Request one whistle."""
-    return CommandRequest("whistle", pb.WhistleCommand())
+def plain_request(verb: str, **fields: Any) -> CommandRequest:
+    """Request a command of `schemas.commands` that needs no rule here, with the fields of its message."""
+    return CommandRequest(verb, messages.message_class(COMMANDS[verb].message)(**fields))
 
 
 def speed_request(step: str) -> CommandRequest:
@@ -130,11 +131,6 @@ def fan_request(state: str | None = None) -> CommandRequest:
 def lease_request(*, take: bool = False, release: bool = False) -> CommandRequest:
     """Request a lease for 2 s, or its release. take: as a person, take the car over from another person."""
     return CommandRequest("lease", pb.LeaseCommand(release=release), take=take)
-
-
-def find_request() -> CommandRequest:
-    """Request a blink and a beep."""
-    return CommandRequest("find", pb.FindCommand())
 
 
 def stop_request() -> CommandRequest:
@@ -155,11 +151,6 @@ def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> Comm
 def pause_request(why: str = "") -> CommandRequest:
     """Request a stop, and a pause of the whole fleet."""
     return CommandRequest("pause", pb.PauseCommand(why=why), Until.STOPPED)
-
-
-def unpause_request() -> CommandRequest:
-    """Request the end of the pause of the fleet."""
-    return CommandRequest("unpause", pb.UnpauseCommand())
 
 
 def lend_request(to: str, duration_s: float) -> CommandRequest:
@@ -225,7 +216,7 @@ class CarCommands(ABC, Generic[R]):
 
     def whistle(self) -> R:
         """Sound once."""
-        return self.do(whistle_request())
+        return self.do(plain_request("whistle"))
 
     def speed(self, step: str) -> R:
         """Change the speed by one step `up` or `down`: the car has no absolute speed."""
@@ -257,4 +248,4 @@ class CarCommands(ABC, Generic[R]):
 
     def find(self) -> R:
         """Blink and beep, without moving."""
-        return self.do(find_request())
+        return self.do(plain_request("find"))

@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from schemas.commands import COMMANDS
+
 _ANY: Final = "*"
 _ESTOP: Final[dict[str, str]] = {
     "shown": "emergency-stopped ({took_s:.1f} s)",
@@ -17,6 +19,7 @@ _STOP: Final[dict[str, str]] = {
 }
 
 EFFECTS: Final[dict[str, dict[str, str]]] = {
+    **{verb: {"sent": row.effect} for verb, row in COMMANDS.items() if row.effect},
     "drive": {
         "complete": "drove{detail}, then stopped",
         "unconfirmed": "drive sent, NOT CONFIRMED",
@@ -26,20 +29,8 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
     "stop": _STOP,
     "estop": _ESTOP,
     "estop_fleet": _ESTOP,
-    "mode": {"sent": "switching to mode{detail}"},
-    "led": {"sent": "LED set"},
-    "light": {"sent": "light set to{detail}"},
-    "servo": {"sent": "servo set"},
-    "arm": {"sent": "arm set"},
-    "whistle": {"sent": "whistled"},
-    "speed": {"sent": "speed one step{detail}"},
-    "fan": {"sent": "fan{detail}"},
-    "find": {"sent": "blinked and beeped"},
     "resume": {"sent": "{words}", "estopped": "{words}", "held": "{words}"},
     "pause": _STOP,
-    "unpause": {"sent": "{words}"},
-    "lend": {"sent": "{words}"},
-    "lease": {"sent": "done"},
     _ANY: {
         "complete": "done",
         "sent": "sent",

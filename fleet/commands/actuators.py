@@ -1,4 +1,7 @@
-"""`fleet led, light, servo, arm, whistle, speed, fan, identify`: actions of a car without a duration."""
+"""`fleet led, light, servo, arm, speed, fan`, and the subcommands that a row of `schemas.commands` describes.
+
+Those of a row, such as `whistle` and `identify`, have no function here.
+"""
 
 import re
 from typing import Any, Final
@@ -10,16 +13,16 @@ from fleet.client.commands import (
     CommandRequest,
     arm_request,
     fan_request,
-    find_request,
     led_request,
     light_request,
+    plain_request,
     servo_request,
     speed_request,
-    whistle_request,
 )
 from fleet.commands.options import carry_out, json_option, take_option, with_client
-from fleet.commands.params import CarNames, Choice, Color, cars_argument, missing_words
+from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, missing_words
 from gateway.protocol.enums import Light, SpeedStep
+from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
@@ -143,15 +146,6 @@ def arm(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
     carry_out(client, request, cars, take=take, as_json=as_json)
 
 
-@click.command(epilog="\b\nexample:\n  fleet whistle red")
-@cars_argument
-@json_option
-@with_client
-def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
-    """Sound the whistle once."""
-    carry_out(client, whistle_request(), cars, as_json=as_json)
-
-
 @click.command(epilog="\b\nexample:\n  fleet speed red up")
 @cars_argument
 @click.argument("step", type=Choice("speed step", SpeedStep))
@@ -176,10 +170,26 @@ def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
     carry_out(client, request, cars, take=take, as_json=as_json)
 
 
-@click.command(epilog="\b\nexample:\n  fleet identify red")
-@cars_argument
-@json_option
-@with_client
-def identify(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
-    """Blink and beep, without moving: shows which car is which."""
-    carry_out(client, find_request(), cars, as_json=as_json)
+def _plain_command(row: CommandType) -> click.Command:
+    """Return the subcommand of a verb whose row in `schemas.commands` says all about it."""
+
+    @cars_argument
+    @json_option
+    @with_client
+    def command(client: Fleet, cars: tuple[str, ...], *, as_json: bool, **fields: float) -> None:
+        carry_out(client, plain_request(row.verb, **fields), cars, as_json=as_json)
+
+    example = f"fleet {row.subcommand} red"
+    if row.max_duration_s:
+        example += " --for 2s"
+        limit = Duration(row.max_duration_s)
+        command = click.option("--for", "duration_s", type=limit, required=True, help="Duration, such as 2s.")(command)
+    return click.command(row.subcommand, help=row.summary, epilog=f"\b\nexample:\n  {example}")(command)
+
+
+def __getattr__(name: str) -> click.Command:
+    """Return the subcommand of that name that has no function here."""
+    for row in COMMANDS.values():
+        if row.subcommand == name:
+            return _plain_command(row)
+    raise AttributeError(name)

@@ -1,14 +1,11 @@
 """`fleet pause, unpause, lend`: what a lead does with the cars of all."""
 
-from typing import Final
-
 import click
 
 from fleet.client.client import Fleet
 from fleet.commands.options import end_with, json_option, with_client
 from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
-
-_DAY_S: Final = 86_400.0
+from schemas.commands import COMMANDS
 
 
 @click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")
@@ -39,7 +36,12 @@ examples:
 )
 @cars_argument
 @click.option("--to", metavar="PERSON", shell_complete=complete_people, help="Who gets the cars.")
-@click.option("--for", "duration_s", type=Duration(_DAY_S), help="For how long, such as 10m; at most 24h.")
+@click.option(
+    "--for",
+    "duration_s",
+    type=Duration(COMMANDS["lend"].max_duration_s),
+    help="For how long, such as 10m; at most 24h.",
+)
 @click.option("--end", is_flag=True, help="End the loan now. A car that the borrower drives is stopped.")
 @json_option
 @with_client

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
-from fleet.client.commands import CommandRequest, estop_request, pause_request, stop_request, unpause_request
+from fleet.client.commands import CommandRequest, estop_request, pause_request, plain_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
 from fleet.console.bus_message import message_in
@@ -339,7 +339,7 @@ class Console:
                     raise BadPageMessage(refused)  # it stops no car, so it ends no press
                 self.stop_all(message.text("id"), page.operator, pause_request(why))
             case "unpause":
-                page.operator.command(unpause_request(), None, self._answer_to(page, message))
+                page.operator.command(plain_request("unpause"), None, self._answer_to(page, message))
             case "take":
                 page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
             case "give_back":

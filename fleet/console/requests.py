@@ -165,10 +165,10 @@ _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]]
     "resume": _resume,
     "lend": _lend,
     "end_loan": lambda _: commands.end_loan_request(),
-    "whistle": lambda _: commands.whistle_request(),
+    "whistle": lambda _: commands.plain_request("whistle"),
     "speed": lambda message: commands.speed_request(message.one_of("step", frozenset({"up", "down"}))),
     "fan": lambda _: commands.fan_request(),
-    "find": lambda _: commands.find_request(),
+    "find": lambda _: commands.plain_request("find"),
     "stop": lambda _: commands.stop_request(),
     "estop": lambda message: commands.estop_request(message.text("why", MAX_REASON_LENGTH), "car"),
 }

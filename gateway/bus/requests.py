@@ -8,10 +8,11 @@ import json
 import math
 import uuid
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final, TypeVar
 
 from gateway.control.commands import (
+    PLAIN_ACTIONS,
     Action,
     ChangeSpeed,
     Command,
@@ -19,7 +20,6 @@ from gateway.control.commands import (
     EmergencyStop,
     EndLoan,
     Fan,
-    Find,
     Lend,
     OneShot,
     Pause,
@@ -27,8 +27,6 @@ from gateway.control.commands import (
     Resume,
     SetMode,
     Stop,
-    TakeLease,
-    Unpause,
 )
 from gateway.control.people import Sender, SenderKind
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
@@ -45,8 +43,6 @@ DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
-MAX_LOAN_S: Final = 86_400.0
-"""Maximum duration of a loan."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
@@ -159,7 +155,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
         kind = _word("kind", message.kind or SenderKind.SCRIPT, _WIRE_KINDS)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
-        what = _drive(message, request.longest_drive_s, request.car) if verb == "drive" else _WHAT[verb](message)
+        what = _action(verb, message, request)
     except (ValueError, EncodeError) as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
     return replace(
@@ -168,6 +164,19 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
         age_s=_age_s(message, request),
         ttl_s=ttl_s if ttl_s is not None else COMMANDS[verb].ttl_s,
     )
+
+
+def _action(verb: str, message: Any, request: ParsedRequest) -> Action:
+    """Return the action of a message. Raises ValueError or EncodeError for a wrong field."""
+    if verb == "drive":
+        return _drive(message, request.longest_drive_s, request.car)
+    if verb in _WHAT:
+        return _WHAT[verb](message)
+    plain = PLAIN_ACTIONS[verb]
+    values = {field.name: getattr(message, field.name) for field in fields(plain)}
+    if "duration_s" in values:
+        _seconds("duration_s", values["duration_s"], COMMANDS[verb].max_duration_s)
+    return plain(**values)
 
 
 def _encoding(request: ParsedRequest) -> str:
@@ -217,7 +226,7 @@ def _lend(message: Any) -> Action:
     to = _text("to", message.to, "/*$#?@")
     if not to:
         raise ValueError("to is missing: the person who gets the car")
-    return Lend(to, _seconds("duration_s", message.duration_s, MAX_LOAN_S))
+    return Lend(to, _seconds("duration_s", message.duration_s, COMMANDS["lend"].max_duration_s))
 
 
 def _resume(message: Any) -> Action:
@@ -302,12 +311,9 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     "whistle": lambda _: OneShot(General(Motion.STOP, whistle=True)),
     "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     "fan": _fan,
-    "stop": lambda _: Stop(),
     "estop": _estop,
     "resume": _resume,
     "pause": lambda message: Pause(_why(message.why)),
-    "unpause": lambda _: Unpause(),
     "lend": _lend,
-    "lease": lambda message: TakeLease(message.release),
-    "find": lambda _: Find(),
 }
+"""Actions of the verbs whose fields need rules. `drive` also needs the limit of its gateway."""

@@ -15,8 +15,8 @@ from gateway.control.commands import (
     EndLoan,
     Fan,
     Find,
+    FrameAction,
     Lend,
-    OneShot,
     Pause,
     Reason,
     Resume,
@@ -27,8 +27,8 @@ from gateway.control.commands import (
 )
 from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
-from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.frames import ArmSet, General, Ptz
+from gateway.protocol.enums import Mode, Motion, SpeedStep
+from gateway.protocol.frames import General
 from gateway.protocol.platforms import Profile
 from schemas.suggestion import did_you_mean
 
@@ -108,11 +108,9 @@ TABLE: Final[dict[type[Action], Needs]] = {
     TakeLease: Needs(lease=True, link=False),
     Drive: _MOVES,
     SetMode: Needs(lease=True, battery=True),
-    OneShot: _ACTS,
-    ChangeSpeed: _ADJUSTS,
-    Fan: _ADJUSTS,
     Find: _ACTS,
 }
+"""Needs of each action that is no `FrameAction`."""
 
 Refusal = tuple[Reason, str]
 
@@ -126,10 +124,8 @@ def needs(what: Action) -> Needs:
             return CLOSE
         case TakeLease(release=True):
             return _ANYTIME
-        case OneShot(Ptz() | ArmSet()):
-            return _ADJUSTS
-        case OneShot(General() as frame) if frame.servo is not None:
-            return _ADJUSTS
+        case FrameAction():
+            return _ADJUSTS if what.needs_lease else _ACTS
         case _:
             return TABLE[type(what)]
 
@@ -170,20 +166,11 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
         case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
             known = ", ".join(sorted(profile.modes))
             return f"{context.car} ({profile.name}) has no mode {mode}. It has: {known}."
-        case OneShot(frame):
-            return profile.refusal(frame)
-        case ChangeSpeed(step):
-            after = profile.speed.step(context.speed, step)
-            share = profile.speed.fraction(after)
-            if after > context.speed and share > context.speed_max:
-                return (
-                    f"{context.car} would drive at about {share:.0%} of full speed. "
-                    f"Its maximum is {context.speed_max:.0%} (speed_max)."
-                )
-            return profile.refusal(General(Motion.STOP, speed=step))
-        case Fan(on):
-            words = profile.refusal(General(Motion.STOP, fan=True))
-            if words is None and on is not None and context.fan is None:
+        case ChangeSpeed(step) if (words := _too_fast(step, context)) is not None:
+            return words
+        case FrameAction():
+            words = next((refusal for frame in what.frames if (refusal := profile.refusal(frame))), None)
+            if words is None and isinstance(what, Fan) and what.on is not None and context.fan is None:
                 return (
                     f"{context.car}'s fan state is unknown, so on/off is not possible. "
                     f"Toggle it: `fleet fan {context.car}`."
@@ -193,6 +180,19 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
             return profile.refusal(General(motion))
         case _:
             return None
+
+
+def _too_fast(step: SpeedStep, context: CommandContext) -> str | None:
+    """Return why the car must not become as fast as after this step; None if it may."""
+    speed = context.profile.speed
+    after = speed.step(context.speed, step)
+    share = speed.fraction(after)
+    if after <= context.speed or share <= context.speed_max:
+        return None
+    return (
+        f"{context.car} would drive at about {share:.0%} of full speed. "
+        f"Its maximum is {context.speed_max:.0%} (speed_max)."
+    )
 
 
 def _may_direct(sender: Sender, deed: str, context: CommandContext) -> Refusal | None:

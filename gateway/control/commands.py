@@ -1,11 +1,14 @@
 """The commands that control takes, after parsing and range checks, and their answers. Values only."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 from gateway.control.people import Sender
 from gateway.protocol.enums import Mode, Motion, SpeedStep
-from gateway.protocol.frames import Frame
+from gateway.protocol.frames import ArmSet, Frame, General, Ptz
 
 
 class Reason(StrEnum):
@@ -63,25 +66,62 @@ class SetMode:
     mode: Mode
 
 
+class FrameAction(ABC):
+    """An action that sends frames in mode 0, one after the other. A general frame gets the current motion."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def frames(self) -> tuple[Frame, ...]:
+        """The frames to send."""
+
+    @property
+    def needs_lease(self) -> bool:
+        """True if only the driver of a car may do it: it moves a part of the car, or changes how the car moves."""
+        return True
+
+
 @dataclass(frozen=True, slots=True)
-class OneShot:
-    """Send a frame that acts once: light, servo, whistle, arm. A general frame gets the current motion."""
+class OneShot(FrameAction):
+    """Send a frame that acts once: light, servo, whistle, arm."""
 
     frame: Frame
 
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The frame."""
+        return (self.frame,)
+
+    @property
+    def needs_lease(self) -> bool:
+        """True for a servo and the arm."""
+        frame = self.frame
+        return isinstance(frame, Ptz | ArmSet) or (isinstance(frame, General) and frame.servo is not None)
+
 
 @dataclass(frozen=True, slots=True)
-class ChangeSpeed:
+class ChangeSpeed(FrameAction):
     """Change the car's relative speed by one step."""
 
     step: SpeedStep
 
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The frame of one step."""
+        return (General(Motion.STOP, speed=self.step),)
+
 
 @dataclass(frozen=True, slots=True)
-class Fan:
+class Fan(FrameAction):
     """Toggle the fan, or bring it to a state. For that its current state must be known."""
 
     on: bool | None = None
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The frame that toggles the fan."""
+        return (General(Motion.STOP, fan=True),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +198,14 @@ Action = (
     | Lend
     | EndLoan
 )
+
+PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
+    "stop": Stop,
+    "unpause": Unpause,
+    "lease": TakeLease,
+    "find": Find,
+}
+"""Actions by verb whose fields are those of the message, flags or `duration_s`, and need no rule of their own."""
 
 
 @dataclass(frozen=True, slots=True)

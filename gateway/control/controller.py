@@ -17,15 +17,14 @@ from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import (
     Action,
     Answer,
-    ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     EndLoan,
     Fan,
     Find,
+    FrameAction,
     Lend,
-    OneShot,
     Pause,
     Phase,
     Reason,
@@ -223,12 +222,8 @@ class Controller:
                 return self._take_lease(pending, now, release=release)
             case Fan(bool() as on) if on == self.model.believed.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
-            case Fan():
-                pending.frames.append(General(Motion.STOP, fan=True))
-            case OneShot(frame):
-                pending.frames.append(frame)
-            case ChangeSpeed(step):
-                pending.frames.append(General(Motion.STOP, speed=step))
+            case FrameAction():
+                pending.frames.extend(what.frames)
             case Find():
                 pending.frames.extend(frame for frame in self._blinks() if self.model.profile.refusal(frame) is None)
             case _:

@@ -1,15 +1,19 @@
 """Tests that turn payloads into commands: the table of verbs, the words of each refusal, and random bytes."""
 
 import json
+import math
 import time
+from dataclasses import dataclass, fields
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.bus import requests
 from gateway.bus.requests import BadRequest, ParsedRequest, parse
 from gateway.control.commands import (
+    PLAIN_ACTIONS,
     Action,
     ChangeSpeed,
     Command,
@@ -17,6 +21,7 @@ from gateway.control.commands import (
     EmergencyStop,
     Fan,
     Find,
+    FrameAction,
     OneShot,
     Reason,
     Resume,
@@ -26,7 +31,7 @@ from gateway.control.commands import (
 )
 from gateway.control.people import Sender, SenderKind
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
-from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
+from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, Ptz
 from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
@@ -109,6 +114,32 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
 def test_every_verb_of_the_table_is_known_here() -> None:
     for verb in COMMANDS:
         assert (verb, parsed(ParsedRequest(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
+    assert sorted([*requests._WHAT, *PLAIN_ACTIONS, "drive"]) == sorted(COMMANDS), "each verb once"
+
+
+def test_the_fields_of_a_plain_action_are_flags_and_durations() -> None:
+    found = {field.name: field.type for action in PLAIN_ACTIONS.values() for field in fields(action)}
+    assert all(each is bool for name, each in found.items() if name != "duration_s")
+
+
+@dataclass(frozen=True)
+class Horn(FrameAction):
+    """A verb with a duration, made from `lend`, whose message has one."""
+
+    duration_s: float
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return (General(Motion.STOP, whistle=True),) * math.ceil(self.duration_s)
+
+
+def test_a_plain_action_with_a_duration_has_the_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(requests._WHAT, "lend")
+    monkeypatch.setattr(requests, "PLAIN_ACTIONS", {**PLAIN_ACTIONS, "lend": Horn})
+    assert ask("lend", {"duration_s": 86_400}).what == Horn(86_400.0)
+    for wrong in (86_401, 0, -1, "NaN", "Infinity"):
+        assert "duration_s" in refused("lend", {"duration_s": wrong}).words
+    assert "duration_s 0: allowed are more than 0" in refused("lend", {}).words
 
 
 @pytest.mark.parametrize(
