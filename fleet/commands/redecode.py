@@ -40,7 +40,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
     """
     from fleet.recording.reading.session import NoSession
     from fleet.replay.analysis.redecode import NoPlatform
-    from fleet.replay.analysis.test_vector import ENDING, BadVector
+    from fleet.replay.analysis.vector_file import ENDING, BadVector
     from gateway.protocol.platforms import parse_platform
 
     if platform is not None:
@@ -83,7 +83,7 @@ class _RedecodeReport:
 
     def of_vector(self) -> None:
         """Read frames from a vector. Raises BadVector, OSError."""
-        from fleet.replay.analysis.test_vector import read
+        from fleet.replay.analysis.vector_file import read
 
         car, items = read(self._path)
         self._items = ((car, item) for item in items)
@@ -202,11 +202,11 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
     from fleet.commands.sessions import part_of
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session as overview
-    from fleet.replay.analysis import test_vector as vectors
+    from fleet.replay.analysis import vector_file
     from fleet.replay.analysis.recorded_frames import FRAME_KEYS, Rx, SkippedMessages, of_session
 
-    if out.suffix != vectors.ENDING:
-        raise click.UsageError(f"--out {out}: a vector's name ends in {vectors.ENDING}")
+    if out.suffix != vector_file.ENDING:
+        raise click.UsageError(f"--out {out}: a vector's name ends in {vector_file.ENDING}")
     try:
         found = Session(session)
         part = part_of(found, start, end, (car,))
@@ -214,10 +214,10 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
     except NoSession as error:
         raise click.ClickException(str(error)) from None
     expressions = [f"*/{car}/{key.split('/', 2)[2]}" for key in FRAME_KEYS]
-    before_ns = None if part.start_ns is None else part.start_ns - vectors.BEFORE_NS
-    after_ns = None if part.end_ns is None else part.end_ns + vectors.BEFORE_NS
+    before_ns = None if part.start_ns is None else part.start_ns - vector_file.BEFORE_NS
+    after_ns = None if part.end_ns is None else part.end_ns + vector_file.BEFORE_NS
     recorded = of_session(found.messages(expressions, before_ns, after_ns), SkippedMessages())
-    items = [*vectors.stretch((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
+    items = [*vector_file.select_range((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
     frames = sum(isinstance(item, Rx) for item in items)
     if not frames:
         raise click.ClickException(f"{session} holds no raw frames of {car} there: a vector would be empty")
@@ -225,7 +225,9 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         with out.open("x", encoding="utf-8") as file:
             file.writelines(
                 f"{line}\n"
-                for line in vectors.lines(items, part.start_ns or about.start_ns, car, source or f"{found.name}, {car}")
+                for line in vector_file.lines(
+                    items, part.start_ns or about.start_ns, car, source or f"{found.name}, {car}"
+                )
             )
     except FileExistsError:
         raise click.UsageError(f"--out {out}: is there already: name a new file") from None
@@ -233,4 +235,4 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
     click.echo(f"{out}: {frames} frames")
     if found.damage:
-        click.echo(f"what is whole was taken: {found.damage_words}", err=True)
+        click.echo(f"the session is damaged; only its readable part was used: {found.damage_words}", err=True)

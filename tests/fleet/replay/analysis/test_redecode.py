@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
 from fleet.cli import cli
-from fleet.replay.analysis import test_vector
+from fleet.replay.analysis import vector_file
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
 from gateway.protocol.enums import Mode
@@ -36,7 +36,7 @@ def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[Read
 
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
 def test_a_recorded_vector_has_no_difference(path: Path) -> None:
-    _, items = test_vector.read(path)
+    _, items = vector_file.read(path)
     found, one = redecoded(items)
     assert found == []
     assert one.counts.frames >= 3
@@ -50,7 +50,7 @@ def test_there_are_vectors() -> None:
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
 def test_every_field_of_a_vector_counts(path: Path) -> None:
     """Any change in the readings of a recorded frame is found and named."""
-    _, items = test_vector.read(path)
+    _, items = vector_file.read(path)
     frames = [number for number, item in enumerate(items) if isinstance(item, Rx) and item.readings]
     changed = 0
     for number in {frames[0], frames[-1]}:

@@ -1,11 +1,11 @@
-"""A stretch of one car's wire as a file: raw frames with their times, and what they are to be decoded to.
+"""Test vector files: the raw frames of one car for some time, and the readings that a decoder must make of them.
 
-A text file of JSON objects, one a line. The first says where it is from; the others are what happened, in order, each
-with `at_us`, microseconds since the stretch began (before it below 0, for what was known then):
+A text file with one JSON object per line. The first line names the source. Each other line is an item with `at_us`,
+microseconds since the beginning. Items from before the beginning have a time below 0:
 
     {"format": 1, "source": "...", "car": "red", "began": "2026-03-14T15:16:17.000Z"}
-    {"at_us": -400000, "platform": "arduino"}      what the car was treated as from now on
-    {"at_us": -20000, "mode": "tracking"}          the mode that was confirmed from now on; null: none
+    {"at_us": -400000, "platform": "arduino"}      the platform of the car from now on
+    {"at_us": -20000, "mode": "tracking"}          the confirmed mode from now on; null: none
     {"at_us": 1200, "tx": "$1,0,0,0,0,0,0,0,0#"}   bytes to the car, each a character of ISO 8859-1
     {"at_us": 51000, "rx": "$4WD,...#", "verdict": "sensors", "readings": {"sensor/line": {"left_outer": false, ...}}}
 """
@@ -23,36 +23,36 @@ from gateway.protocol.enums import Mode
 ENDING: Final = ".jsonl"
 FORMAT: Final = 1
 BEFORE_NS: Final = 3_000_000_000
-"""Time before the stretch in which to look for the states at its beginning. Gateways publish them once a second."""
+"""Time before a vector in which to look for the states at its beginning. Gateways publish them once a second."""
 _ESTIMATED: Final = frozenset({"charge", "charge_error", "level"})
-"""Fields that the gateway adds to what was decoded."""
+"""Fields that the gateway adds to the decoded ones."""
 
 
 class BadVector(Exception):
-    """A file that is no vector; the text says where and why."""
+    """A file that is no vector. The message names the file, the line and the fault."""
 
 
-def stretch(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
-    """Yield the frames of a time range, after what was known at its start.
+def select_range(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
+    """Yield the known mode and platform at the start of a time range, then its frames.
 
     The items are in order and begin `BEFORE_NS` before the range.
     """
     known: dict[type, Item] = {}
-    begun = False
+    is_inside = False
     for item in items:
         if end_ns is not None and item.at_ns >= end_ns and isinstance(item, Rx | Tx):
-            continue  # the states after it are wanted
+            continue  # states are published later than the frames that they are about
         if item.at_ns < start_ns:
             if isinstance(item, Tx) and item.at_ns >= start_ns - ECHO_S * 1e9:
                 yield item
             elif isinstance(item, KnownMode | KnownPlatform):
                 known[type(item)] = item
             continue
-        if not begun:
-            begun = True
+        if not is_inside:
+            is_inside = True
             yield from known.values()
         yield item
-    if not begun:
+    if not is_inside:
         yield from known.values()
 
 
@@ -62,15 +62,15 @@ def lines(items: Iterable[Item], start_ns: int, car: str, source: str) -> Iterat
     yield json.dumps(head)
     before: dict[type, Any] = {}
     for item in sorted(items, key=lambda item: item.at_ns):
-        told = _told(item)
+        content = _as_json(item)
         if isinstance(item, KnownMode | KnownPlatform):
-            if before.get(type(item)) == told:
-                continue  # said once a second; only a change matters
-            before[type(item)] = told
-        yield json.dumps({"at_us": (item.at_ns - start_ns) // 1000, **told})
+            if before.get(type(item)) == content:
+                continue  # published once a second; only a change matters
+            before[type(item)] = content
+        yield json.dumps({"at_us": (item.at_ns - start_ns) // 1000, **content})
 
 
-def _told(item: Item) -> dict[str, Any]:
+def _as_json(item: Item) -> dict[str, Any]:
     match item:
         case KnownPlatform():
             return {"platform": item.platform}
@@ -83,12 +83,12 @@ def _told(item: Item) -> dict[str, Any]:
                 topic: {name: value for name, value in fields.items() if name not in _ESTIMATED}
                 for topic, fields in item.readings.items()
             }
-            told = {"rx": item.data.decode("latin-1"), "verdict": item.verdict, "readings": readings}
-            return told if set(item.published) == set(readings) else {**told, "published": list(item.published)}
+            content = {"rx": item.data.decode("latin-1"), "verdict": item.verdict, "readings": readings}
+            return content if set(item.published) == set(readings) else {**content, "published": list(item.published)}
 
 
 def read(path: Path) -> tuple[str, list[Item]]:
-    """Return the car of a vector and its items; raises BadVector and OSError."""
+    """Return the car and the items of a vector. Raises BadVector and OSError."""
     objects = []
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
@@ -111,17 +111,17 @@ def read(path: Path) -> tuple[str, list[Item]]:
     return head["car"], items
 
 
-def _item(told: Mapping[str, Any]) -> Item:
-    at_ns = int(told["at_us"]) * 1000
-    if "platform" in told:
-        return KnownPlatform(at_ns, str(told["platform"]))
-    if "mode" in told:
-        return KnownMode(at_ns, None if told["mode"] is None else Mode(told["mode"]))
-    if "tx" in told:
-        return Tx(at_ns, told["tx"].encode("latin-1"))
+def _item(content: Mapping[str, Any]) -> Item:
+    at_ns = int(content["at_us"]) * 1000
+    if "platform" in content:
+        return KnownPlatform(at_ns, str(content["platform"]))
+    if "mode" in content:
+        return KnownMode(at_ns, None if content["mode"] is None else Mode(content["mode"]))
+    if "tx" in content:
+        return Tx(at_ns, content["tx"].encode("latin-1"))
     readings = {
         topic: {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
-        for topic, fields in told["readings"].items()
+        for topic, fields in content["readings"].items()
     }
-    published = tuple(told.get("published", readings))
-    return Rx(at_ns, told["rx"].encode("latin-1"), str(told["verdict"]), published, readings)
+    published = tuple(content.get("published", readings))
+    return Rx(at_ns, content["rx"].encode("latin-1"), str(content["verdict"]), published, readings)
