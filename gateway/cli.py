@@ -128,7 +128,7 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--state-dir",
         metavar="DIR",
-        help="where e-stops and holds of each bus are kept (default: FLEET_STATE_DIR, or the user's)",
+        help="directory for the e-stops and holds of each bus (default: FLEET_STATE_DIR, or the user's)",
     )
     run.add_argument(
         "--person",

@@ -89,7 +89,7 @@ class _Checks:
         self._done: set[Path] = set()
 
     def recognize(self, file: Path) -> FileKind | None:
-        """Return the kind of a file. None if it cannot be read, which is an error of it."""
+        """Return the kind of a file. If it cannot be read, add an error and return None."""
         try:
             text = read_text(file)
         except BadFile as error:
@@ -176,7 +176,7 @@ class _Checks:
 
 
 def recognize(text: str) -> FileKind:
-    """Return the kind of a file by its fields. A file of none is taken for a fleet file, whose errors then tell."""
+    """Return the kind of a file by its fields. Any other file counts as a fleet file, so that its errors are of one."""
     try:
         found: Any = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError):  # not a date, nested too deep: parsing names the place

@@ -1,4 +1,4 @@
-"""`fleet doctor`: what an engineer needs to know of a car or a session that is odd, and the likely cause."""
+"""`fleet doctor`: shows the state of an odd car or session to an engineer, and names the likely cause."""
 
 import json
 from collections.abc import Iterable, Sequence

@@ -241,7 +241,9 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
                 click.echo(json_text(reading) if as_json else line(reading))
                 if readings.dropped > reported:
                     reported = readings.dropped
-                    click.echo(f"fleet: {reported} readings dropped so far: what reads this is too slow", err=True)
+                    click.echo(
+                        f"fleet: {reported} readings dropped so far: the reader of this output is too slow", err=True
+                    )
                 shown += 1
                 if shown == count:
                     return

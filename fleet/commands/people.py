@@ -1,4 +1,4 @@
-"""`fleet pause, unpause, lend`: what a lead does with the cars of all."""
+"""`fleet pause, unpause, lend`: a lead's commands for the cars of all people."""
 
 import click
 

@@ -192,9 +192,9 @@ class _ReplanReport:
         click.echo(f"{self._session.path}: {self._decisions} decisions from {times}: {found}")
         click.echo(f"the same decisions came at most {late_s:.2f} s apart", err=True)
         if partly:
-            click.echo("a coordinator began before the recording: what it knew then is not in it", err=True)
+            click.echo("a coordinator began before the recording, which lacks its earlier knowledge", err=True)
         if self._session.damage:
-            click.echo(f"what is whole was taken: {self._session.damage_words}", err=True)
+            click.echo(f"only the intact part was used: {self._session.damage_words}", err=True)
 
 
 def _describe(each: "DecisionDifference", origin_ns: int) -> str:

@@ -86,7 +86,7 @@ def play(
             first_ns = begin_ns if offset is None else _time("--offset", offset, begin_ns, end_ns)
             if not begin_ns <= first_ns < max(end_ns, begin_ns + 1):
                 length = time_spec.words((end_ns - begin_ns) / 1e9)
-                raise click.UsageError(f"--offset {offset} is not within what is played, which is {length} long")
+                raise click.UsageError(f"--offset {offset} is outside the selected part, which is {length} long")
             gap_ns = None if skip_gaps_s is None else round(skip_gaps_s * 1e9)
             fleets = _fleets(found, about)
             name = keys.check_name(name or f"{fleets[0]}-replay", "fleet name (--as)")
@@ -138,7 +138,7 @@ def play(
         if count:
             click.echo(f"{count} {note}", err=True)
     if found.damage:
-        click.echo(f"what is whole was published: {found.damage_words}", err=True)
+        click.echo(f"only the intact part was published: {found.damage_words}", err=True)
 
 
 def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:

@@ -148,7 +148,7 @@ class _RedecodeReport:
             if count:
                 click.echo(f"{count} {words}", err=True)
         if damage:
-            click.echo(f"what is whole was decoded: {damage}", err=True)
+            click.echo(f"only the intact part was decoded: {damage}", err=True)
 
 
 def _line(each: "ReadingDifference", start_ns: int) -> str:
@@ -235,4 +235,4 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
     click.echo(f"{out}: {frames} frames")
     if found.damage:
-        click.echo(f"the session is damaged; only its readable part was used: {found.damage_words}", err=True)
+        click.echo(f"only the intact part was used: {found.damage_words}", err=True)

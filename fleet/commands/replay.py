@@ -58,7 +58,7 @@ def replay(
             if found.damage:
                 # Copy the undamaged messages first: Rerun's own reader would also show chunks with a wrong checksum.
                 whole = _rescue(found, Path(scratch) / f"{found.name}.mcap")
-                click.echo(f"{found.damage_words}; showing what is whole", err=True)
+                click.echo(f"{found.damage_words}; showing only the intact part", err=True)
                 found = whole
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
             _export(found, out, part, cars)
@@ -97,7 +97,7 @@ def _rescue(session: "Session", out: Path) -> "Session":
         return session.rescue(out)
     except OSError as error:
         raise click.ClickException(
-            f"what is whole of {session.path} cannot be copied to {out.parent}: {error.strerror}; "
+            f"the intact part of {session.path} cannot be copied to {out.parent}: {error.strerror}; "
             "set TMPDIR to a directory with room"
         ) from None
 

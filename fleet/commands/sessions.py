@@ -307,4 +307,4 @@ def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
         if found.damage:
-            click.echo(f"what is whole was exported: {found.damage_words}", err=True)
+            click.echo(f"only the intact part was exported: {found.damage_words}", err=True)

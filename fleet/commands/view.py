@@ -89,7 +89,7 @@ def _follow(
                 pause = VIEW_INTERVAL_S
         finally:
             live.close(send=viewer is None or viewer.ended is None)
-        lost = f"; {live.dropped} were left out, the viewer was too slow" if live.dropped else ""
+        lost = f"; {live.dropped} were dropped because the viewer was too slow" if live.dropped else ""
         words = f"{save}: " if save is not None else ""
         click.echo(f"{words}{live.sent} messages of {len(live.cars)} cars{lost}", err=save is None)
 

@@ -17,7 +17,7 @@ TREND_WINDOW_S: Final = 240.0
 """Time over which the trend of a battery is measured."""
 TREND_SAMPLE_INTERVAL_S: Final = 5.0
 _MIN_TREND_S: Final = 30.0
-"""Minimum time before a trend is shown."""
+"""Minimum time of readings for a trend."""
 TREND_STEADY_V: Final = 0.03
 """Maximum change of a steady battery. The readings have steps of 0.01 V."""
 MAX_LEDGER_ENTRIES: Final = 60
@@ -33,7 +33,7 @@ class BatteryTrend:
     _samples: deque[tuple[float, float]] = field(default_factory=deque)
 
     def add(self, voltage_v: float, now: float) -> None:
-        """Add a voltage. Most are left out: a trend needs few."""
+        """Add a voltage. Skip most of them: a trend needs few."""
         if self._samples and now - self._samples[-1][0] < TREND_SAMPLE_INTERVAL_S:
             return
         self._samples.append((now, voltage_v))

@@ -39,7 +39,7 @@ class FrameLog:
 
 
 def describe_gateway(link: Any, health: Any, safety: Any, mode: Any) -> list[tuple[str, str]]:
-    """Return what a gateway knows of its car and link, as names and texts. A message that is None is left out."""
+    """Return what a gateway knows of its car and link, as names and texts. None stands for no message."""
     rows: list[tuple[str, str]] = []
     if link is not None:
         rows += [(name, str(getattr(link, name))) for name in _COUNTS]

@@ -40,7 +40,7 @@ class PageLink:
         self._not_empty.set()
 
     def show(self, kind: str, text: str) -> None:
-        """Set the newest message of a kind (`tick`, `state`). An unsent older one is left out."""
+        """Set the newest message of a kind (`tick`, `state`). It replaces an older one that was not sent yet."""
         self._newest[kind] = text
         self._not_empty.set()
 

@@ -1,4 +1,4 @@
-"""What a person may do with a car, and why not: the gateway's rules again, so that a page says them before. Pure.
+"""The rights of a person on a car, with the reasons: the gateway's rules again, so that a page shows them. Pure.
 
 The gateway decides (`gateway.control.arbiter`). A test compares both in one table.
 """
@@ -36,7 +36,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class CarRules:
-    """What decides who may do what with a car, from its `state/safety`."""
+    """The facts that decide about rights on a car, from its `state/safety`."""
 
     car: str
     listed: bool = False

@@ -1,4 +1,4 @@
-"""What the plan page shows: the plan in force, who has which role, and why. Pure."""
+"""The content of the plan page: the plan in force, the role of each car, and the reasons. Pure."""
 
 from typing import Any
 

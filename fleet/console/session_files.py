@@ -1,4 +1,4 @@
-"""The sessions folder as the pages see it: which names are sessions, and a session as a stream of bytes."""
+"""The sessions folder for the pages: the names that are sessions, and a session as a stream of bytes."""
 
 import zipfile
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 class _Pipe:
-    """A file that keeps what is written until it is taken. It cannot seek, so the archive needs no memory."""
+    """A buffer of written bytes for a stream. It cannot seek, so an archive is never in memory as a whole."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

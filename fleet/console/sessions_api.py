@@ -1,4 +1,4 @@
-"""What the pages do with recordings: the recorder, the list of sessions, verify, download, export, and Rerun.
+"""Requests of the pages about recordings: the recorder, the list of sessions, verify, download, export, and Rerun.
 
 The work runs in processes of its own with a low priority: a session of gigabytes must not delay a STOP.
 """
@@ -166,7 +166,7 @@ class SessionsApi:
     async def _download_export(self, request: Request) -> Response:
         out = self._exports.get(request.path_params["name"])
         if out is None:
-            return refuse("this export is gone: make it again", 404)
+            return refuse("this export was deleted. Export the session again.", 404)
         return _stream(zip_files(files_of(out), out.name), f"{out.name}.zip")
 
     async def _view(self, request: Request) -> Response:

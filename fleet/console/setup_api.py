@@ -1,4 +1,4 @@
-"""What the pages do to set a fleet up: scan, let a car blink, write its link into the fleet file.
+"""Requests of the pages to set up a fleet: scan, let a car blink, write its link into the fleet file.
 
 Only pages of this computer may do it. A file is never replaced: links are inserted, and all else stays as it is.
 """

@@ -502,7 +502,7 @@ def _plan_command(query: zenoh.Query) -> tuple[str, str]:
 
 
 def _sender(query: zenoh.Query, message_type: str) -> str:
-    """Return the sender of a command, whose payload may be left out. Raises BadPayload."""
+    """Return the sender of a command with or without a payload. Raises BadPayload."""
     payload, encoding = _payload(query)
     command: Any = messages.parse(message_type, payload, encoding) if payload else None
     return str(command.sender if command is not None else "") or _ANONYMOUS

@@ -87,7 +87,7 @@ def check_device(path: str) -> tuple[bool, str]:
     except OSError as error:
         if error.errno == errno.ENOENT:
             return False, "there is no such device: plug the car in, switch it on, or bind it again (fleet bind)"
-        return False, f"cannot be looked at: {error.strerror}"
+        return False, f"cannot be checked: {error.strerror}"
     if not stat.S_ISCHR(file_stat.st_mode):
         return False, "is no serial port but a file or directory"
     if not os.access(path, os.R_OK | os.W_OK):

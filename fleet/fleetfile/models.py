@@ -164,7 +164,7 @@ class CarEntry(CommonEntry):
 
 
 class PersonEntry(Entry):
-    """What a person may do. Everyone may watch, stop and emergency-stop every car."""
+    """The rights of a person. Everyone may watch, stop and emergency-stop every car."""
 
     rank: PersonRank = Field(
         default=PersonRank.PERSON, description="lead: drives every car, outranks all others, pauses and lends"

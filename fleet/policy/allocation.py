@@ -15,7 +15,7 @@ from fleet.policy.plan.plan import Plan, Role
 from fleet.policy.snapshot import CONTRADICTED, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 
 REFUSED_MODE_RETRY_S: Final = 10.0
-"""Interval before a car is asked again for a mode that it refused."""
+"""Delay before the next request of a mode that a car refused."""
 _REFUSALS: Final = frozenset({"battery_low", "unsupported", "link_down", "write_failed"})
 """Reasons that lie with the car. Holds and leases are known from its states."""
 _STAND_IN: Final = "/"
@@ -119,7 +119,7 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
     ):
         return Barrier(
             f"it refused mode {refused.mode}: {refused.reason}: {refused.words}",
-            "it accepts the mode when it is asked again, after 10 s",
+            "it accepts the mode at the next request, after 10 s",
         )
     return None
 

@@ -241,7 +241,7 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
     if not known.present:
         return Barrier(f"{car} is not on the bus", "its gateway comes up"), False
     if not known.mode:  # nor is it known whether there is a hold
-        return Barrier(f"{car} has not said yet how it is", "its gateway publishes its first states"), False
+        return Barrier(f"{car} has published no state yet", "its gateway publishes its first states"), False
     if known.estopped_by is not None:
         return Barrier(
             f"{car} is e-stopped by {known.estopped_by}", f"a person or script ends it (`fleet resume {car} --estops`)"

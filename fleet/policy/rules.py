@@ -1,4 +1,4 @@
-"""Follows rules and phases: which rules are in force, which car triggered each, which phase it is. Pure; times in s."""
+"""Follows rules and phases: the rules in force, the car that triggered each, and the phase. Pure; times in s."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -40,13 +40,13 @@ def sessions_in(place: Path) -> Iterator[Path]:
 
 
 def newest_first(place: Path) -> list[Path]:
-    """Return the recorded sessions of a directory, the one that was begun last first."""
+    """Return the recorded sessions of a directory, newest first."""
     found = [(info, each) for each in sessions_in(place) if not ((info := SessionInfo.read(each)) and info.origin)]
     return [path for _, path in sorted(found, key=lambda each: _begun(*each), reverse=True)]
 
 
 def _begun(info: SessionInfo | None, path: Path) -> tuple[str, float]:
-    """Return when a session was begun: by its description, by its name, or by the time of its last change."""
+    """Return the start of a session: by its description, by its name, or by the time of its last change."""
     changed = path.stat().st_mtime
     if info is not None and info.started:
         return re.sub(r"[-:]|\.\d+", "", info.started), changed

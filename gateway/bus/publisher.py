@@ -50,7 +50,7 @@ _CLASSES: Final[dict[str, Any]] = {
 }
 """Message classes by topic. Each message is a new object: a cleared one would keep its old memory."""
 _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
-"""Phases at the arrival of a command, for which `took_s` is left out."""
+"""Phases at the arrival of a command. They have no `took_s`."""
 _FOXGLOVE_LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 

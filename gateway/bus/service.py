@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FAMILIES: Final = ("sensor", "state")
 MAX_QUEUED_DRIVES: Final = 32
-"""Maximum waiting drives of streams; the newest are kept. Few, so that a stop never waits long behind them."""
+"""Maximum waiting drives of streams. Older ones are dropped. Few, so that a stop never waits long behind them."""
 MAX_QUEUED_QUERIES: Final = 128
 """Maximum waiting command queries."""
 MAX_QUEUED_STOPS: Final = 128

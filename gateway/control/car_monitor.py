@@ -20,7 +20,7 @@ from gateway.protocol.platforms import StopStyle
 from gateway.protocol.sensors import Sensors
 
 STALL_S: Final = 0.5
-"""Maximum gap of the loop while a motion is held. After a longer one it stops the car
+"""Maximum gap of the loop during a held motion. After a longer one it stops the car
 (docs/explanation/how-it-works.md#processes-and-threads)."""
 STALE_TIMES_S: Final = 0.5
 """Maximum gap of the loop. After a longer one report times do not count: a normal gap may look like a pause."""

@@ -36,7 +36,7 @@ class Sender:
 
 
 class PersonRole(StrEnum):
-    """What a person is to this car."""
+    """The role of a person for this car."""
 
     DRIVER = "driver"
     LEAD = "lead"

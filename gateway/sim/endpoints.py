@@ -77,7 +77,7 @@ class SimEndpoint(Protocol):
         """Read unless the link is held or stuck."""
 
     def rename(self, path: str | None) -> None:
-        """Become another device at the next `up`, at another path if one is given; raise EndpointError."""
+        """Become another device at the next `up`, at `path` if not None. Raises EndpointError."""
 
     async def close(self) -> None:
         """Close the link for good and remove its traces."""

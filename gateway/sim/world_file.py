@@ -110,7 +110,7 @@ class _WorldParser:
             path = (*path, *path[-2:0:-1])
         for other in ("x_m", "y_m", "carried_by"):
             if {"path", other} <= given:
-                report((*where, other), "is not allowed beside a path, which is where it is")
+                report((*where, other), "is not allowed beside a path: the path gives its place")
         for other in ("speed_m_s", "there_and_back", "waits_for_m"):
             if "path" not in given and other in given:
                 report((*where, other), "is not allowed without a path")

@@ -184,7 +184,7 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
         case ModeClose():
             lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
         case Ptz() | ColorLed() | ArmSet():
-            lines.append("its motors are as they were; in a mode other than 0 it ignores this")
+            lines.append("its motors do not change; in a mode other than 0 it ignores this")
         case Reset():
             lines.append("this ended half a frame in its buffer, which the car may have obeyed")
         case None:

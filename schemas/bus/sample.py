@@ -36,7 +36,7 @@ class Sample:
     """The publisher's sequence number for the key, modulo 2^32. 0 if there is none."""
     deleted: bool = False
     unread: str = ""
-    """Why the payload is left out: it is too large."""
+    """Why there is no payload: it is too large. Empty if there is one."""
 
     def message(self) -> "Message":
         """Parse the payload as the message that the encoding names. Raises messages.BadPayload or KeyError."""

@@ -82,7 +82,7 @@ def _find_self_conflicts(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bo
 
 
 def _asked_for(mode: Mode) -> Expression:
-    """Return the condition that a car was asked for this mode."""
+    """Return the condition that this mode is requested of a car."""
     return Expression(Compare(Name("mode.asked", ValueKind.WORD), Op.EQ, Literal(str(mode))))
 
 

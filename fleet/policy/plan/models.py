@@ -105,7 +105,7 @@ class RoleEntry(Entry):
     if_none: _Name | None = Field(
         None, description="the role that gets a place for each place here that no car can take"
     )
-    given_by: GivenBy = Field(GivenBy.PLAN, description="plan: whoever fits best has it; rules: only a rule gives it")
+    given_by: GivenBy = Field(GivenBy.PLAN, description="plan: the best car has it; rules: only a rule gives it")
 
 
 class PhaseEntry(Entry):
@@ -128,7 +128,7 @@ class PlanEntry(Entry):
         default={}, description="the only role, or the only mode, of a certain car: `blue: {mode: manual}`"
     )
     rules: list[RuleEntry] = Field(
-        default=[], max_length=200, description="what changes while a condition is true; the first counts"
+        default=[], max_length=200, description="changes while a condition is true; the first true one counts"
     )
     phases: dict[_Name, PhaseEntry] = Field(default={}, description="parts of the job, the first one begins")
     without_role: WithoutRole = Field(

@@ -35,7 +35,7 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
     tables, exported = arrow_tables(rows)
     if exported.undecoded:
         warnings.warn(
-            f"{exported.undecoded} messages of {session} do not match their schema and are left out", stacklevel=3
+            f"{exported.undecoded} messages of {session} do not match their schema and were skipped", stacklevel=3
         )
     other = tables.pop(OTHER_TABLE, None)
     if not tables:

@@ -209,7 +209,7 @@ def _state(session: Session, cut: Sequence[Path]) -> tuple[SessionState, str]:
             description.error or "the recorder did not close it: `fleet sessions recover` makes it whole",
         )
     if cut:
-        return SessionState.CUT, f"{cut[0].name} has no end that is whole: `fleet sessions recover` makes it whole"
+        return SessionState.CUT, f"{cut[0].name} has no intact end: `fleet sessions recover` repairs it"
     return SessionState.WHOLE, ""
 
 

@@ -34,7 +34,7 @@ MAX_WAITING_MESSAGES: Final = 50_000
 MAX_PATH_POINTS: Final = 3_000
 """Maximum points of the path of each simulated car: five minutes."""
 DEFAULT_VIEW_S: Final = 120.0
-"""Time span in view, unless all is shown."""
+"""Time span in view. The view can also show all."""
 VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
 _ON_CHANGE_TOPICS: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
 """Topics published only on change, so queried at the start."""

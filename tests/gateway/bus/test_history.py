@@ -98,7 +98,7 @@ def test_the_ring_gives_the_latest_the_last_or_a_range_oldest_first(
 
 @pytest.mark.parametrize("last", ["", "0", "-1", "1.5", "three", "³", "٣", "1_0", " 3", "inf", "0" * 5000])
 def test_a_last_that_is_no_count_is_refused(last: str) -> None:
-    with pytest.raises(BadRange, match=f"whole number from 1 on, at most {HISTORY} are kept"):
+    with pytest.raises(BadRange, match=f"whole number from 1 on. The history has at most {HISTORY} values"):
         filled(3).select(time_range=None, last=last, now_ns=NOW)
 
 
