@@ -234,7 +234,7 @@ def test_a_hub_that_is_killed_is_replaced(fleet: FleetProcesses, session: Path) 
     ("arguments", "words"),
     [
         (("--as", "Not a name"), "fleet name (--as) 'Not a name' is not allowed"),
-        (("--offset", "9h"), "is not within what is played"),
+        (("--offset", "9h"), "is outside the selected part"),
         (("--skip-gaps", "soon"), '--skip-gaps: "soon" is not a duration'),
         (("--skip-gaps", "0s"), "--skip-gaps: 0s is too short: more than 0"),
         (("--save", "x.rrd"), "--save"),
