@@ -323,7 +323,7 @@ def describe_missing(client: Fleet, written: str, what: str) -> str:
     """Describe what is there instead of what a key names: the likely car, its readings, or the connected cars."""
     under = topics_under(written)
     if under and all(topic.family == "sim" for topic in under):
-        return f"{what}; a simulated car's truth has no latest value. Watch it: fleet watch {written.partition('/')[2]}"
+        return f"{what}; a simulated car's truth is only published. Watch it: fleet watch {written.partition('/')[2]}"
     cars = client.cars()
     if not cars:
         return no_cars(client).message

@@ -340,7 +340,7 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     assert done.returncode == 1
     assert done.stderr == 'fleet: No car "purple". Connected: blue, green, red.\n'
     done = run(cars.endpoint, "get", "red/sim/truth")
-    assert done.stderr.endswith("what is true of a simulated car is only published: fleet watch red/sim/truth\n")
+    assert done.stderr.endswith("a simulated car's truth is only published. Watch it: fleet watch red/sim/truth\n")
 
 
 def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
