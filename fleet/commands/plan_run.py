@@ -25,7 +25,7 @@ from schemas.yaml_document.document import read_text
 example:
   fleet plan run plan.yaml
 
-With `fleet up --plan FILE` the plan runs beside the cars: this command is for a coordinator of its own.
+`fleet up --plan FILE` runs a plan too. This command runs a separate coordinator.
 
 \b
 a plan:
@@ -48,7 +48,7 @@ a plan:
     "run_name",
     default="",
     metavar="NAME",
-    help="Phase and rules outlive the coordinator within one run (of fleet up).",
+    help="Name of a run of `fleet up`. Within one run, phase and rules survive a restart of the coordinator.",
 )
 @starter_option()
 @json_option

@@ -138,11 +138,10 @@ class _RedecodeReport:
         found = f"{differences} differences" if differences else "no difference"
         click.echo(f"{self._path}: {frames} frames and {readings} readings of {', '.join(self.counts)}: {found}")
         notes = {
-            "frames could have been several things, of which the recording does not tell one; what was recorded is one "
-            "of them": undecided,
-            "readings were published and are not in the recording (see fleet sessions verify): not compared": absent,
+            "frames have several possible readings; the recorded one is among them": undecided,
+            "published readings are not in the recording (see fleet sessions verify): not compared": absent,
             "readings have no raw frame in the recording: not compared": self._unread.unframed,
-            "messages do not parse as what they say they are: left out": broken,
+            "messages do not match their schema: skipped": broken,
         }
         for words, count in notes.items():
             if count:
@@ -230,7 +229,7 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
                 )
             )
     except FileExistsError:
-        raise click.UsageError(f"--out {out}: is there already: name a new file") from None
+        raise click.UsageError(f"--out {out} exists already. Name a new file.") from None
     except OSError as error:
         raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
     click.echo(f"{out}: {frames} frames")

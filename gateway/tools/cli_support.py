@@ -81,8 +81,8 @@ def warn_before_opening(url: LinkUrl) -> None:
     """Print a warning if opening and closing this link may harm a car."""
     if isinstance(url, TcpUrl):
         print_note(
-            f"{url}: a Raspberry Pi car's program dies when its TCP client goes away, this one included, and its "
-            "motors stay as they were"
+            f"{url}: a Raspberry Pi car's program dies when a TCP client disconnects, this one too. Its motors then "
+            "stay as they are."
         )
 
 
@@ -115,7 +115,7 @@ class Paint:
 
 
 def run_until_interrupted(work: Coroutine[Any, Any, None]) -> None:
-    """Run the work. Treat every termination signal as Ctrl-C: the work cleans up, then raise KeyboardInterrupt."""
+    """Run the work. On a termination signal, let it clean up, then raise KeyboardInterrupt as for Ctrl-C."""
     import asyncio
 
     from schemas.process import signals

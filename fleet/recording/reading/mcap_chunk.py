@@ -96,7 +96,7 @@ class ChunkPart:
             case ValueError() if not isinstance(error, UnicodeError):
                 words = str(error)
             case _:
-                words = "cannot be taken apart"
+                words = "cannot be parsed"
         return Damage(self.at, f"the {named(self.opcode)} there {words}{self.span}")
 
     def _plain(self) -> Chunk:
@@ -113,7 +113,7 @@ class ChunkPart:
         chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(self.body)))
         size = chunk.uncompressed_size
         if size > MAX_RECORD_BYTES:
-            raise ValueError(f"says that it has {size} bytes: no more than {MAX_RECORD_BYTES} are read")
+            raise ValueError(f"says that it has {size} bytes, more than the limit of {MAX_RECORD_BYTES}")
         # Ask for one byte more: detects a larger chunk without decompressing all of it.
         data: bytes
         match chunk.compression:

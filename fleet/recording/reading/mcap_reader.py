@@ -106,7 +106,7 @@ class McapReader:
     def messages(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
         """Yield every intact selected message in the order of the file. At most one chunk is in memory.
 
-        With an intact index only chunks that may contain a selected message are read, without one all chunks.
+        With an intact index, read only chunks that may contain a selected message. Without one, read all chunks.
         """
         self._begin()
         try:
@@ -124,7 +124,7 @@ class McapReader:
                         continue
                     yield from channels.rows(records, part.at, strays)
                 if strays:
-                    words = f"{len(strays)} messages from there on are of channels that were described in what is lost"
+                    words = f"{len(strays)} messages after it belong to channels whose description is lost"
                     self.damage.append(Damage(strays[0], words))
         except OSError as error:
             self._unreadable(error)
@@ -159,7 +159,7 @@ class McapReader:
         if not footer.summary_start or not footer.summary_crc:
             return None, None  # a file of another writer, without an index or without its CRC
         if not len(MAGIC) + _DATA_END_SIZE <= footer.summary_start <= at:
-            self.damage.append(Damage(at, "the footer says that the index is where it cannot be"))
+            self.damage.append(Damage(at, "the footer gives an impossible place of the index"))
             return None, None
         if _checksum(file, footer.summary_start, at + _FOOTER_SIZE - 4) != footer.summary_crc:
             self.damage.append(Damage(footer.summary_start, "the index there fails its checksum"))
@@ -167,7 +167,7 @@ class McapReader:
         try:
             return footer, mcap_index.read(file, footer.summary_start, at)
         except BROKEN:
-            self.damage.append(Damage(footer.summary_start, "the index there cannot be taken apart"))
+            self.damage.append(Damage(footer.summary_start, "the index there cannot be parsed"))
             return None, None
 
     def _parts(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[ChunkPart]:
@@ -197,11 +197,11 @@ class McapReader:
         at, length = chunk.at, chunk.length - HEAD.size
         if length > MAX_RECORD_BYTES:
             self.damage.append(
-                Damage(at, f"the chunk there has {length} bytes: no more than {MAX_RECORD_BYTES} are read")
+                Damage(at, f"the chunk there has {length} bytes, more than the limit of {MAX_RECORD_BYTES}")
             )
             return
         if length < 0 or at + chunk.length > file.seek(0, os.SEEK_END):
-            self.damage.append(Damage(at, "the index says that a chunk is there, where none can be"))
+            self.damage.append(Damage(at, "the index gives an impossible place of a chunk"))
             return
         record = read(file, at, chunk.length)
         if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length):
@@ -213,7 +213,7 @@ class McapReader:
         at = footer.summary_start - _DATA_END_SIZE
         record = read(file, at, _DATA_END_SIZE)
         if HEAD.unpack_from(record) != (Opcode.DATA_END, _DATA_END_SIZE - HEAD.size):
-            self.damage.append(Damage(at, "the end of the messages is damaged, no message is"))
+            self.damage.append(Damage(at, "the end of the data section is damaged; every message is intact"))
             return
         expected = DataEnd.read(ReadDataStream(BytesIO(record[HEAD.size :]))).data_section_crc
         if expected and expected != _checksum(file, 0, at):

@@ -77,7 +77,7 @@ class RecordScanner:
                 chunks = chunks or opcode == Opcode.CHUNK
                 if length > MAX_RECORD_BYTES:
                     self._report(
-                        at, f"the {named(opcode)} there has {length} bytes: no more than {MAX_RECORD_BYTES} are read"
+                        at, f"the {named(opcode)} there has {length} bytes, more than the limit of {MAX_RECORD_BYTES}"
                     )
                 else:
                     yield ChunkPart(at, opcode, read(self._file, at + HEAD.size, length))
