@@ -210,7 +210,7 @@ def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
     try:
         monitor = _live(start, car.link)
         wait_for(lambda: car.connections, "the monitor connects")
-        assert "a Raspberry Pi car's program dies when its TCP client goes away" in monitor.stderr
+        assert "a Raspberry Pi car's program dies when a TCP client disconnects" in monitor.stderr
         car.send(MANUAL)
         _until(monitor, "sensors")
     finally:

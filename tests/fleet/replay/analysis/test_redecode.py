@@ -169,7 +169,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     )
     result = run("sessions", "redecode", unknown, "--platform", "arduino")
     assert result.exit_code == 0
-    assert "1 readings were published and are not in the recording" in result.output
+    assert "1 published readings are not in the recording" in result.output
 
     foreign = tmp_path / "foreign.mcap"
     with foreign.open("wb") as file:
