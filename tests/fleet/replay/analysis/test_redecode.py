@@ -197,5 +197,5 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
         assert words in result.output
     path = tmp_path / "there.jsonl"
     path.touch()
-    assert "is there already" in run("sessions", "vector", unknown, "--car", "red", "--out", path).output
+    assert "exists already" in run("sessions", "vector", unknown, "--car", "red", "--out", path).output
     assert "ends in .jsonl" in run("sessions", "vector", unknown, "--car", "red", "--out", tmp_path / "x.tsv").output
