@@ -29,6 +29,7 @@ from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender, Sender
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import General
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile
 from schemas.suggestion import did_you_mean
 
@@ -45,13 +46,9 @@ class CommandContext:
     now: float
     link_open: bool
     link_reason: str
-    answering: bool
-    """False if the car was silent for too long."""
     closing: bool
     asked: Mode | None
     """The commanded mode, also one that still waits."""
-    contradicted: bool
-    """True if readings or silence contradict the commanded mode."""
     hold: Hold | None
     estops: tuple[Estop, ...]
     ended: tuple[str, ...]
@@ -164,6 +161,11 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
     profile = context.profile
     match what:
         case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
+            if profile.kind is Platform.UNKNOWN:
+                return (
+                    f"the platform of {context.car} is not known, and a mode frame ends the program of some cars. "
+                    f"Name it: `platform:` in the fleet file, or `gateway run --platform`."
+                )
             known = ", ".join(sorted(profile.modes))
             return f"{context.car} ({profile.name}) has no mode {mode}. It has: {known}."
         case ChangeSpeed(step) if (words := _too_fast(step, context)) is not None:
@@ -244,8 +246,8 @@ def _unlisted(sender: Sender, context: CommandContext) -> Refusal:
 def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool:
     """Return True if the sender may end this e-stop.
 
-    A lead's e-stop ends only a lead. An e-stop of this car ends who may drive the car, a fleet-wide one every person of
-    the fleet, so that all gateways decide alike. Everybody ends their own.
+    Only a lead may end a lead's e-stop. Whoever may drive this car may end an e-stop of this car, and every person of
+    the fleet may end a fleet-wide one, so that all gateways decide alike. Everybody may end their own.
     """
     people, person = context.people, sender.person
     if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
@@ -354,7 +356,7 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     if needed.battery and context.battery:
         return Reason.BATTERY_LOW, context.battery
     if needed.link:
-        refusal = _unreachable(context, fan=isinstance(command.what, Fan))
+        refusal = _unreachable(context)
         if refusal is not None:
             return refusal
     if needed.manual and context.asked not in (None, Mode.MANUAL):
@@ -364,24 +366,15 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
             Reason.WRONG_MODE,
             f"{car} ignores {command.verb} commands while in mode {context.asked}. First: {fix}.",
         )
-    if needed.manual and context.contradicted:
-        words = f"{car} may ignore this: its readings do not fit mode {context.asked}. First: `fleet stop {car}`."
-        return Reason.WRONG_MODE, words
     if needed.queue and context.queued >= MAX_QUEUED_COMMANDS:
         return Reason.QUEUE_FULL, f"{car} is busy: {context.queued} commands wait already. Try again in a second."
     return None
 
 
-def _unreachable(context: CommandContext, *, fan: bool) -> Refusal | None:
+def _unreachable(context: CommandContext) -> Refusal | None:
     car = context.car
     if context.closing:
         return Reason.LINK_DOWN, f"the gateway of {car} is shutting down."
     if not context.link_open:
         return Reason.LINK_DOWN, f"{car} is unreachable: {context.link_reason}"
-    if not context.answering and not (
-        fan and context.fan is not False
-    ):  # a running fan may be the cause of the silence
-        checks = "Check: switched on? in range? fan off? `platform:` right?"
-        words = f"{car} is silent: no readings arrive. {checks} `gateway monitor` shows its bytes."
-        return Reason.LINK_DOWN, words
     return None

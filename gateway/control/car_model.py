@@ -7,15 +7,17 @@ from dataclasses import dataclass, field, replace
 
 from gateway.control.command_log import CommandLog
 from gateway.control.estimate.battery import Battery, BatteryPolicy
+from gateway.control.estimate.learned import Learned, Shows
 from gateway.control.estimate.mode import ModeEstimator, Verdict
 from gateway.control.estimate.outputs import StateEstimate
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
 from gateway.control.events import Level
-from gateway.control.pacing import AWAKE_S, FLIGHT_S, Pacing
+from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import stopping
 from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
 
@@ -32,31 +34,35 @@ class CarModel:
     auto: bool
     log: CommandLog
     battery_policy: BatteryPolicy
+    learned: Learned = field(default_factory=Learned)
     platform: PlatformDetector = field(init=False)
     mode: ModeEstimator = field(init=False)
     battery: Battery = field(init=False)
     pacing: Pacing = field(init=False)
     believed: StateEstimate = field(init=False)
-    evidence: StopEvidence = field(default_factory=StopEvidence)
+    evidence: StopEvidence = field(init=False)
     trust: TrustState = field(default_factory=TrustState)
     rest: StopCase = StopCase.SOFT
     """The case of the stop, if the claim of rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
     """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""
+    cut_write: bool = False
+    """True if a write has failed since the last recovery: the car may keep a string that only a color frame clears."""
     link_open: bool = False
     link_reason: str = "not connected yet"
 
     def __post_init__(self) -> None:
         self.platform = PlatformDetector(self.profile, auto=self.auto)
-        self.mode = ModeEstimator(self.profile)
+        self.mode = ModeEstimator(self.profile, self.learned)
+        self.evidence = StopEvidence(self.profile, self.learned)
         self.battery = Battery(self.battery_policy)
-        self.pacing = Pacing(self.profile)
+        self.pacing = Pacing(self.profile, self.learned)
         self.believed = StateEstimate(self.profile)
 
     def treat_as(self, profile: Profile) -> None:
         """Use another platform's profile from now on."""
-        self.profile = self.mode.profile = self.pacing.profile = profile
+        self.profile = self.mode.profile = self.pacing.profile = self.evidence.profile = profile
         self.believed = replace(self.believed, profile=profile)
 
     def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
@@ -89,18 +95,25 @@ class CarModel:
 
     @property
     def can_show(self) -> bool:
-        """Return True if a car of this platform shows a stop."""
-        return self.stop_style is StopStyle.MODE_FRAME
+        """Return True if this car shows a stop, or may: not as its program is known, nor as it was found out."""
+        match self.stop_style:
+            case StopStyle.GENERAL:
+                return False
+            case StopStyle.TIMER:
+                return self.learned.shows is Shows.YES
+            case StopStyle.MODE_FRAME | StopStyle.BOTH:
+                return self.profile.has_readings and self.learned.shows is not Shows.NO
 
     @property
     def is_deaf(self) -> bool:
         """Return True if the car could have shown a stop, and has not reacted to the last one."""
-        return self.can_show and self.evidence.obeyed_at is None and not self.evidence.without_echo
+        shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME
+        return shows and self.evidence.reacted_at is None and not self.evidence.without_echo
 
     @property
     def stop_style(self) -> StopStyle:
         """Return the kind of stop for this car now."""
-        return stopping.style_of(self.profile, doubted=self.platform.doubted)
+        return stopping.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
 
     @property
     def is_heard(self) -> bool:
@@ -130,8 +143,23 @@ class CarModel:
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
         return stopping.StopContext(
-            self.profile, self.known, self.mode.asked, contradicted, clear, blocked, self.platform.doubted
+            self.profile,
+            self.known,
+            self.mode.asked,
+            contradicted,
+            clear,
+            blocked,
+            doubted=self.platform.doubted,
+            open_mode=self.platform.open_mode,
+            clearing=self._clearing,
         )
+
+    @property
+    def _clearing(self) -> ColorLed | None:
+        """Return the color that clears a string which begins with `4WD,`, if there is a reason to suspect one."""
+        suspected = self.cut_write or (self.learned.shows is Shows.YES and self.trust.state is CarTrust.UNPROVEN)
+        color = self.believed.led
+        return color if suspected and self.profile.refusal(color) is None else None
 
     @property
     def ready_at(self) -> float:
@@ -141,7 +169,7 @@ class CarModel:
     def is_awake(self, now: float) -> bool:
         """Return True if the car reads a frame at once, because no block runs, known or unknown."""
         pacing = self.pacing
-        if now <= pacing.reported_at + AWAKE_S and now >= pacing.block_from - FLIGHT_S / 2:
+        if now <= pacing.awake_until and now >= pacing.block_from - FLIGHT_S / 2:
             return True
         if now < pacing.block_until - FLIGHT_S:
             return False

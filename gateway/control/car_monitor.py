@@ -6,13 +6,14 @@ from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog
 from gateway.control.commands import Phase, Reason, SetMode
 from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
-from gateway.control.estimate.mode import MANUAL_SILENCE_S, Verdict
+from gateway.control.estimate.learned import Shows
+from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.events import Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
-from gateway.control.stops.evidence import Finding, StopCase
+from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
 from gateway.protocol.enums import Cause, Mode
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.modes import only_candidate
@@ -39,11 +40,15 @@ class CarMonitor:
         self._stops = executor.stops
         self._log = log
         self._not_obeyed_logged = False
+        self._silent_since: float | None = None
+        """When the last reading before a silence arrived that was dealt with; a command may have come since."""
 
     def link_up(self) -> None:
         """Forget the evidence of the last link."""
         model = self.model
         self._not_obeyed_logged = False
+        self._silent_since = None
+        model.platform.begin_link()
         if model.platform.auto:  # another car may have been plugged in
             model.platform = PlatformDetector(model.platform.configured, auto=True)
             model.treat_as(model.platform.configured)
@@ -69,6 +74,8 @@ class CarMonitor:
         if model.trust.state is CarTrust.UNHEARD:
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
+        if model.evidence.found_out:
+            self._log_found_out(now)
         if only_candidate(event) is Mode.MANUAL:
             self._on_report(event, now)
         self._log_delivery(finding, now)
@@ -83,39 +90,56 @@ class CarMonitor:
             model.pacing.on_report(event.at)
         if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
             self._update_battery(event.voltage_v, now)
-        if now > model.believed.fan_at + FAN_SETTLED_S and model.profile.stop_style is not StopStyle.RASPBERRY_PI:
+        if now > model.believed.fan_at + FAN_SETTLED_S and model.profile.fan_silences:
             model.believed.fan = False  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
 
     def _log_delivery(self, finding: Finding, now: float) -> None:
-        """Log once that frames do not arrive, and once that they arrive again."""
+        """Log once that a car which has shown its stops did not get one, and once that it gets them again."""
         name = self.model.name
-        if finding is Finding.LOST and self.model.stop_style is not StopStyle.UNKNOWN:
+        if finding is Finding.LOST and self.model.learned.shows is Shows.YES:
             self.lost_frames += 1
             if not self._not_obeyed_logged:
                 self._not_obeyed_logged = True
-                self._log.log(Level.WARNING, "not_obeyed", self._not_obeyed(), now)
+                words = f"{name} did not get a stop: it does not react as before, while readings arrive."
+                self._log.log(Level.WARNING, "not_obeyed", f"{words} The gateway stops it again.", now)
         elif finding in (Finding.SHOWN, Finding.SETTLING) and self._not_obeyed_logged:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
-    def _not_obeyed(self) -> str:
-        """Return what it means that a stop did not arrive, and where to look."""
-        name = self.model.name
-        if self.model.evidence.obeyed_at is None:
-            return (
-                f"{name} does not react to commands (readings arrive, stops do not work). "
-                f"Check the wire to its RX pin. Until this clears, `fleet stop` cannot stop {name}."
-            )
-        return f"{name} did not get a stop: its link loses commands, while readings arrive. The gateway stops it again."
+    def _log_found_out(self, now: float) -> None:
+        """Log what the readings have shown about the car itself."""
+        name, learned = self.model.name, self.model.learned
+        if learned.shows is Shows.NO:
+            words = EVIDENCE[StopCase.NO_REACTION].words.format(car=name)
+            self._log.log(Level.INFO, "cannot_show", f"{words}. It can be used like any other car.", now)
+        else:
+            words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
+            self._log.log(Level.WARNING, "rhythm_changed", f"{words} What it showed before is forgotten.", now)
 
     def _apply_platform(self, now: float) -> None:
-        """Use the profile of the detected platform, but never during a stop: each stop is for one platform."""
+        """Use the profile of the detected platform.
+
+        Not during the first frames of a stop: each stop is for one platform. But if the readings show an open mode, at
+        once: general stops do not end it.
+        """
         model = self.model
-        if model.platform.profile is model.profile or not model.known or self._stops.running is not None:
+        if model.platform.profile is model.profile or not model.link_open:
+            return
+        may_replace = model.platform.open_mode and model.stop_style is StopStyle.BOTH
+        if not may_replace and not self._executor.accepts_commands(now):
             return
         model.treat_as(model.platform.profile)
         words = f"{model.name} is a {model.profile.name} car: {model.platform.evidence[0]}"
         self._log.log(Level.INFO, "platform_settled", words, now)
+        if model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
+            self._stops.recover(now, words)  # it can show its stop, and half a named frame may lie in its buffer
+
+    @property
+    def _is_idle(self) -> bool:
+        """Return True if nothing that a command began goes on."""
+        queue = self._executor.queue
+        waits = queue.held is not None or queue.mode_change is not None or bool(queue.one_shots)
+        return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
 
     def _update_battery(self, voltage_v: float, now: float) -> None:
         """Log a change of the battery level, and stop the car if the policy requires it."""
@@ -152,8 +176,9 @@ class CarMonitor:
         if model.trust.state is CarTrust.UNHEARD or limit_s is None:
             return
         silent_s = model.mode.unheard_s(now)
-        if silent_s <= MANUAL_SILENCE_S:
+        if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
             return
+        self._silent_since = model.mode.heard_at
         words = (
             f"{model.name} may be moving: no reading for {silent_s:.1f} s. Is it on, in range, its fan off? "
             "The gateway keeps stopping it."

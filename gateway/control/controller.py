@@ -132,6 +132,7 @@ class Controller:
 
     def on_write_failed(self, reason: str, now: float) -> None:
         """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
+        self.model.cut_write = True
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
     def poll(self, now: float) -> OutgoingFrame | None:
@@ -334,6 +335,8 @@ class Controller:
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
         """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
         sender, safety = pending.command.sender, self.safety
+        if not resume.ids and self.model.learned.doubted:  # a person says that the car is fine
+            self.model.learned.forget_reactions()
         named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
         mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self._context(now))]
         if ended := safety.end(each.id for each in mine if each.id in named):
@@ -548,8 +551,13 @@ class Controller:
         return Answer(Phase.SENT, reason, words)
 
     def _queued(self, pending: Pending, now: float) -> Answer:
-        self._log.record(pending, Phase.QUEUED, now)
-        return Answer(Phase.QUEUED)
+        words = "" if self.model.is_heard else self._silent(now)
+        self._log.record(pending, Phase.QUEUED, now, words=words)
+        return Answer(Phase.QUEUED, words=words)
+
+    def _silent(self, now: float) -> str:
+        silent_s = self.model.mode.unheard_s(now)
+        return f"{self.car} has been silent for {silent_s:.0f} s: nothing shows that it hears this"
 
     def _reject(self, pending: Pending, reason: Reason, words: str, now: float) -> Answer:
         self._log.record_rejection(pending, reason, words, now)
@@ -568,10 +576,8 @@ class Controller:
             now=now,
             link_open=self.model.link_open,
             link_reason=self.model.link_reason,
-            answering=self.model.is_heard,
             closing=self.stops.shutting_down,
             asked=self.asked,
-            contradicted=self.model.mode.verdict is Verdict.CONTRADICTED,
             hold=self.safety.hold,
             estops=self.safety.estops,
             ended=self.safety.ended,

@@ -8,15 +8,16 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
-from gateway.control.commands import Fan, Phase, Reason, SetMode
-from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent
+from gateway.control.commands import Phase, Reason, SetMode
+from gateway.control.estimate.learned import blocking_kind
+from gateway.control.estimate.trust import Basis, TrustEvent
 from gateway.control.events import FrameOrigin, OutgoingFrame
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.control.stop_executor import StopExecutor
 from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.control.stops.sequences import STOP_FRAME, StopSequence
+from gateway.control.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen, encode
@@ -67,13 +68,19 @@ class Executor:
 
     # ------------------------------------------------------------------ frames out
 
-    @property
-    def accepts_commands(self) -> bool:
-        """Return True if the car's state allows frames that are no stop."""
-        state = self.model.trust.state
-        if state is CarTrust.STOPPING:
-            return self.stops.running is None  # a drive took the place of a soft stop
-        return state in (CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.UNPROVEN)
+    def accepts_commands(self, now: float) -> bool:
+        """Return True if a command's frame may be written: no stop runs, or a new command may take its place.
+
+        What the car has not shown delays nothing. Only the first frames of a stop do, through their worst case.
+        """
+        running = self.stops.running
+        if running is None:
+            return True
+        if self.stops.shutting_down:
+            return False
+        # Each other frame stops the motors as well as the second frame of a soft stop does.
+        is_soft = running.sequence.rank == SOFT.rank and running.index > 0
+        return is_soft or now >= running.gives_way_at
 
     def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
@@ -87,11 +94,12 @@ class Executor:
             return None
         if running is not None:
             stops.fail_late(running, now)
-            write = self._next_step(running, now)
-            if write is not None or (stops.running is not None and not stops.running.leaves_gap(now)):
+            # A new command goes before the repeats of a stop, but never before its first frames.
+            write = self._next_command(now) if self.accepts_commands(now) else None
+            if write is not None:
                 return write
-        if not self.accepts_commands:
-            return self._toggle_fan(now)
+            running = stops.running
+            return None if running is None else self._next_step(running, now)
         return self._next_command(now)
 
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
@@ -99,32 +107,24 @@ class Executor:
             return None
         return self._write(running.frame, running.why, running, running.commands[0] if running.commands else None)
 
-    def _toggle_fan(self, now: float) -> OutgoingFrame | None:
-        """Send the fan's toggle to a silent car: the fan may be the cause."""
-        one_shots, running = self.queue.one_shots, self.stops.running
-        if (
-            self.model.trust.state is not CarTrust.UNHEARD
-            or not one_shots
-            or not isinstance(one_shots[0].command.what, Fan)
-        ):
-            return None
-        if now < self.model.ready_at or (running is not None and not running.frames_sent):
-            return None
-        return self._write(one_shots[0].frames[0], FrameOrigin.COMMAND, one_shots[0], one_shots[0])
-
     def _next_command(self, now: float) -> OutgoingFrame | None:
         model, queue = self.model, self.queue
         if now < model.ready_at:
             return None
         held = queue.held
-        if held is not None and not held.pending.sent:
+        if held is not None and not held.pending.sent and self._is_new(held.pending):
             self.stops.give_way(now)
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
-        if queue.mode_change is not None and not (queue.one_shots and model.at_rest) and self.stops.running is None:
-            return self._open_mode(queue.mode_change, now)
+        change = queue.mode_change
+        if change is not None and not (queue.one_shots and model.at_rest) and self._is_new(change):
+            return self._open_mode(change, now)
         if queue.one_shots and now >= model.pacing.act_at(queue.one_shots[0].frames[0]):
             pending = queue.one_shots[0]  # queued before the mode, in which the car would ignore it
-            return self._write(model.believed.with_motion(pending.frames[0]), FrameOrigin.COMMAND, pending, pending)
+            if self._is_new(pending):
+                frame = model.believed.with_motion(pending.frames[0])
+                return self._write(frame, FrameOrigin.COMMAND, pending, pending)
+        if self.stops.running is not None:
+            return None
         if model.believed.repeat and now >= model.pacing.repeat_at:
             return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
         return self._renew_stop(now)
@@ -132,11 +132,22 @@ class Executor:
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, but stop the car first: opening a mode while driving leaves the motors on."""
         assert isinstance(pending.command.what, SetMode)
-        if not self.model.rest_is_sure:
-            return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now)
-        if now < self.model.pacing.open_at(now):
+        model, running = self.model, self.stops.running
+        # The full stop before the mode has gone out if it runs and gives way; its evidence would delay the mode.
+        has_stopped = running is not None and running.sequence.rank > SOFT.rank
+        if not (model.rest_is_sure or has_stopped):
+            return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now, pending)
+        if now < model.pacing.open_at(now, can_show=model.can_show):
             return None
+        self.stops.give_way(now)
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+
+    def _is_new(self, pending: Pending) -> bool:
+        """Return True if a command began after the running stop, or waits for that stop: only then it may go first."""
+        running = self.stops.running
+        if running is None or running.sequence.rank == SOFT.rank:
+            return True
+        return pending.received_at >= running.began_at or running.before is pending
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
         """Repeat the stop of a car at rest that has not shown it: its frames may have been lost."""
@@ -148,10 +159,13 @@ class Executor:
             return self._begin_stop(self.stops.full(now), FrameOrigin.REPEAT, now)
         return self._write(renewal.take(now), FrameOrigin.REPEAT, None, None)
 
-    def _begin_stop(self, sequence: StopSequence, why: FrameOrigin, now: float) -> OutgoingFrame | None:
-        """Begin a stop. Return its first frame if that may be written now."""
+    def _begin_stop(
+        self, sequence: StopSequence, why: FrameOrigin, now: float, before: Pending | None = None
+    ) -> OutgoingFrame | None:
+        """Begin a stop, if need be before a command. Return its first frame if that may be written now."""
         self.stops.begin(sequence, why, now)
         assert self.stops.running is not None
+        self.stops.running.before = before
         return self._next_step(self.stops.running, now)
 
     def _write(
@@ -186,6 +200,8 @@ class Executor:
                 self._log.record_sent(source, now)
             case Pending():
                 source.frames.popleft()
+                if self.stops.running is not None:
+                    self.stops.running.on_other_written(now)
                 if not source.frames:
                     self._log.record_sent(source, now)
                     if self.queue.one_shots and self.queue.one_shots[0] is source:
@@ -218,7 +234,7 @@ class Executor:
                 model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
             case _:
                 model.mode.on_written(block_s, now=now)
-                model.evidence.blocked(block_s)
+                model.evidence.blocked(blocking_kind(frame), block_s)
                 if isinstance(frame, General) and frame.motion is not Motion.STOP:
                     model.evidence.sent_motion()
                     self._end_rest(TrustEvent.MOTION_SENT, now)
@@ -226,7 +242,7 @@ class Executor:
                     model.evidence.sent_other()
                 if shown and frame != STOP_FRAME and model.trust.shown:
                     self._doubt_rest(now)
-        if model.profile.stop_style is StopStyle.RASPBERRY_PI and model.mode.asked is None:
+        if model.stop_style is StopStyle.GENERAL and model.mode.asked is None:
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
@@ -295,22 +311,26 @@ class Executor:
         running = self.stops.running
         if running is not None:
             times.extend(self.stops.deadlines(running, now))
-        if self.accepts_commands and (running is None or running.leaves_gap(now)):
-            times.extend(self._command_times(now))
-        elif self.queue.one_shots and self.model.trust.state is CarTrust.UNHEARD:
-            times.append(max(self.model.ready_at, now + FLIGHT_S))
+        times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))
 
     def _command_times(self, now: float) -> list[float]:
-        model, queue, times = self.model, self.queue, []
-        stopped = self.stops.running is None
-        if queue.one_shots:
-            times.append(max(model.pacing.act_at(queue.one_shots[0].frames[0]), model.left_until))
-        if queue.held is not None and not queue.held.pending.sent:
-            times.append(model.ready_at)
-        if queue.mode_change is not None and stopped:
-            times.append(max(model.pacing.open_at(now), model.left_until) if model.rest_is_sure else model.ready_at)
-        if model.believed.repeat:
+        model, queue = self.model, self.queue
+        times: list[float] = []
+        running = self.stops.running
+        stopped = running is None
+        if running is not None and self.stops.shutting_down:
+            return times
+        free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
+        if queue.one_shots and self._is_new(queue.one_shots[0]):
+            times.append(max(model.pacing.act_at(queue.one_shots[0].frames[0]), model.left_until, free_at))
+        if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
+            times.append(max(model.ready_at, free_at))
+        if queue.mode_change is not None and self._is_new(queue.mode_change):
+            opens = model.rest_is_sure or (running is not None and running.sequence.rank > SOFT.rank)
+            open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
+            times.append(max(open_at, model.ready_at, free_at))
+        if model.believed.repeat and stopped:
             times.append(max(model.pacing.repeat_at, model.left_until))
         if model.at_rest and not model.trust.shown and stopped and queue.mode_change is None:
             times.append(max(self.stops.renewal.due_at, model.ready_at))

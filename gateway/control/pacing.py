@@ -5,22 +5,22 @@ It knows frames and times, no commands. `Executor` decides which frame is writte
 
 from typing import Final
 
-from gateway.control.stops.sequences import REPEAT_INTERVAL_S, Gate
+from gateway.control.estimate.learned import Learned
+from gateway.control.stops.sequences import NAMED_GAP_S, REPEAT_INTERVAL_S, Gate
 from gateway.protocol.enums import ServoAction
-from gateway.protocol.frames import ArmSet, Frame, General
+from gateway.protocol.frames import ArmSet, Frame, General, Reset
 from gateway.protocol.platform_name import Platform
-from gateway.protocol.platforms import Profile, StopStyle
+from gateway.protocol.platforms import Profile
 
 FLIGHT_S: Final = 0.06
 """Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""
 FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
-# After a report the car ranges again no earlier than 0.85 s later (docs/reference/protocol.md#rates: once a second in
-# mode 0). This leaves
-# 0.25 s for the delay of the link.
 AWAKE_S: Final = 0.6
-"""Time after a report in which the car reads a frame at once."""
-REPORT_S: Final = 2.2
-"""Maximum interval of reports in mode 0: one a second, and 1.0 s more without an echo."""
+"""Maximum time after a report in which the car reads a frame at once: it ranges again an interval later."""
+LINK_DELAY_S: Final = 0.3
+"""Maximum delay of a report by the link, which shortens that time."""
+REPORT_MARGIN_S: Final = 0.2
+"""Margin of the longest interval of reports in mode 0."""
 
 
 class Pacing:
@@ -30,13 +30,14 @@ class Pacing:
     # the buffer. The car reads it earlier if it was awake at the write, or has sent a report since. Frames that waited
     # before it may then block the car once more. An echo in the last ranging does not predict the next one.
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, learned: Learned) -> None:
         self.profile = profile
+        self.learned = learned
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the link is new."""
-        self._written_at = float("-inf")
+        self._written_at = self._framed_at = float("-inf")
         self._block_s = 0.0
         self._sure_s = 0.0
         self._before_s = 0.0
@@ -45,10 +46,12 @@ class Pacing:
 
     def on_written(self, frame: Frame, now: float) -> None:
         """Record a written frame."""
-        awake_at = max(now, self.block_until) if now <= self._reported_at + AWAKE_S else float("inf")
+        awake_at = max(now, self.block_until) if now <= self.awake_until else float("inf")
         self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_INTERVAL_S, self.block_until))
         self._written_at = now
+        if not isinstance(frame, Reset):
+            self._framed_at = now
         self._block_s = self.profile.block_s(frame)
         self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
 
@@ -69,9 +72,17 @@ class Pacing:
             self._read_by = min(self._read_by, at + self._before_s)
 
     @property
-    def reported_at(self) -> float:
-        """Return when the last report of mode 0 arrived; -inf if none has."""
-        return self._reported_at
+    def _interval_s(self) -> float:
+        return self.learned.echo.median_s or self.profile.interval_s
+
+    @property
+    def awake_until(self) -> float:
+        """Return until when the car reads a frame at once, as its last report shows; -inf if none has come."""
+        return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
+
+    def named_at(self, frame: Frame) -> float:
+        """Return the earliest time for this frame if it is a named one: behind another frame it must not be read."""
+        return float("-inf") if isinstance(frame, General | Reset) else self._framed_at + NAMED_GAP_S
 
     @property
     def written_at(self) -> float:
@@ -120,17 +131,18 @@ class Pacing:
 
     def act_at(self, frame: Frame) -> float:
         """Return the earliest time for the frame of a one-shot."""
-        if self.profile.stop_style is StopStyle.RASPBERRY_PI and not isinstance(frame, General):
+        if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
             return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
-        return self.flight_until
+        return max(self.flight_until, self.named_at(frame))
 
-    def open_at(self, now: float) -> float:
+    def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""
-        # The car must be awake, so that the block begins at once. If no report comes, wait until none is due any more.
-        alone = max(now, self.buffer_until, self.flight_until)
-        if alone <= self._reported_at + AWAKE_S:
+        # The car must be awake, so that the block begins at once, and the end of the mode can be shown. If no report
+        # comes, wait until none is due any more. A car that cannot show it need not wait.
+        alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
+        if alone <= self.awake_until or not can_show:
             return alone
-        return max(now, self.buffer_until + REPORT_S)
+        return max(now, self.buffer_until + self._interval_s + self.profile.ranging_s + REPORT_MARGIN_S)
 
     @property
     def repeat_at(self) -> float:

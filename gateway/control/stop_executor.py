@@ -8,23 +8,33 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.commands import Phase, Reason, SetMode
+from gateway.control.estimate.learned import Shows
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.events import FrameOrigin, Level
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import sequences, stopping
-from gateway.control.stops.evidence import CLOSED_S, EVIDENCE, Finding, StopCase
+from gateway.control.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
 from gateway.control.stops.sequences import StopSequence
 from gateway.control.stops.stopping import StopInProgress
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
 
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
-UNKNOWN_PROBES: Final = 2
-"""Maximum probes of a car of an unknown platform: a Raspberry Pi does not react to them."""
+DOUBTED_PROBES: Final = 2
+"""Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
 RESETTING_STEPS: Final = 1
 """Index of recovery's first `MODE00`. The frames up to it are written before a probe may replace the rest."""
+
+
+_PROBED: Final = {
+    Finding.REPORT: sequences.PROBE,
+    Finding.PAUSE: sequences.PROBE,
+    Finding.CONTROL: sequences.CONTROL,
+}
+"""The next frame of a stop that the car may still show, by what its last report was."""
 
 
 class StopExecutor:
@@ -93,21 +103,37 @@ class StopExecutor:
     def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         model = self.model
         worst_s = stopping.worst_s(sequence, model.for_stop(now), model.pacing, now)
-        timeout_s = min(worst_s, stopping.MAX_ANNOUNCED_WORST_S) + stopping.EVIDENCE_TIMEOUT_S
+        timeout_s = min(worst_s, stopping.MAX_ANNOUNCED_WORST_S) + stopping.evidence_s(model.profile, model.learned)
         self.running = StopInProgress(
-            sequence, why, now, now, commands, worst_at=now + worst_s, timeout_s=timeout_s, case=self._case(sequence)
+            sequence,
+            why,
+            now,
+            now,
+            commands,
+            worst_at=now + worst_s,
+            timeout_s=timeout_s,
+            reported_s=stopping.reported_s(model.profile, model.learned),
+            case=self._case(sequence),
         )
-        model.evidence.settles_at = None
+        model.evidence.begin_stop()
         model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
 
     def _case(self, sequence: StopSequence) -> StopCase:
         """Return what this stop rests on if the car does not show it."""
-        style = self.model.stop_style
-        if style is StopStyle.RASPBERRY_PI:
-            return StopCase.RASPBERRY_PI
-        if sequence.rank == sequences.SOFT.rank:
-            return StopCase.SOFT
-        return StopCase.UNKNOWN_PLATFORM if style is StopStyle.UNKNOWN else StopCase.MANUAL
+        model = self.model
+        if not model.profile.has_readings:
+            return StopCase.NO_READINGS
+        match model.stop_style:
+            case StopStyle.GENERAL if model.profile.kind is Platform.RASPBERRY_PI:
+                return StopCase.RASPBERRY_PI
+            case StopStyle.GENERAL:
+                return StopCase.UNKNOWN_PLATFORM
+            case _ if sequence.rank == sequences.SOFT.rank:
+                return StopCase.SOFT
+            case StopStyle.BOTH:
+                return StopCase.WRONG_PLATFORM
+            case _:
+                return StopCase.MANUAL if model.can_show else StopCase.NO_REACTION
 
     # ------------------------------------------------------------------ link, shutdown
 
@@ -188,17 +214,22 @@ class StopExecutor:
         is_time_up = now >= running.obeyed_at
         if not running.frames_sent or not (is_time_up or reported):
             return None
-        if running.case is StopCase.SOFT:
-            return StopCase.SOFT if is_time_up else None
-        if running.case is StopCase.RASPBERRY_PI:
-            has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
-            return StopCase.RASPBERRY_PI if is_time_up and has_report else None
+        match running.case:
+            case StopCase.SOFT | StopCase.NO_READINGS:
+                return running.case if is_time_up else None
+            case StopCase.RASPBERRY_PI | StopCase.UNKNOWN_PLATFORM:
+                has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
+                return running.case if is_time_up and has_report else None
+            case StopCase.WRONG_PLATFORM if reported and running.probes >= DOUBTED_PROBES:
+                return StopCase.WRONG_PLATFORM
+            case _:
+                pass
         if is_time_up and model.believed.fan and model.profile.fan_silences:
             return StopCase.FAN
         if running.no_echo_at > running.closed_at:
             return StopCase.NO_ECHO
-        if running.case is StopCase.UNKNOWN_PLATFORM and reported and running.probes >= UNKNOWN_PROBES:
-            return StopCase.UNKNOWN_PLATFORM
+        if not model.can_show and running.report_at > running.try_at and model.stop_style is not StopStyle.BOTH:
+            return StopCase.NO_REACTION
         return None
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:
@@ -231,7 +262,8 @@ class StopExecutor:
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
             if self.model.mode.heard_at > running.began_at:
-                self.model.evidence.obeyed_at = None
+                self.model.evidence.reacted_at = None
+                self.model.learned.doubted = self.model.learned.shows is Shows.YES
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:
@@ -240,9 +272,9 @@ class StopExecutor:
                 self._log.log(Level.WARNING, "unheard", words, now)
 
     def give_way(self, now: float) -> None:
-        """End an overdue stop: a new drive takes its place."""
+        """End a stop that the car has not shown yet: a new command takes the place of its repeats."""
         running, self.running = self.running, None
-        words = f"NOT CONFIRMED: {self.model.name} was driven again before it reacted to the stop"
+        words = f"NOT CONFIRMED: {self.model.name} was commanded again before it reacted to the stop"
         for pending in running.commands if running is not None else ():
             self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
 
@@ -253,14 +285,17 @@ class StopExecutor:
         running = self.running
         if running is None or running.first_at is None:
             return
+        evidence = self.model.evidence
         if finding is not Finding.NOTHING and at > running.closed_at + FLIGHT_S and at > running.first_at + FLIGHT_S:
             running.report_at = at
+            if at >= running.closed_at + evidence.close_s - EARLY_S > float("-inf"):
+                running.sent_all = True  # it is in mode 0, and reads
         match finding:
             case Finding.SHOWN:
-                self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
-            case Finding.NO_ECHO if at > running.closed_at + CLOSED_S:
+                self._finish(running, Basis.SHOWN, evidence.words, now)
+            case Finding.NO_ECHO if at > running.closed_at + evidence.close_s - EARLY_S:
                 running.without_echo += 1
-                if max(running.without_echo, self.model.evidence.without_echo) >= 2:
+                if max(running.without_echo, evidence.without_echo) >= 2:
                     running.no_echo_at = at
             case Finding.LOST:
                 self._handle_loss(running, now)
@@ -268,9 +303,9 @@ class StopExecutor:
                 pass
         if self.running is running and running.frames_sent:
             self._await(running, now)
-        if self.running is running and finding in (Finding.REPORT, Finding.PAUSE) and self._may_probe(running):
+        if self.running is running and finding in _PROBED and self._may_probe(running):
             running.probes += 1
-            running.begin_try(sequences.PROBE, now)
+            running.begin_try(_PROBED[finding], now)
 
     def on_contact(self, now: float, words: str) -> None:
         """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""
@@ -281,19 +316,19 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _may_probe(self, running: StopInProgress) -> bool:
-        """Return True if the car could react to a `MODE00` now."""
-        if running.case is StopCase.SOFT or running.case is StopCase.RASPBERRY_PI:
+        """Return True if the car could react to a `MODE00` now, and show it."""
+        if running.case is StopCase.WRONG_PLATFORM:
+            return running.frames_sent and running.probes < DOUBTED_PROBES
+        if running.case is not StopCase.MANUAL or not self.model.can_show:
             return False
-        if running.case is StopCase.UNKNOWN_PLATFORM:
-            return running.frames_sent and running.probes < UNKNOWN_PROBES
         # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
-        return running.sequence is not sequences.RECOVERY or running.index > RESETTING_STEPS
+        return not running.sequence.is_recovery or running.index > RESETTING_STEPS
 
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""
         running.probes += 1
-        unknown = running.case is StopCase.UNKNOWN_PLATFORM
-        if not unknown and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
+        doubted = running.case is StopCase.WRONG_PLATFORM
+        if not doubted and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
             self._try_again(running, now)
 
     def _finish(
@@ -304,6 +339,7 @@ class StopExecutor:
         self.running = None
         recovered = model.trust.state in STOP_GOES_ON and not model.known
         model.rest = case
+        model.cut_write = False
         self.renewal.left_mode = model.left_at >= running.began_at
         model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
@@ -346,6 +382,6 @@ class StopExecutor:
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""
         running, ready_at = self.running, self.model.ready_at
-        if running is None or running.overdue or running.sequence.rank == sequences.SOFT.rank:
+        if running is None or running.sequence.rank == sequences.SOFT.rank:
             return ready_at
         return max(running.over_at(self.model.pacing, now), ready_at)

@@ -24,7 +24,7 @@ class StopRenewal:
         self._count = 0
         self._next_at = float("inf")
         self._general_stop_follows = False
-        """True if the last renewal was a `MODE00`. A Raspberry Pi ignores it, so a general stop follows alone."""
+        """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop follows alone."""
 
     def suspend(self) -> None:
         """Send no more renewals until the next `schedule`."""
@@ -74,4 +74,4 @@ class StopRenewal:
         A general stop does nothing to a car that keeps half a named frame (docs/reference/protocol.md#hazards).
         `MODE00` clears it.
         """
-        return self._model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._count <= CLEARING_RENEWALS
+        return self._model.rest in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS

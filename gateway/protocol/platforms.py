@@ -13,15 +13,20 @@ from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose,
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
 from gateway.protocol.platform_name import OPTIONS, Platform, parse_name
 from gateway.protocol.sensors import ATTRIBUTES, Sensors
-from gateway.protocol.timing import RASPBERRY_PI_FAN_S, block_s
+from gateway.protocol.timing import DIGITLESS_OPEN_S, RANGING_S, RASPBERRY_PI_FAN_S, REPORT_INTERVAL_S, block_s
 
 
 class StopStyle(StrEnum):
     """The stop sequences of a car (docs/reference/protocol.md#stops)."""
 
     MODE_FRAME = "mode_frame"
-    RASPBERRY_PI = "raspberry_pi"
-    UNKNOWN = "unknown"
+    """`MODE00` stops the car in every mode, and its block shows it."""
+    TIMER = "timer"
+    """`MODE00` leaves a mode, general stops do in mode 0, and nothing shows either."""
+    GENERAL = "general"
+    """General stops only: the car knows no MODE frame, or nobody knows whether it does."""
+    BOTH = "both"
+    """Both kinds of frames: readings contradict the platform."""
 
 
 _FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
@@ -96,6 +101,36 @@ class Profile:
     def observed(self) -> bool:
         """True if all of this profile was observed on a running program."""
         return not self.not_observed
+
+    @property
+    def has_readings(self) -> bool:
+        """True if the car sends readings."""
+        return "no_readings" not in self.options
+
+    @property
+    def close_s(self) -> float:
+        """The expected block of `MODE00`, s. What the car's readings show counts more."""
+        return self.block_s(ModeClose())
+
+    @property
+    def interval_s(self) -> float:
+        """The interval of reports in mode 0 until that of the car is learned, s."""
+        return REPORT_INTERVAL_S
+
+    @property
+    def ranging_s(self) -> float:
+        """The longest time that a report takes longer if the ranging gets no echo, s."""
+        return RANGING_S
+
+    @property
+    def reopened_s(self) -> float:
+        """The shortest block of a `MODE00` that lost its digits, s."""
+        return DIGITLESS_OPEN_S
+
+    @property
+    def shortest_opening_s(self) -> float:
+        """The shortest block of the opening of a mode, s."""
+        return min((row.open_s for mode, row in MODES.items() if mode is not Mode.MANUAL), default=0.0)
 
     @property
     def silent_modes(self) -> frozenset[Mode]:
@@ -260,7 +295,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _MODE_CAR | options,
                 _ALL_LIGHTS,
                 _FRONT,
-                StopStyle.MODE_FRAME,
+                StopStyle.TIMER,
                 ARDUINO_SPEED,
                 not_observed=("the program was read, not run", "constants in mode 0: as arduino", "speed: as arduino"),
             )
@@ -272,7 +307,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _PI_CAR | options,
                 _LIGHTS_2_TO_4,
                 _FRONT | _VERTICAL | _HORIZONTAL,
-                StopStyle.RASPBERRY_PI,
+                StopStyle.GENERAL,
                 RASPBERRY_PI_SPEED,
                 constants=_CONSTANTS,
                 not_observed=("the speed at the start",),
@@ -285,7 +320,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _EVERY_CAR | options,
                 _LIGHTS_2_TO_4,
                 _FRONT,
-                StopStyle.UNKNOWN,
+                StopStyle.GENERAL,
                 ARDUINO_SPEED,
                 constants=_CONSTANTS,
                 not_observed=("only what every known platform has is used",),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from gateway.control.stops.sequences import STOP_REPORT_TIMEOUT_S, UNKNOWN
+from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
@@ -80,7 +80,7 @@ class LinkProbe:
         assert self.link is not None
         self.probed = True
         last = time.monotonic()
-        for step in UNKNOWN.steps:
+        for step in GENERAL.steps:
             await self.listen(last + step.after_s - time.monotonic())
             if self.trouble is not None:
                 return

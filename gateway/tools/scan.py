@@ -12,7 +12,7 @@ from collections.abc import Coroutine, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from gateway.control.stops.sequences import STOP_REPORT_TIMEOUT_S, UNKNOWN
+from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import parse_url
 from gateway.protocol.frames import encode
 from gateway.tools import cli_support
@@ -129,12 +129,12 @@ class _Scan:
         if not probed:
             cli_support.print_note("nothing to probe: no port is open and is a car or silent")
             return
-        frames = ", ".join(encode(step.frame).decode() for step in UNKNOWN.steps)
+        frames = ", ".join(encode(step.frame).decode() for step in GENERAL.steps)
         where = ", ".join(str(probe.url) for probe in probed)
-        seconds = f"{UNKNOWN.length_s:g} s"
+        seconds = f"{GENERAL.length_s:g} s"
         cli_support.print_note(f"sending {frames} within {seconds} to {where}: a car there stops, and goes to mode 0")
         probing = asyncio.gather(*(probe.probe() for probe in probed))
-        await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + STOP_REPORT_TIMEOUT_S)
+        await self._with_progress(_all(probing), "probing", GENERAL.length_s + STOP_REPORT_TIMEOUT_S)
 
     async def _with_progress(self, work: Coroutine[Any, Any, None], what: str, seconds: float) -> None:
         """Run the work; show its remaining time at a terminal."""

@@ -193,6 +193,6 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
             )
     if frame is None or (isinstance(frame, General) and moves(frame)):
         lines.append(f"stop it: {again} '{_STOP}'")
-        if profile.stop_style is not StopStyle.RASPBERRY_PI:
+        if "mode" in profile.capabilities:
             lines.append(f"     or: {again} '{_MANUAL}', which works in every mode, but not on a Raspberry Pi car")
     return lines

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
+from gateway.control.estimate.learned import Learned
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.enums import Mode
 from gateway.protocol.modes import SILENT_MODES, candidate_modes
@@ -22,6 +23,10 @@ CONTRADICTING_FRAMES: Final = 3
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
 """Minimum silence that contradicts mode 0, and modes 2, 5 and 6. Known blocks and a running fan do not count."""
+FIRST_SILENCE_S: Final = 5.0
+"""The same for mode 0 until the rhythm of the car is known."""
+SILENCE_MARGIN_S: Final = 0.75
+"""Minimum by which a silence is longer than the longest normal interval of the car."""
 CORRUPTED_MATCH_S: Final = 0.5
 """Period after a reading from another mode in which a single match may be a corrupted frame. Require three in a row."""
 MAX_BLOCKS: Final = 256
@@ -41,6 +46,7 @@ class ModeEstimator:
     """The commanded mode (`asked`), the inferred mode, and the verdict. Times: s, monotonic."""
 
     profile: Profile
+    learned: Learned = field(default_factory=Learned)
     asked: Mode | None = None
     inferred: Mode | None = None
     """The only mode that fits the last readings or the silence; None if several or none fit."""
@@ -145,7 +151,7 @@ class ModeEstimator:
             self._on_expected_silence(self.asked, now)
             return
         silent_s = self.unheard_s(now)
-        if silent_s > MANUAL_SILENCE_S:
+        if silent_s > self.manual_silence_s:
             self._set_candidates(self._silent_modes)
         if silent_s > limit:
             words = f"silent for {silent_s:.1f} s, but mode {self.asked} reports at least every {limit:g} s"
@@ -166,7 +172,7 @@ class ModeEstimator:
         """Withdraw a confirmation that is older than the longest silence of the commanded mode."""
         if self.verdict is not Verdict.CONFIRMED or self.asked is None:
             return
-        limit = MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
+        limit = self.manual_silence_s if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
         since_s = now - max(self.evidence_at or self._own_at, self._excused_at)
         blocked_s = sum(block_s for at, block_s in self._blocks if at > now - since_s)
         if self.inferred is None or since_s > limit + blocked_s + MODE_CLOSE_S:
@@ -177,10 +183,28 @@ class ModeEstimator:
         return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
-        """Return the longest silence of the commanded mode, s; None if silence is normal or no mode was commanded."""
-        if self.asked is None or self.asked in self.profile.silent_modes or (fan and self.profile.fan_silences):
+        """Return the longest silence of the commanded mode, s; None if silence shows nothing, or no mode was commanded.
+
+        In a mode other than 0, silence shows something only on a car that has reported in that mode before.
+        """
+        if self.asked is None or self.is_silent(self.asked) or (fan and self.profile.fan_silences):
             return None
-        return MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
+        return self.manual_silence_s if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
+
+    def is_silent(self, mode: Mode) -> bool:
+        """Return True if this car is not known to report in a mode."""
+        if not self.profile.has_readings or mode in self.profile.silent_modes:
+            return True
+        return mode is not Mode.MANUAL and mode not in self.learned.reporting
+
+    @property
+    def manual_silence_s(self) -> float:
+        """Return the minimum silence that contradicts mode 0, s."""
+        learned = self.learned
+        if not learned.echo.is_known and not learned.no_echo.is_known:
+            return FIRST_SILENCE_S
+        longest_s = max(learned.no_echo.median_s, learned.echo.median_s + self.profile.ranging_s)
+        return max(MANUAL_SILENCE_S, longest_s + SILENCE_MARGIN_S)
 
     @property
     def _silent_modes(self) -> tuple[Mode, ...]:
@@ -189,19 +213,21 @@ class ModeEstimator:
     def _on_expected_silence(self, asked: Mode, now: float) -> None:
         """Let older evidence expire: silence is normal in this mode or with the fan on, so it proves nothing."""
         silent_s = now - max(self._heard_at, self._asked_at)
-        if asked not in self.profile.silent_modes:
+        if not self.is_silent(asked):
             self._excused_at = now
-            if silent_s > MANUAL_SILENCE_S and self.verdict is not Verdict.CONTRADICTED:
+            if silent_s > self.manual_silence_s and self.verdict is not Verdict.CONTRADICTED:
                 self._set_candidates(tuple(mode for mode in Mode if mode in self.profile.possible_modes))
                 self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, as expected while its fan runs", now)
             return
         if now < self._settled_at:
             return
-        if self.unheard_s(now) > MANUAL_SILENCE_S:
+        if self.unheard_s(now) > self.manual_silence_s:
             self._mismatches = 0
             self._set_candidates(self._silent_modes)
         if self._mismatches == 0 and self.verdict is Verdict.ASSUMED:
-            self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, as expected", now)
+            known = asked in self.profile.silent_modes or not self.profile.has_readings
+            why = "as expected" if known else f"and it is not known whether this car reports in {asked}"
+            self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, {why}", now)
 
     def _silence_s(self, heard_at: float, now: float) -> float:
         since = max(heard_at, self._settled_at, self._excused_at)
@@ -215,6 +241,8 @@ class ModeEstimator:
             self.inferred = candidates[0] if len(candidates) == 1 else None
 
     def _conclude(self, verdict: Verdict, evidence: str, at: float) -> None:
+        if verdict is Verdict.CONFIRMED and self.asked is not None:
+            self.learned.reporting.add(self.asked)
         self.verdict = verdict
         self.evidence = evidence
         self.evidence_at = at

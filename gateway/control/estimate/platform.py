@@ -64,6 +64,7 @@ class PlatformDetector:
         }
     )
     _frames: dict[str, int] = field(default_factory=lambda: {"arm": 0, "imu": 0})
+    _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
 
@@ -81,6 +82,15 @@ class PlatformDetector:
         return any(shown.holds for words, shown in self._against.items() if words not in self._extra_options)
 
     @property
+    def open_mode(self) -> bool:
+        """Return True if the last readings show a mode other than 0, so the car knows MODE frames."""
+        return self._open_mode.holds
+
+    def begin_link(self) -> None:
+        """Forget what the readings of the last link showed of the mode."""
+        self._open_mode = _PlatformEvidence()
+
+    @property
     def evidence(self) -> tuple[str, ...]:
         """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
         return (*self._why(), *self.contradictions, *self.profile.not_observed)
@@ -89,6 +99,7 @@ class PlatformDetector:
         """Update the evidence, and with `auto` the profile. Return new contradictions, in words."""
         match event:
             case Sensors():
+                self._open_mode.update(shown=Mode.MANUAL not in candidate_modes(event))
                 new = self._check_profile(event)
                 if self.auto:
                     self._detect(event)

@@ -1,71 +1,89 @@
 """Detects from the car's readings whether a stop arrived; a table lists the cases. Pure.
 
-The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). A car shows in three ways that it obeyed
-`MODE00`. It leaves a mode that it reported. It leaves a silent mode that was opened from a shown rest. Or its reports
-pause. The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
+The car acknowledges nothing. All that a gateway has is the frames that it wrote, and the moments at which readings
+arrived. This essay is about what those moments can prove, what they cannot, and what is still doubtful.
+
+*Why pauses.* On most cars `MODE00` blocks the program for about a second: it beeps. Meanwhile the car sends nothing, so
+the next report comes late by just that second. That lateness is the acknowledgement which the protocol lacks. The
+general stop does not block, so no reading ever shows it. That is why a stop that wants to be shown ends with a `MODE00`
+alone, and why no other frame of ours may follow it: a general stop written after the evidence could be flipped into a
+motion by the link, and nobody would look again. The frame that is judged is the last one.
+
+*Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
+(docs/reference/protocol.md#programs). Reports come every 0.7 s from one car and every 2.2 s from another. So nothing
+here compares a car with a constant: `Learned` has its own rhythm and its own blocks, and a pause is an interval that is
+longer than the rhythm by just the block. A car whose reports come by a timer never pauses. For it nothing is ever shown
+here, which costs it nothing else: stops end as `sent`, and the words say why.
+
+*Why not one pause.* A link that swallows both `MODE00` and the report after it leaves a gap, too: two intervals instead
+of one. If the interval is about as long as the block, that gap equals a pause. Half of all outages of 0.6 s around a
+stop do that on a car that reports every second. So two pauses are needed, each around a `MODE00` of its own. If one of
+them is longer than it should be (a slow link, or a report that the link held), three are.
+
+*Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
+`MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length tells.
+Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop at the same
+moment of an interval. It does not block, so the next report must come on time. If that one is missing too, the pauses
+were the link's.
+
+*Why silence follows.* A link that holds reports makes gaps of any length. But the held report comes late, and the next
+one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
+such a report would have come.
+
+*Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. That needs one
+report only, but the report must begin after `MODE00` was obeyed, and come before a `MODE00` that lost its digits would
+let one through: without its digits the frame opens mode 0 with the motors on, which blocks longer. A silent mode shows
+nothing by its silence. If it was opened from a shown rest, the end of the silence shows that it was left.
+
+*What a car can forge.* Its reports have no checksum. A damaged frame of another mode can look like mode 0, so a report
+counts only after a silence that no such mode has. The start of one frame and the end of another can join. The decoder
+ends a frame at a silence, and damage of any kind ends the comparison of intervals.
+
+*What is still doubtful.* A link that flips bits can turn the judged `MODE00` into another frame that blocks as long; no
+such frame is known. A car that pauses by itself just when it should, twice, would be believed. And a half-duplex link
+whose mute time changes from write to write can pass the control by chance.
+
+The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
+from gateway.control.estimate.learned import SAME_S, Blocking, Learned, Rhythm
 from gateway.protocol.enums import Mode
 from gateway.protocol.modes import candidate_modes
+from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import Sensors
-from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
+from gateway.protocol.timing import FRAME_S
 
-# A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
-# checksum. But no silence comes before it.
+SETTLED_SHARE: Final = 0.6
 SETTLED_S: Final = 0.8
-"""Minimum silence before a mode-0 report that counts."""
-# A loaded machine reads a report up to 0.5 s late.
+"""Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. A reporting mode
+sends 20 frames a second; a damaged one that looks like mode 0 has no silence before it."""
+BUNCHED_SHARE: Final = 0.3
 BUNCHED_S: Final = 0.4
-"""Maximum interval of reports that the link has delayed. A pause before them may be the link's."""
-CLOSED_S: Final = 0.95
-"""Minimum time from `MODE00` to a report that the car sent after it obeyed: closing takes 1.0 s."""
-# 1.0 s of closing, up to 0.9 s to the report, and 0.1 s of wire. A `MODE00` that lost a digit or both opens mode 0
-# instead, with the motors on. That blocks for 2.3 s or 2.0 s. A report of 41 bytes or more can follow at once, so it
-# comes after 2.05 s.
-LEFT_S: Final = 2.05
-"""Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
+"""Maximum interval of reports that the link has delayed: this share of the interval, at most this time."""
+EARLY_S: Final = 0.05
+"""How much earlier than the end of a block a report may seem to come."""
 LATE_S: Final = 0.2
-"""Additional time of such a report on a slow link. It counts as a pause only, so one more shows the stop."""
-RANGING_S: Final = 1.0
-"""Additional time of a report without an echo."""
+"""Additional time of the report that shows the end of a mode, on a slow link. It counts as a pause only."""
 SHAPE_UNTIL_S: Final = 1.0
-"""Maximum time that readings of a mode go on after the `MODE00` that ends it. The general stop follows at 1.1 s."""
-# Opening alone blocks for 2.5 s. During it a slow link delivers older reports, one a second.
-OPENING_SILENCE_S: Final = 2.3
-"""Minimum silence before the report that shows the end of a silent mode."""
-OPENED_S: Final = 2.5
-"""Minimum block by opening a mode (docs/reference/protocol.md#blocking-times). The car cannot report the end of the
-mode earlier."""
-PAUSE_MIN_S: Final = 1.88
-PAUSE_MAX_S: Final = 2.6
-"""Range of the interval of two reports around an obeyed `MODE00`: 1.9 s or a little more
-(docs/reference/protocol.md#evidence-of-a-stop)."""
-NORMAL_MIN_S: Final = 0.8
-NORMAL_MAX_S: Final = 1.4
-"""Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
-# A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
-# around a stop do that, so one pause is not enough. Not even at a rest that was shown before: a damaged frame of the
-# next stop can start the motors.
+"""Maximum time that readings of a mode go on after the `MODE00` that ends it."""
+LONGER_S: Final = 0.65
+"""Maximum by which a pause may be longer than the block. It is in doubt then."""
 PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
-# A damaged `MODE00` may open mode 0 with the motors on, which blocks for 2.0 to 2.3 s. If the link held the report
-# before for a second, both gaps look like pauses. But they are not 1.0 s longer than the normal interval of this car.
 PAUSES_IN_DOUBT: Final = 3
-"""Number of pauses that are needed if one of them does not match the normal interval."""
-MATCH_S: Final = 0.12
-"""Maximum difference of a matching pause from the normal interval and the 1.0 s that `MODE00` takes."""
-# A link that holds the reports for two seconds leaves such a gap, too. Then the next report comes with the held one, or
-# 0.2 s later.
+"""Number of pauses that are needed if one of them is in doubt."""
 SETTLING_S: Final = 0.25
-"""Time without a reading after the last pause, before the pauses count."""
+"""Minimum time without a reading after the last pause, before the pauses count."""
 SHAPES: Final = 2
 """Number of consecutive readings with the shape of another mode that show that mode."""
 ROUND_TRIP_S: Final = 2.5
 """Round trip of a slow link, from the second try on: the car may have sent earlier reports before `MODE00`."""
+IN_FLIGHT_S: Final = 0.1
+"""Minimum time from a frame to a report that the car sent after it could have read the frame."""
 
 
 class StopCase(StrEnum):
@@ -74,12 +92,15 @@ class StopCase(StrEnum):
     LEFT_SHAPE = "left_shape"
     LEFT_SILENT = "left_silent"
     MANUAL = "manual"
+    NO_REACTION = "no_reaction"
+    NO_READINGS = "no_readings"
     NO_ECHO = "no_echo"
     FAN = "fan"
     SOFT = "soft"
     ACTED = "acted"
     RASPBERRY_PI = "raspberry_pi"
     UNKNOWN_PLATFORM = "unknown_platform"
+    WRONG_PLATFORM = "wrong_platform"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,27 +116,40 @@ class EvidenceRow:
 
 EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
-        "full, out of tracking, light seeking or following",
-        "a mode-0 report that begins after `MODE00` and comes within 2.05 s (3.05 s without an echo), when `MODE00` "
-        "was the first frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in mode 0",
+        "full, out of a mode in which the car reported",
+        "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
+        "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(
-        "full, out of obstacle avoidance, color LED or remote control",
-        "the same, after 2.3 s of silence, when the mode was opened from a rest that was shown; else as in mode 0",
+        "full, out of a silent mode",
+        "the same, after the silence of the opening, when the mode was opened from a rest that was shown; else as in "
+        "mode 0",
         "the stop goes on",
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00` (three if one is not 1.0 s longer than a normal "
-        "interval), and no reading for 0.25 s after the last",
-        "the stop goes on",
+        "two pauses between reports, each around a `MODE00` and longer than this car's interval by just its block "
+        "(three if one is longer), no reading too early after the last, and no frame of ours after its `MODE00`",
+        "the stop goes on, and a command may take its place",
+    ),
+    StopCase.NO_REACTION: EvidenceRow(
+        "full or recovery, the reports of this car do not react to frames",
+        "",
+        "`sent` after a report; a general stop every 6 s",
+        "{car}'s reports do not react to frames: nothing shows that a stop arrived",
+    ),
+    StopCase.NO_READINGS: EvidenceRow(
+        "any, a car that sends no readings",
+        "",
+        "`sent`; a general stop every 6 s",
+        "{car} sends no readings: nothing shows that a stop arrived",
     ),
     StopCase.NO_ECHO: EvidenceRow(
         "full or recovery, in mode 0 without an echo",
         "",
         "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
-        "{car} has no sonar echo, so its readings cannot show a stop",
+        "{car} has no sonar echo, so its readings cannot show a stop now",
     ),
     StopCase.FAN: EvidenceRow(
         "full or recovery, the fan runs (not Raspberry Pi)",
@@ -142,10 +176,16 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
         "a Raspberry Pi car never confirms a stop",
     ),
     StopCase.UNKNOWN_PLATFORM: EvidenceRow(
-        "full or recovery, platform unknown",
-        "as for the other platforms",
-        "`sent` if it reports on in mode 0, as a Raspberry Pi does; then as without an echo",
-        "{car} keeps reporting in mode 0 like a Raspberry Pi car, which never confirms a stop",
+        "any, platform unknown",
+        "",
+        "`sent` after a report; a general stop every 6 s",
+        "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
+    ),
+    StopCase.WRONG_PLATFORM: EvidenceRow(
+        "full or recovery, readings contradict the platform",
+        "as in mode 0",
+        "`sent` if it reports on in mode 0; then as without an echo",
+        "the readings of {car} contradict its platform, and nothing in them shows the stop",
     ),
 }
 
@@ -155,11 +195,15 @@ class Finding(StrEnum):
 
     NOTHING = "nothing"
     REPORT = "report"
-    """A report of mode 0 with an echo, and no `MODE00` before it to judge. The car can react to a `MODE00` now."""
+    """A report of mode 0 with an echo that judges no `MODE00`. The car can react to a `MODE00` now."""
+    UNJUDGED = "unjudged"
+    """The same, while the rhythm of the car is not known: a `MODE00` now would show nothing."""
     PAUSE = "pause"
     """A pause; more are needed."""
+    CONTROL = "control"
+    """A pause that a link could forge: the next frame must be one that does not block."""
     SETTLING = "settling"
-    """The last pause that is needed. The stop is shown if no reading follows at once."""
+    """The last pause that is needed. The stop is shown if no reading follows too early."""
     LOST = "lost"
     """Reports went on without a pause."""
     NO_ECHO = "no_echo"
@@ -168,11 +212,16 @@ class Finding(StrEnum):
     """The car obeyed."""
 
 
+_NEVER: Final = float("-inf")
+
+
 @dataclass(slots=True)
 class StopEvidence:
     """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
 
-    obeyed_at: float | None = None
+    profile: Profile
+    learned: Learned = field(default_factory=Learned)
+    reacted_at: float | None = None
     """When the car last reacted to a frame; None if never on this link, or not to the last stop."""
     words: str = ""
     """The evidence for `SHOWN`."""
@@ -180,69 +229,123 @@ class StopEvidence:
     """When the pauses count, unless a reading comes before; None if they do not suffice."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
-    _last_at: float = float("-inf")
-    """When the last bytes arrived, except frames of the options (arm, gyro)."""
-    _foreign_at: float = float("-inf")
+    found_out: bool = False
+    """True if the last reading made this car one that cannot show a stop, or gave it another rhythm."""
+    _last_at: float = _NEVER
+    """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
+    _foreign_at: float = _NEVER
     """When the last frame arrived, whole or corrupted, that is no report of mode 0."""
     _before: float | None = None
     """When the last report with an echo arrived, if nothing else has arrived since."""
+    _before_no_echo: float | None = None
     _pending: float | None = None
     """When the last `MODE00` without a result was written."""
+    _delay_s: float | None = None
+    """The delay of the first report after that `MODE00`, if it is known."""
     _pauses: int = 0
     _pauses_needed: int = PAUSES
-    _interval_s: float | None = None
-    """The last normal interval of two reports, without a frame that blocks in between."""
-    _blocked_s: float = 0.0
-    """For how long the frames since the last report block the car."""
-    _window_s: float = CLOSED_S
+    _unjudged: bool = False
+    """True if a frame was written after the `MODE00` that the next pause would judge."""
+    _controlled: bool = False
+    """True if a general frame of this stop did not delay a report."""
+    _blocking: list[tuple[Blocking | None, float]] = field(default_factory=list)
+    """The other frames that block, since the last report: kind and maximum block."""
+    _general: bool = False
+    """True if a general frame that does not block was written since the last report."""
+    _window_s: float = 0.0
     _shapes: int = 0
     _shape_at: float | None = None
     """When the last reading of another mode arrived, since the last motion or opening."""
     _silent_mode: Mode | None = None
     """The silent mode that was opened from a shown rest."""
-    _opened_at: float = float("-inf")
+    _opened_at: float = _NEVER
     """When the last mode was opened."""
     _closed_at: float | None = None
     """When the first `MODE00` since then was written; None if none was."""
     _plain: bool = False
     """True if no other frame was written before that `MODE00`."""
 
+    # ------------------------------------------------------------------ the car's own numbers
+
+    @property
+    def close_s(self) -> float:
+        """Return by how much `MODE00` delays this car's next report, s."""
+        return self.learned.block_s(Blocking.MODE_CLOSE, self.profile.close_s)
+
+    @property
+    def _rhythm(self) -> Rhythm:
+        return self.learned.echo
+
+    @property
+    def _interval_s(self) -> float:
+        return self._rhythm.median_s or self.profile.interval_s
+
+    @property
+    def settled_s(self) -> float:
+        """Return the minimum silence before a mode-0 report that counts."""
+        return min(SETTLED_S, SETTLED_SHARE * self._interval_s)
+
+    @property
+    def _left_s(self) -> float:
+        """Return the maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
+        latest_s = self.close_s + self._interval_s + self._rhythm.tolerance_s
+        return min(latest_s, self.profile.reopened_s) + EARLY_S
+
+    @property
+    def settling_s(self) -> float:
+        """Return the time after the last pause in which a report that a link had held would be followed by another."""
+        return max(0.0, self._interval_s - self.close_s) + SETTLING_S
+
     # ------------------------------------------------------------------ frames
 
     def begin_link(self) -> None:
-        """Forget everything: the link is new."""
-        self.obeyed_at = self._interval_s = None
-        self._last_at = self._foreign_at = float("-inf")
-        self._window_s = CLOSED_S
+        """Forget everything but what was learned: the link is new."""
+        self.reacted_at = None
+        self._last_at = self._foreign_at = _NEVER
+        self._window_s = 0.0
         self.reset_times()
         self.sent_motion()
+
+    def begin_stop(self) -> None:
+        """Prepare for another stop. Pauses of the one before stay, the control does not."""
+        self.settles_at = None
+        self._controlled = False
 
     def sent_motion(self) -> None:
         """Drop the evidence: the car may drive."""
         self._drop_pauses()
         self._pending = self.settles_at = None
+        self._general = True
         self._leave_nothing()
 
     def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
         """Record the opening of a mode. `shown`: the car had shown its rest before."""
         self.sent_motion()
+        self._before = self._before_no_echo = None
         self._opened_at = now
         self._plain = True
         self._silent_mode = mode if silent and shown else None
 
     def sent_other(self) -> None:
         """Record a frame that neither moves the car nor closes a mode."""
+        self._general = self._unjudged = True
+        self.settles_at = None
         if self._closed_at is None:
             self._plain = False
 
-    def blocked(self, block_s: float) -> None:
-        """Record a frame that blocks the car for so long: the next report comes later."""
+    def blocked(self, kind: Blocking | None, block_s: float) -> None:
+        """Record a frame that blocks the car for at most so long: the next report comes later."""
         if block_s > FRAME_S:
-            self._blocked_s += block_s
+            self._blocking.append((kind, block_s))
 
     def closed(self, now: float, *, awake: bool) -> None:
-        """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly 1.0 s."""
+        """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly its block."""
         self._pending = now if awake else None
+        if not awake:
+            self._blocking.append((None, self.close_s))  # this interval is no measure
+        self._delay_s = None
+        self._unjudged = False
+        self.settles_at = None
         if self._closed_at is None:
             self._closed_at = now
         else:
@@ -257,57 +360,68 @@ class StopEvidence:
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
         """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
         self._last_at = at
-        self._before = self.settles_at = None
+        self._before = self._before_no_echo = self.settles_at = None
         if damaged:
             self._foreign_at = at
 
     def reset_times(self) -> None:
         """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
-        self._before = self._pending = self.settles_at = None
+        self._before = self._before_no_echo = self._pending = self.settles_at = None
         self._drop_pauses()
 
     def is_settled(self, event: Sensors) -> bool:
         """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
-        return event.at - self._foreign_at >= SETTLED_S or Mode.MANUAL not in candidate_modes(event)
+        return event.at - self._foreign_at >= self.settled_s or Mode.MANUAL not in candidate_modes(event)
 
     def on_reading(self, event: Sensors) -> Finding:
         """Record a reading. Return what it shows."""
         at, quiet_s = event.at, event.at - self._last_at
         self._last_at = at
+        self.found_out = False
+        # A report that comes a normal interval after the last pause was not held back by the link.
+        on_time = self.settles_at is not None and quiet_s >= self._interval_s - self._rhythm.tolerance_s
+        if on_time and Mode.MANUAL in candidate_modes(event):
+            self._before, self._blocking, self._general = at if event.range_cm else None, [], False
+            return self._obeyed(at)
         self.settles_at = None
         if Mode.MANUAL not in candidate_modes(event):
             self._other_mode(at)
             return Finding.NOTHING
         self._shapes = 0
-        if quiet_s < SETTLED_S:
-            self._before = None
-            if quiet_s < BUNCHED_S:
+        if quiet_s < self.settled_s:
+            self._before = self._before_no_echo = None
+            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * self._interval_s):
                 self._drop_pauses()
             return Finding.NOTHING
         if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
-            self._before = None
+            self._before = self._before_no_echo = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
-        blocked_s, self._blocked_s = self._blocked_s, 0.0
+        before_no_echo, self._before_no_echo = self._before_no_echo, None if event.range_cm else at
+        blocking, self._blocking = self._blocking, []
+        general, self._general = self._general, False
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
-        left = self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S)
+        within_s = self._left_s if event.range_cm else self._left_s + self.profile.ranging_s
+        left = self._left(at, quiet_s, within_s)
         if left is Finding.SHOWN:
             return self._obeyed(at)
         if left is Finding.PAUSE and event.range_cm:
             return self._left_late(at)
         pending = self._pending
         if not event.range_cm:
+            if before_no_echo is not None and pending is None and not blocking:
+                self.learned.add_interval(at - before_no_echo, echo=False)
             return Finding.NO_ECHO
         if pending is None:
-            if before is not None and not blocked_s and at - before < NORMAL_MAX_S:
-                self._interval_s = at - before
-            return Finding.REPORT
+            return self._without_mode_00(before, at, blocking, general=general)
         if before is None:
-            if at <= pending + CLOSED_S:
+            if at <= pending + self.close_s - EARLY_S:
                 return Finding.NOTHING
             self._pending = None
-            return Finding.REPORT
-        return self._compare(at - before, at - pending, at, blocked_s)
+            return self._report
+        if not self._rhythm.is_known:
+            return Finding.UNJUDGED
+        return self._compare(before, pending, at, blocking)
 
     def settle(self, now: float) -> bool:
         """Return True if the pauses count from now on: no reading came just after them."""
@@ -317,44 +431,100 @@ class StopEvidence:
         self._obeyed(self._last_at)
         return True
 
-    def _compare(self, gap_s: float, after_s: float, at: float, blocked_s: float) -> Finding:
-        """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
-        if after_s <= CLOSED_S:
+    @property
+    def _report(self) -> Finding:
+        return Finding.REPORT if self._rhythm.is_known else Finding.UNJUDGED
+
+    def _without_mode_00(
+        self, before: float | None, at: float, blocking: list[tuple[Blocking | None, float]], *, general: bool
+    ) -> Finding:
+        """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
+        if before is None:
+            return self._report
+        gap_s = at - before
+        if not blocking:
+            if general and self._rhythm.is_known:
+                self._controlled = self._rhythm.fits(gap_s)
+                if not self._controlled:
+                    self._drop_pauses()  # the link loses reports when it is written to
+            self._learn_interval(gap_s)
+        elif len(blocking) == 1 and (kind := blocking[0][0]) is not None and self._rhythm.is_known:
+            expected_s = blocking[0][1]
+            delay_s = gap_s - self._rhythm.median_s
+            self.learned.add_delay(kind, delay_s, self.profile.reopened_s)
+            if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
+                self.learned.on_reaction()
+                self.reacted_at = at
+            elif self._rhythm.fits(gap_s) and expected_s > 2 * self._rhythm.tolerance_s:
+                self.found_out = self.learned.on_no_reaction()
+        return self._report
+
+    def _learn_interval(self, gap_s: float) -> None:
+        if self.learned.add_interval(gap_s, echo=True):
+            self.found_out = True
+            self._drop_pauses()
+
+    def _compare(
+        self, before: float, pending: float, at: float, blocking: list[tuple[Blocking | None, float]]
+    ) -> Finding:
+        """Judge the interval of two reports. `MODE00` was written at `pending`."""
+        gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
+        delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
+        blocked_s = sum(block_s for _, block_s in blocking)
+        if pending >= before and after_s > IN_FLIGHT_S and not blocking:
+            self._delay_s = delay_s
+        if after_s <= close_s - EARLY_S:
             return Finding.NOTHING
-        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S:
+        matches = -tolerance_s <= delay_s - close_s <= blocked_s + tolerance_s
+        longer = -tolerance_s <= delay_s - close_s <= LONGER_S and not rhythm.is_multiple(delay_s, 2 * tolerance_s)
+        if close_s > 2 * tolerance_s and (matches or longer):
             self._pending = None
-            self._pauses += 1
-            if not self._matches(gap_s, blocked_s):
+            if not matches:
                 self._pauses_needed = PAUSES_IN_DOUBT
-            self.obeyed_at = at
-            if self._pauses < self._pauses_needed:
-                return Finding.PAUSE
-            self.words = f"{self._pauses} pauses in its reports, each after MODE00"
-            self.settles_at = at + SETTLING_S
-            return Finding.SETTLING
-        if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
+                self.learned.add_delay(Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s)
+            return self._pause(at)
+        if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:
             return Finding.NOTHING
         self._pending = None
-        self._drop_pauses()
-        if not NORMAL_MIN_S < gap_s < NORMAL_MAX_S:
+        first_delay_s, self._delay_s = self._delay_s, None
+        if first_delay_s is not None and self.learned.add_delay(
+            Blocking.MODE_CLOSE, first_delay_s, self.profile.reopened_s
+        ):
+            self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
+            return self._pause(at)
+        if not rhythm.fits(gap_s):
+            self._drop_pauses()
             return Finding.REPORT
-        if not blocked_s:
-            self._interval_s = gap_s
+        if first_delay_s is not None and not rhythm.fits(rhythm.median_s + first_delay_s):
+            return Finding.REPORT
+        self._drop_pauses()
+        if not blocking:
+            self._learn_interval(gap_s)
+        if self.profile.close_s > 2 * tolerance_s:
+            self.found_out = self.learned.on_no_reaction() or self.found_out
         return Finding.LOST
 
-    def _matches(self, gap_s: float, blocked_s: float) -> bool:
-        """Return True if a pause is as long as `MODE00` makes it: 1.0 s more than the normal interval of this car."""
-        if self._interval_s is None:  # a new link: the first pause is the measure of the next ones
-            self._interval_s = gap_s - MODE_CLOSE_S
-        return -MATCH_S <= gap_s - MODE_CLOSE_S - self._interval_s <= blocked_s + MATCH_S
+    def _pause(self, at: float) -> Finding:
+        """Count a pause."""
+        self._pauses += 1
+        self.reacted_at = at
+        self._delay_s = None
+        self.learned.on_reaction()
+        if not self._controlled and self.learned.is_confusable(self.close_s):
+            return Finding.CONTROL
+        if self._pauses < self._pauses_needed or self._unjudged:
+            return Finding.PAUSE
+        self.words = f"{self._pauses} pauses in its reports, each after MODE00"
+        self.settles_at = at + self.settling_s
+        return Finding.SETTLING
 
     def _drop_pauses(self) -> None:
-        self._pauses, self._pauses_needed = 0, PAUSES
+        self._pauses, self._pauses_needed, self._controlled = 0, PAUSES, False
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1
         self._foreign_at = at
-        self._before = None
+        self._before = self._before_no_echo = None
         self._drop_pauses()
         if self._shapes >= SHAPES or self._shape_at is not None:
             self._shape_at = at
@@ -364,10 +534,14 @@ class StopEvidence:
         """Return SHOWN if this report shows that `MODE00` alone closed the mode of the car, PAUSE if it is late."""
         closed_at = self._closed_at
         shape_at, silent = self._shape_at, self._silent_mode
-        if closed_at is None or at <= closed_at + CLOSED_S:
+        if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
             return Finding.NOTHING
-        if silent is not None and (quiet_s < OPENING_SILENCE_S or at < self._opened_at + OPENED_S + CLOSED_S):
-            return Finding.NOTHING  # an older report, on a slow link
+        opening_s = self.profile.shortest_opening_s
+        # Opening alone blocks for so long. During it a slow link delivers older reports, so less silence is no evidence.
+        if silent is not None and (
+            quiet_s < opening_s - LATE_S or at < self._opened_at + opening_s + self.close_s - EARLY_S
+        ):
+            return Finding.NOTHING
         self._shape_at = self._silent_mode = None
         if not self._plain or at > closed_at + within_s + LATE_S:
             return Finding.NOTHING
@@ -375,27 +549,27 @@ class StopEvidence:
             return Finding.NOTHING
         mode = "the mode that it reported" if silent is None else silent
         self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
-        return Finding.SHOWN if at <= closed_at + within_s else Finding.PAUSE
+        is_judged = at <= closed_at + within_s and not self._unjudged
+        return Finding.SHOWN if is_judged else Finding.PAUSE
 
     def _left_late(self, at: float) -> Finding:
-        self.obeyed_at = at
+        self.reacted_at = at
         self._pending = None
         self._drop_pauses()
         self._pauses = 1
         return Finding.PAUSE
 
     def _obeyed(self, at: float) -> Finding:
-        self.obeyed_at = at
+        self.reacted_at = at
         self._pending = None
+        self.settles_at = None
         self._drop_pauses()
-        self._window_s = CLOSED_S
+        self._window_s = 0.0
         self._leave_nothing()
+        self.learned.on_shown()
         return Finding.SHOWN
 
     def _leave_nothing(self) -> None:
         self._shapes = 0
         self._shape_at = self._silent_mode = self._closed_at = None
         self._plain = False
-
-
-assert CLOSED_S < MODE_CLOSE_S

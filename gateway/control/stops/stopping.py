@@ -4,13 +4,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import Pending
+from gateway.control.estimate.learned import Blocking, Learned
 from gateway.control.events import FrameOrigin
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences
 from gateway.control.stops.evidence import StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.protocol.enums import Mode
-from gateway.protocol.frames import Frame, ModeClose
+from gateway.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
@@ -21,27 +22,44 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 """A car in an unknown state may be avoiding obstacles; assume the worst."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
+EVIDENCE_INTERVALS: Final = 3
+"""Minimum of that timeout, in intervals with a pause: two pauses, and the report before them."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer."""
-USUAL_EVIDENCE_S: Final = 2.0
-"""Usual time from the last frame of a stop to the evidence."""
 # The silence is longer than any block outside avoidance, so the car reads the next frame alone. With growth to 6.5 s
 # the car reads one of two tries within 15 s of the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
 """Intervals from `MODE00` to the next try, by the number of tries."""
-# Without an echo the car ranges for 1.0 s before it reads the frame, is blocked for 1.0 s, ranges for another 1.0 s,
-# and reports after 0.9 s.
-REPORTED_S: Final = 4.1
-"""Minimum wait for a report after the last frame of a try."""
+REPORT_MARGIN_S: Final = 0.1
+"""Margin of the wait for a report after the last frame of a try."""
 IN_TIME_S: Final = 0.2
 """Minimum time from the write of a frame to the end of a block, so that it arrives before that end on any link."""
-GAP_S: Final = 1.5
-"""Minimum time to the next try of a stop that leaves room for other frames."""
 
 
-def style_of(profile: Profile, *, doubted: bool) -> StopStyle:
-    """Return the kind of stop for a car. `doubted`: its readings contradict its platform."""
-    return StopStyle.UNKNOWN if doubted else profile.stop_style
+def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
+    """Return the kind of stop for a car.
+
+    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame goes only
+    to a car whose platform knows it, or whose readings show that it does: others may die of it
+    (docs/reference/protocol.md#programs).
+    """
+    if profile.stop_style is StopStyle.GENERAL:
+        return StopStyle.BOTH if open_mode else StopStyle.GENERAL
+    return StopStyle.BOTH if doubted else profile.stop_style
+
+
+def evidence_s(profile: Profile, learned: Learned) -> float:
+    """Return the timeout for the evidence of a stop in addition to its worst case, s."""
+    close_s = learned.block_s(Blocking.MODE_CLOSE, profile.close_s)
+    return max(EVIDENCE_TIMEOUT_S, EVIDENCE_INTERVALS * (learned.echo.median_s + close_s))
+
+
+def reported_s(profile: Profile, learned: Learned) -> float:
+    """Return the time after the last frame of a try in which a car that obeyed it has reported, s."""
+    # Without an echo the car ranges before it reads the frame, is blocked by it, and ranges again before it reports.
+    interval_s = learned.echo.median_s or profile.interval_s
+    close_s = learned.block_s(Blocking.MODE_CLOSE, profile.close_s)
+    return 2 * profile.ranging_s + close_s + interval_s + REPORT_MARGIN_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +78,15 @@ class StopContext:
     """True if a block of our last frame runs in mode 0. The car does not range directly after it."""
     doubted: bool = False
     """True if readings contradict the platform, so the car needs a stop that works on any platform."""
+    open_mode: bool = False
+    """True if readings show a mode other than 0."""
+    clearing: ColorLed | None = None
+    """The last color, if the car may keep a string that only a color frame clears."""
 
     @property
     def style(self) -> StopStyle:
         """Return the kind of stop."""
-        return style_of(self.profile, doubted=self.doubted)
+        return style_of(self.profile, doubted=self.doubted, open_mode=self.open_mode)
 
     @property
     def manual(self) -> bool:
@@ -102,6 +124,8 @@ class StopInProgress:
     """When the motors are off at the latest, if all steps are in time and all frames arrive."""
     timeout_s: float = EVIDENCE_TIMEOUT_S
     """Timeout for the evidence, from the arrival of each command."""
+    reported_s: float = 0.0
+    """Minimum wait for a report after the last frame of a try."""
     due: float = float("inf")
     """When the next step is due, by the last call of `due_at`."""
     report_at: float = float("-inf")
@@ -111,8 +135,12 @@ class StopInProgress:
     without_echo: int = 0
     """Number of reports without an echo since the stop began."""
     probes: int = 0
+    sent_all: bool = False
+    """True if all frames of the first try are written, or a report came after its `MODE00`."""
     overdue: bool = False
     """True if the car did not show the stop in time. The stop goes on."""
+    before: Pending | None = None
+    """The mode command that this stop precedes."""
     at_rest: bool = False
     """True if the car had shown that it stands before it fell silent. Send it general stops only: unlike a named frame,
     a general stop that loses bytes cannot start the motors."""
@@ -133,7 +161,7 @@ class StopInProgress:
         """Return when the next step is due."""
         step = self.sequence.steps[self.index]
         due = self.try_at if self.index == 0 else self.last_at + step.after_s
-        self.due = max(due, pacing.ready_at(step.gate))
+        self.due = max(due, pacing.ready_at(step.gate), pacing.named_at(step.frame))
         return self.due
 
     @property
@@ -145,30 +173,38 @@ class StopInProgress:
     def next_try_at(self) -> float:
         """Return the time of the next try, if the car has not shown the stop before."""
         after = self.closed_at if self.closed_at > float("-inf") else self.last_at
-        return max(self.last_at + REPORTED_S, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+        return max(self.last_at + self.reported_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
 
     @property
     def gives_up_at(self) -> float:
         """Return when the stop counts as not shown."""
         return self.began_at + self.timeout_s
 
-    def leaves_gap(self, now: float) -> bool:
-        """Return True if other frames may go out between two tries of an overdue stop."""
-        return self.overdue and self.frames_sent and self.next_try_at > now + GAP_S
+    @property
+    def gives_way_at(self) -> float:
+        """Return when a new command may take the place of the repeats; inf if the first frames are not all written.
+
+        Missing evidence delays no command. The first frames do, through the announced worst case, unless a report came
+        in between: the car is in mode 0 then, and reads.
+        """
+        if not self.sent_all:
+            return float("inf")
+        return self.report_at if self.report_at > float("-inf") else self.obeyed_at
 
     def worst_s(self, now: float) -> float:
         """Return the longest time until the motors are off, if the frames arrive."""
         worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
-        if self.sequence is sequences.RECOVERY and self.frames_sent:
+        if self.sequence.is_recovery and self.frames_sent:
             # The car may have read all frames as one string, at the wrong places. Then only the next try counts.
             worst_at = max(worst_at, self.next_try_at + _AVOIDING_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
     def over_at(self, pacing: Pacing, now: float) -> float:
-        """Return the estimated end of the stop."""
+        """Return when a new command may take the place of the stop, as far as that is known."""
+        if self.sent_all:
+            return max(self.gives_way_at, now)
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
-        shown_s = 0.0 if self.case is StopCase.SOFT else USUAL_EVIDENCE_S
-        return max(began + self.sequence.length_s, self.worst_at, now) + shown_s
+        return max(began + self.sequence.length_s, self.worst_at, now)
 
     def on_step_written(self, now: float) -> bool:
         """Go to the next step. Return True if the written frame was the first of the stop."""
@@ -180,7 +216,13 @@ class StopInProgress:
         if isinstance(self.frame, ModeClose):
             self.closed_at = now
         self.index += 1
+        self.sent_all = self.sent_all or self.frames_sent
         return first
+
+    def on_other_written(self, now: float) -> None:
+        """Move the rest of a soft stop: its last frame must be alone in the car's buffer."""
+        if self.sequence.rank == sequences.SOFT.rank:
+            self.last_at = now
 
     def begin_try(self, sequence: StopSequence, now: float) -> None:
         """Begin the next try."""
@@ -190,29 +232,33 @@ class StopInProgress:
 def recovery(context: StopContext) -> StopSequence:
     """Return the stop that brings a car in an unknown state to rest in mode 0."""
     match context.style:
-        case StopStyle.RASPBERRY_PI:
-            return sequences.PI
-        case StopStyle.UNKNOWN:
-            return sequences.UNKNOWN
-        case StopStyle.MODE_FRAME:
-            return sequences.RECOVERY
+        case StopStyle.GENERAL:
+            return sequences.GENERAL
+        case StopStyle.BOTH:
+            return sequences.BOTH
+        case StopStyle.MODE_FRAME | StopStyle.TIMER:
+            return sequences.RECOVERY if context.clearing is None else sequences.clearing(context.clearing)
 
 
 def full(context: StopContext) -> StopSequence:
     """Return the stop that `stop`, `estop` and a shutdown send."""
     style = context.style
-    if not context.known or style is StopStyle.RASPBERRY_PI:
+    if not context.known or style is StopStyle.GENERAL:
         return recovery(context)
-    if style is StopStyle.UNKNOWN:
-        return sequences.UNKNOWN_MANUAL if context.manual else sequences.UNKNOWN
-    return sequences.FULL_BEHIND if context.manual and not context.clear else sequences.FULL
+    if style is StopStyle.BOTH:
+        return sequences.BOTH_MANUAL if context.manual else sequences.BOTH
+    if not context.manual:
+        return sequences.FULL_MODE
+    if style is StopStyle.TIMER:
+        return sequences.GENERAL  # `MODE00` would show nothing, and turn the LED off
+    return sequences.FULL if context.clear else sequences.FULL_BEHIND
 
 
 def soft(context: StopContext) -> StopSequence:
     """Return the stop that ends a drive."""
-    if context.style is StopStyle.RASPBERRY_PI:
-        return sequences.PI_SOFT
-    if context.known and context.manual and context.style is StopStyle.MODE_FRAME:
+    if context.style is StopStyle.GENERAL:
+        return sequences.GENERAL_SOFT
+    if context.known and context.manual and context.style is not StopStyle.BOTH:
         return sequences.SOFT
     return full(context)
 
@@ -226,16 +272,18 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     block_s = max(pacing.block_until - now, 0.0)
     ranging_s = FRAME_S if context.blocked else context.profile.mode_turn_s(Mode.MANUAL)
     lost_s = 0.0 if context.clear else sequences.REPEAT_INTERVAL_S
-    if sequence is sequences.FULL:
+    if sequence in (sequences.FULL, sequences.FULL_MODE):
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not context.manual and now + alone_s + IN_TIME_S < pacing.block_from:
             return block_s + WIRE_S  # read as the opening ends, before the first turn
         if not context.manual:
             return max(alone_s, block_s) + context.turn_s + WIRE_S
         return max(alone_s + ranging_s, block_s + FRAME_S) + WIRE_S
-    if sequence is sequences.RECOVERY:
+    if sequence.is_recovery and context.style is StopStyle.TIMER:
+        return sequence.steps[1].after_s + FRAME_S + WIRE_S  # nothing blocks this car
+    if sequence.is_recovery:
         return RECOVERY_WORST_S + _AVOIDING_S
-    if sequence is sequences.UNKNOWN:
+    if sequence is sequences.BOTH:
         # Even if the first frames merge with a partial frame and open a mode, the second half of the sequence closes
         # it.
         return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S

@@ -1,0 +1,250 @@
+"""Learns one car's habits from its readings: its rhythm, its delays, and whether it can show that a stop arrived. Pure.
+
+Cars of one protocol run different programs (docs/reference/protocol.md#programs). One reports every 1.25 s by its loop,
+another every second by a timer; for one `MODE00` blocks a second, for another it does not block at all. So no number
+of one program judges another. A car is compared with itself.
+
+A *rhythm* is the interval of undisturbed reports: the last few of them, their median and their spread. A report that
+the link lost or held makes a wrong interval, so an interval enters the rhythm only if it fits the others. Three in a
+row that fit each other, and not the rhythm, are a new rhythm: the car runs another program, or another car came.
+
+A *delay* is by how much a report comes later than the rhythm after one frame that may block. A car that blocks
+acknowledges each such frame by its delay; one that reports by a timer never does.
+
+"It cannot show a stop" is a finding, not a first impression. It takes `UNREACTED` blocking frames without any delay,
+and none with one. Nothing is sent just to learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from statistics import median
+from typing import Any, Final
+
+from gateway.protocol.enums import Mode
+from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+
+KEPT_INTERVALS: Final = 9
+"""Number of intervals of a rhythm."""
+SAME_S: Final = 0.18
+"""Maximum difference of intervals that belong to one rhythm: cars spread them by up to 0.08 s each way."""
+FIRM_INTERVALS: Final = 4
+"""Number of intervals from which their spread counts as known."""
+FIRST_TOLERANCE_S: Final = 0.12
+"""Tolerance until then."""
+LINK_TOLERANCE_S: Final = 0.05
+"""Tolerance for the link and the machine, in addition to the spread."""
+CHANGED_INTERVALS: Final = 3
+"""Number of consecutive intervals that are a new rhythm."""
+AGREEING_DELAYS: Final = 3
+"""Number of consecutive delays that agree and so are the block of a frame."""
+UNREACTED: Final = 4
+"""Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
+
+
+class Shows(StrEnum):
+    """Whether the car's reports show that a stop arrived."""
+
+    UNKNOWN = "not_known_yet"
+    YES = "yes"
+    """It has shown one."""
+    NO = "no"
+    """Its reports do not react to frames."""
+
+
+class Blocking(StrEnum):
+    """The frames that may delay the next report."""
+
+    MODE_CLOSE = "mode_close"
+    WHISTLE = "whistle"
+    SERVO = "servo"
+    COLOR = "color"
+
+
+def blocking_kind(frame: Frame) -> Blocking | None:
+    """Return the kind of a frame that may block; None for a frame that does not, or blocks in several ways."""
+    match frame:
+        case ModeClose():
+            return Blocking.MODE_CLOSE
+        case Ptz():
+            return Blocking.SERVO
+        case ColorLed():
+            return Blocking.COLOR
+        case General(whistle=True, servo=None, fan=False):
+            return Blocking.WHISTLE
+        case _:
+            return None
+
+
+@dataclass(slots=True)
+class Rhythm:
+    """The interval of undisturbed reports, s."""
+
+    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_INTERVALS))
+    _others: deque[float] = field(default_factory=lambda: deque(maxlen=CHANGED_INTERVALS))
+    """The last consecutive intervals that do not fit."""
+
+    @property
+    def is_known(self) -> bool:
+        """Return True if there is an interval."""
+        return bool(self.intervals)
+
+    @property
+    def median_s(self) -> float:
+        """Return the median; 0 if no interval is known."""
+        return median(self.intervals) if self.intervals else 0.0
+
+    @property
+    def spread_s(self) -> float:
+        """Return the difference of the longest and the shortest interval, s."""
+        return max(self.intervals) - min(self.intervals) if self.intervals else 0.0
+
+    @property
+    def tolerance_s(self) -> float:
+        """Return the maximum difference of an interval of this car, on this link, from the median."""
+        firm_s = 0.0 if len(self.intervals) >= FIRM_INTERVALS else FIRST_TOLERANCE_S
+        return max(self.spread_s + LINK_TOLERANCE_S, firm_s)
+
+    def fits(self, interval_s: float) -> bool:
+        """Return True if an interval belongs to this rhythm."""
+        return self.is_known and abs(interval_s - self.median_s) <= SAME_S
+
+    def add(self, interval_s: float) -> bool:
+        """Add an undisturbed interval. Return True if it completes another rhythm, which replaces this one."""
+        if not self.intervals or self.fits(interval_s):
+            self.intervals.append(interval_s)
+            self._others.clear()
+            return False
+        self._others.append(interval_s)
+        first = len(self.intervals) < 2  # nothing has confirmed the first interval yet
+        needed = 2 if first else CHANGED_INTERVALS
+        latest = list(self._others)[-needed:]
+        if len(latest) < needed or max(latest) - min(latest) > SAME_S:
+            return False
+        self.intervals.clear()
+        self.intervals.extend(latest)
+        self._others.clear()
+        return not first
+
+    def is_multiple(self, delay_s: float, tolerance_s: float) -> bool:
+        """Return True if a delay is a whole number of intervals, as if the link had lost that many reports."""
+        if not self.is_known or delay_s < self.median_s / 2:
+            return False
+        count = max(1, round(delay_s / self.median_s))
+        return abs(delay_s - count * self.median_s) <= tolerance_s
+
+
+@dataclass(slots=True)
+class Learned:
+    """The habits of one car. Times: s."""
+
+    echo: Rhythm = field(default_factory=Rhythm)
+    """The rhythm of reports of mode 0 with a sonar echo."""
+    no_echo: Rhythm = field(default_factory=Rhythm)
+    shows: Shows = Shows.UNKNOWN
+    doubted: bool = False
+    """True if the car has shown its stops before, and did not show the last one."""
+    reporting: set[Mode] = field(default_factory=set)
+    """The modes in which the car has sent readings."""
+    extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """The lowest and the highest value of each field with a number, as on the wire."""
+    _delays: dict[Blocking, deque[float]] = field(default_factory=dict)
+    _blocks: dict[Blocking, float] = field(default_factory=dict)
+    _unreacted: int = 0
+
+    # ------------------------------------------------------------------ rhythm and delays
+
+    def add_interval(self, interval_s: float, *, echo: bool) -> bool:
+        """Add an undisturbed interval. Return True if the car has another rhythm now: what it showed is forgotten."""
+        changed = (self.echo if echo else self.no_echo).add(interval_s)
+        if changed and echo:
+            self.forget_reactions()
+        return changed
+
+    def forget_reactions(self) -> None:
+        """Forget what the car can show: it is not known whether it is the same car."""
+        self.shows, self.doubted, self._unreacted = Shows.UNKNOWN, False, 0
+        self._delays.clear()
+        self._blocks.clear()
+
+    def block_s(self, kind: Blocking, expected_s: float) -> float:
+        """Return by how much a frame of this kind delays the next report: as seen, or else as expected."""
+        return self._blocks.get(kind, expected_s)
+
+    @property
+    def blocks(self) -> Mapping[Blocking, float]:
+        """Return the delays that were learned."""
+        return self._blocks
+
+    def add_delay(self, kind: Blocking, delay_s: float, longest_s: float) -> bool:
+        """Add the delay of an undisturbed report after a frame. Return True if the last delays agree.
+
+        A delay counts if it is clearly longer than the spread, shorter than `longest_s`, and is no number of lost
+        reports.
+        """
+        tolerance_s = self.echo.tolerance_s
+        if not 2 * tolerance_s < delay_s < longest_s or self.echo.is_multiple(delay_s, 2 * tolerance_s):
+            self._delays.pop(kind, None)
+            return False
+        delays = self._delays.setdefault(kind, deque(maxlen=AGREEING_DELAYS))
+        delays.append(delay_s)
+        if len(delays) < AGREEING_DELAYS or max(delays) - min(delays) > 2 * tolerance_s:
+            return False
+        self._blocks[kind] = median(delays)
+        self._unreacted = 0
+        return True
+
+    def on_reaction(self) -> None:
+        """Record that a report came late by just the block of a frame."""
+        self._unreacted = 0
+
+    def on_no_reaction(self) -> bool:
+        """Record a blocking frame without a delay. Return True if the car counts as one that cannot show a stop now."""
+        self._unreacted += 1
+        if self.shows is not Shows.UNKNOWN or self._unreacted < UNREACTED:
+            return False
+        self.shows = Shows.NO
+        return True
+
+    def on_shown(self) -> None:
+        """Record that the car has shown a stop."""
+        self.shows, self.doubted, self._unreacted = Shows.YES, False, 0
+
+    def is_confusable(self, block_s: float) -> bool:
+        """Return True if reports that the link loses could look like the delay of this block."""
+        return self.echo.is_multiple(block_s, 2 * self.echo.tolerance_s)
+
+    def on_number(self, field_name: str, value: float) -> None:
+        """Record the value of a field."""
+        low, high = self.extremes.get(field_name, (value, value))
+        self.extremes[field_name] = min(low, value), max(high, value)
+
+    # ------------------------------------------------------------------ state file
+
+    def kept(self) -> dict[str, Any]:
+        """Return what is kept over a restart, as JSON values."""
+        return {
+            "echo_s": [round(each, 4) for each in self.echo.intervals],
+            "no_echo_s": [round(each, 4) for each in self.no_echo.intervals],
+            "shows": str(self.shows),
+            "doubted": self.doubted,
+            "reporting": sorted(self.reporting),
+            "blocks_s": {str(kind): round(block_s, 4) for kind, block_s in self._blocks.items()},
+        }
+
+    @classmethod
+    def restore(cls, kept: Mapping[str, Any]) -> "Learned":
+        """Return what `kept` returned. Raises ValueError, KeyError or TypeError if it is damaged."""
+        learned = cls(
+            shows=Shows(kept["shows"]),
+            doubted=bool(kept["doubted"]),
+            reporting={Mode(mode) for mode in kept["reporting"]},
+        )
+        for rhythm, name in ((learned.echo, "echo_s"), (learned.no_echo, "no_echo_s")):
+            intervals = [float(each) for each in kept[name]]
+            if not all(0.0 < each < 60.0 for each in intervals):  # also refuses NaN
+                raise ValueError(f"{name}: {intervals}")
+            rhythm.intervals.extend(intervals)
+        learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
+        return learned
