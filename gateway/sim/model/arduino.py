@@ -4,25 +4,20 @@ It reads its string by position, as the real program does, and does not use our 
 of that name in docs/reference/protocol.md.
 """
 
-import re
 from collections.abc import Generator
 from math import inf
 from typing import Final
 
 from gateway.sim.model.firmware import (
     COLOR_S,
-    MODE_OF_DIGIT,
-    NO_ECHO_S,
     WHISTLE_S,
     CarBodyState,
-    Firmware,
     Program,
     Rng,
     Wait,
-    bits,
     motion,
 )
-from gateway.sim.model.ir_remote import SIGNS, Button
+from gateway.sim.model.mode_car import ARDUINO_LIGHTS, ModeCar, to_int
 from gateway.sim.model.traits import CarTraits
 
 TX_BUFFER: Final = 64
@@ -33,25 +28,9 @@ ARDUINO_BOOT_S: Final = 0.5
 START_SPEED: Final = 150
 OPEN_S: Final = 2.0
 BEEP_S: Final = 0.1
-AVOIDANCE_RANGINGS: Final = 5
-SHARP_S: Final = 0.08
-FAR_CM: Final = 500.0
-"""In avoidance, the program discards a distance from here on like a missing echo."""
-
-ARDUINO_LIGHTS: Final = {
-    "1": (255, 255, 255),
-    "2": (255, 0, 0),
-    "3": (0, 255, 0),
-    "4": (0, 0, 255),
-    "5": (0, 255, 255),
-    "6": (255, 0, 255),
-    "7": (255, 255, 0),
-    "8": (0, 0, 0),
-}
-_JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d+)#")
 
 
-class ArduinoCar(Firmware):
+class ArduinoCar(ModeCar):
     """A car with the vendor's Arduino program. Options: `arm`, `imu`."""
 
     def __init__(
@@ -64,7 +43,6 @@ class ArduinoCar(Firmware):
         now: float = 0.0,
     ) -> None:
         super().__init__(body, rng, options=options, traits=traits, now=now)
-        self._joints = [90] * 6
         # The program counts turns of its loop, so this time stands still while the program blocks.
         self.report_interval_s = self._traits.loop_s
         """Loop time from one report to the next, without the ranging. About a second: cars differ."""
@@ -103,21 +81,10 @@ class ArduinoCar(Firmware):
             self._serial_event()
             if self._complete and (yield from self._parse()):
                 continue  # the car obeys bytes from the time of an opening right after it, not a turn later
-            match self._mode:
-                case 0:
-                    yield from self._manual()
-                case 2:
-                    yield from self._tracking()
-                case 3:
-                    yield from self._avoidance()
-                case 4:
-                    yield from self._color_led()
-                case 5:
-                    yield from self._light_seeking()
-                case 6:
-                    yield from self._following()
-                case _:
-                    yield from self._remote()
+            if self._mode == 0:
+                yield from self._manual()
+            else:
+                yield from self._mode_turn()
 
     # From the host.
 
@@ -212,7 +179,7 @@ class ArduinoCar(Firmware):
         if (at := text.find("PTZ")) > 0:
             end = text.find("#", at)
             if end > at:
-                yield from self._turn_servo(self._servo_deg(_to_int(text[at + 3 : end])))
+                yield from self._turn_servo(self._servo_deg(to_int(text[at + 3 : end])))
                 return True
         elif text.find("CLR") > 0:
             red, green, blue = (_field(text, word) for word in ("CLR", "CLG", "CLB"))
@@ -225,10 +192,7 @@ class ArduinoCar(Firmware):
                 )
                 yield from self._busy(COLOR_S)
                 return True
-        elif "arm" in self._options and (joints := _JOINTS.search(text)):
-            self._joints = [min(180, int(value)) for value in joints.groups()]
-            return True
-        return False
+        return self._set_joints(text)
 
     # Mode 0.
 
@@ -262,10 +226,6 @@ class ArduinoCar(Firmware):
         if self._mode == 0 and not self._is_silent:
             self._send(self._report_frame(self._range()))
 
-    @property
-    def _is_silent(self) -> bool:
-        return MODE_OF_DIGIT[self._mode] in self._traits.silent_modes
-
     def _print(self, data: bytes) -> Program:
         """Send a frame; block while the 64-byte transmit buffer is full."""
         room_at = self._tx_free - (TX_BUFFER - len(data)) / self._rate
@@ -283,148 +243,9 @@ class ArduinoCar(Firmware):
         else:
             yield from self._print(frame)
 
-    # Mode 1.
-
-    def press(self, button: Button, now: float) -> bool:
-        """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
-        self._run(now)
-        if self._mode != 1 or self._pressed is not None:
-            return False
-        self._pressed = button
-        self._run(now)
-        return True
-
-    def _remote(self) -> Program:
-        """Obey only the infrared remote (row "remote control")."""
-        yield Wait(inf, wakes=True)
-        button, self._pressed = self._pressed, None
-        match button:
-            case None:
-                pass
-            case Button.WHISTLE:
-                yield from self._busy(WHISTLE_S)
-            case Button.FASTER:
-                self._faster()
-            case Button.SLOWER:
-                self._slower()
-            case _:
-                left, right = SIGNS[button]
-                self._drive(left * self._speed, right * self._speed)
-
-    # The other modes. Each sets the speed, which mode 0 keeps afterwards.
-
-    def _go(self, left: int, right: int, speed: int) -> None:
-        self._speed = speed
-        self._drive(left * speed, right * speed)
-
-    def _tracking(self) -> Program:
-        line = self._body.line(self._now)
-        left_outer, left_inner, right_inner, right_outer = line
-        yield from self._turn(f"CSB0,PV8,GS0,LF{bits(line)},HW00,GM00")
-        if (left_outer or left_inner) and right_outer:
-            self._go(1, -1, 250)
-            yield from self._busy(SHARP_S)
-        elif left_outer and right_inner:
-            self._go(-1, 1, 250)
-            yield from self._busy(SHARP_S)
-        elif left_outer:
-            self._go(-1, 1, 150)
-        elif right_outer:
-            self._go(1, -1, 150)
-        elif left_inner and not right_inner:
-            self._go(0, 1, 220)
-        elif right_inner and not left_inner:
-            self._go(1, 0, 220)
-        elif left_inner and right_inner:
-            self._go(1, 1, 250)
-        # No line under any sensor: the motors stay as they were.
-
-    def _light_seeking(self) -> Program:
-        seen = self._body.light(self._now)
-        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
-
-    def _following(self) -> Program:
-        """Follow an object (row "6 following"): no `#`, inverted bits, 0 = object seen."""
-        seen = self._body.obstacle(self._now)
-        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
-
-    def _color_led(self) -> Program:
-        yield from self._turn_servo(self._color_position)
-        red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
-        self._rgb = (red, green, blue)
-        yield from self._busy(COLOR_S)
-        self._color_position = (self._color_position + 10) % 190
-
-    def _avoidance(self) -> Program:
-        cm = yield from self._distance()
-        if cm < 20:
-            self._blocked = True
-            yield from self._maneuver()
-            self._blocked = False
-            return
-        left, right = self._body.obstacle(self._now)
-        if right and not left:
-            self._go(-1, 1, 200)
-            yield from self._busy(0.2)
-        elif left:
-            self._go(1, -1, 200)
-            yield from self._busy(0.2)
-        if cm > 30:
-            self._rgb = ARDUINO_LIGHTS["3"]
-            self._go(1, 1, 200)
-        else:
-            self._go(1, 1, 100)
-
-    def _distance(self) -> Generator[Wait, None, float]:
-        """Return the distance of five rangings, 0.1 s. Without echo, brake and block for ever."""
-        found = []
-        for _ in range(AVOIDANCE_RANGINGS):
-            while (cm := self._range()) is None or cm >= FAR_CM:
-                self._drive(0, 0)
-                yield from self._busy(NO_ECHO_S)
-            found.append(cm)
-            yield Wait(self._now + 0.1 / AVOIDANCE_RANGINGS)
-        return sum(sorted(found)[1:4]) / 3
-
-    def _maneuver(self) -> Program:
-        """Back off, range right, left and ahead, turn: 4.2 s with the ranging before it, 4.3 s if hemmed in."""
-        self._rgb = ARDUINO_LIGHTS["2"]
-        self._go(-1, -1, 80)
-        yield from self._busy(0.08)
-        self._drive(0, 0)
-        seen = []
-        for degrees in (0, 180, 90):
-            yield from self._turn_servo(degrees)
-            yield from self._busy(0.5)
-            seen.append((yield from self._distance()))
-        right, left, _ = seen
-        if max(seen) < 10:
-            self._rgb = ARDUINO_LIGHTS["6"]
-            self._go(1, -1, 200)
-            yield from self._busy(0.37)
-        elif left >= right:
-            self._rgb = ARDUINO_LIGHTS["4"]
-            self._go(-1, 1, 200)
-            yield from self._busy(0.28)
-        else:
-            self._rgb = ARDUINO_LIGHTS["6"]
-            self._go(1, -1, 200)
-            yield from self._busy(0.28)
-        self._drive(0, 0)
-
-
-def _to_int(text: str) -> int:
-    """Return the leading digits as a number, 0 without any, as Arduino's String.toInt()."""
-    digits = re.match(r"\s*[+-]?\d{1,9}", text)
-    return int(digits[0]) if digits else 0
-
 
 def _field(text: str, word: str) -> int | None:
     """Return the number after a word of a color frame, 0..255. None if the number or its end is missing."""
     at = text.find(word)
     end = text.find("#" if word == "CLB" else ",", at) if at >= 0 else -1
-    return min(255, max(0, _to_int(text[at + 3 : end]))) if end > at else None
+    return min(255, max(0, to_int(text[at + 3 : end]))) if end > at else None
