@@ -1,5 +1,6 @@
 """The simulated cars' pure core: programs on virtual time, and the world. No I/O, no clock, no randomness.
 
-`firmware` is the base of the programs `arduino` and `raspberry_pi`. `car_body` puts a car into the `world` with its
-`objects`. `faulty_link` carries the bytes, `capture_car` plays a capture, `scheduler` orders the programs.
+`firmware` is the base of the programs `arduino`, `stm32`, `raspberry_pi` and `course`, `traits` has their parameters,
+`mode_car` the modes. `car_body` puts a car into the `world` with its `objects`. `faulty_link` carries the bytes,
+`capture_car` plays a capture, `scheduler` orders the programs.
 """

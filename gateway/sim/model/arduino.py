@@ -1,28 +1,24 @@
-"""The program of the Arduino car and of the STM32 car: one loop, one string, modes.
+"""The program of the Arduino car: one loop, one string, modes. Its traits make it another car of the family.
 
 It reads its string by position, as the real program does, and does not use our codec. "Row" in a comment means the row
 of that name in docs/reference/protocol.md.
 """
 
-import re
 from collections.abc import Generator
 from math import inf
 from typing import Final
 
 from gateway.sim.model.firmware import (
     COLOR_S,
-    NO_ECHO_S,
-    REPORT_INTERVAL_S,
     WHISTLE_S,
     CarBodyState,
-    Firmware,
     Program,
     Rng,
     Wait,
-    bits,
     motion,
 )
-from gateway.sim.model.ir_remote import SIGNS, Button
+from gateway.sim.model.mode_car import ARDUINO_LIGHTS, ModeCar, to_int
+from gateway.sim.model.traits import CarTraits
 
 TX_BUFFER: Final = 64
 # A wedged car never clears its string, which grows until the RAM is full.
@@ -30,49 +26,42 @@ STRING_LIMIT: Final = 512
 """Maximum length of the string. Further bytes are dropped."""
 ARDUINO_BOOT_S: Final = 0.5
 START_SPEED: Final = 150
-CLOSE_S: Final = 1.0
 OPEN_S: Final = 2.0
 BEEP_S: Final = 0.1
-AVOIDANCE_RANGINGS: Final = 5
-SHARP_S: Final = 0.08
-FAR_CM: Final = 500.0
-"""In avoidance, the program discards a distance from here on like a missing echo."""
-
-ARDUINO_LIGHTS: Final = {
-    "1": (255, 255, 255),
-    "2": (255, 0, 0),
-    "3": (0, 255, 0),
-    "4": (0, 0, 255),
-    "5": (0, 255, 255),
-    "6": (255, 0, 255),
-    "7": (255, 255, 0),
-    "8": (0, 0, 0),
-}
-_JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d+)#")
 
 
-class ArduinoCar(Firmware):
+class ArduinoCar(ModeCar):
     """A car with the vendor's Arduino program. Options: `arm`, `imu`."""
 
     def __init__(
-        self, body: CarBodyState, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0
+        self,
+        body: CarBodyState,
+        rng: Rng,
+        *,
+        options: frozenset[str] = frozenset(),
+        traits: CarTraits | None = None,
+        now: float = 0.0,
     ) -> None:
-        super().__init__(body, rng, options=options, now=now)
-        self._joints = [90] * 6
-        self.report_interval_s = REPORT_INTERVAL_S
+        super().__init__(body, rng, options=options, traits=traits, now=now)
+        # The program counts turns of its loop, so this time stands still while the program blocks.
+        self.report_interval_s = self._traits.loop_s
         """Loop time from one report to the next, without the ranging. About a second: cars differ."""
         self._reset_variables()
 
     def _reset_variables(self) -> None:
         """Set the program's variables to their values after a start."""
         self._string = ""
+        self._arriving = ""
+        """The frame that arrives, if a `$` restarts the string."""
         self._started = False
         self._complete = False
         self._pressed = None
         self._speed = START_SPEED
         self._color_position = 0
         # Loop time until each frame of mode 0. The frames of the options come between the reports, so that none blocks.
-        self._due = {"report": self.report_interval_s}
+        self._due: dict[str, float] = {}
+        if not self._traits.timer:
+            self._due["report"] = self._next_interval_s(self.report_interval_s)
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
@@ -86,30 +75,24 @@ class ArduinoCar(Firmware):
         yield from self._main()
 
     def _main(self) -> Program:
+        if self._traits.timer:
+            self._alarm_at = self._now + self._next_interval_s(self._traits.interval_s)
         while True:
             self._serial_event()
             if self._complete and (yield from self._parse()):
                 continue  # the car obeys bytes from the time of an opening right after it, not a turn later
-            match self._mode:
-                case 0:
-                    yield from self._manual()
-                case 2:
-                    yield from self._tracking()
-                case 3:
-                    yield from self._avoidance()
-                case 4:
-                    yield from self._color_led()
-                case 5:
-                    yield from self._light_seeking()
-                case 6:
-                    yield from self._following()
-                case _:
-                    yield from self._remote()
+            if self._mode == 0:
+                yield from self._manual()
+            else:
+                yield from self._mode_turn()
 
     # From the host.
 
     def _serial_event(self) -> None:
         """Append all buffered bytes to ONE string. `#` completes it even outside a frame (row "a lone #")."""
+        if self._traits.last_frame_wins:
+            self._keep_last()
+            return
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
@@ -121,15 +104,27 @@ class ArduinoCar(Firmware):
                 self._started = False
         self._buffer.clear()
 
+    def _keep_last(self) -> None:
+        """Keep the last whole frame of the buffered bytes. A `#` outside a frame does nothing."""
+        for byte in self._buffer:
+            char = chr(byte)
+            if char == "$":
+                self._started, self._arriving = True, ""
+            if self._started and len(self._arriving) < STRING_LIMIT:
+                self._arriving += char
+            if char == "#" and self._started:
+                self._string, self._complete, self._started = self._arriving, True, False
+        self._buffer.clear()
+
     def _parse(self) -> Generator[Wait, None, bool]:
         """Obey the string; return True if it was cleared."""
-        text = self._string
-        if text.find("MODE") > 0 and text.find("4WD") > 0:
+        text, head = self._string, self._traits.head
+        if text.find("MODE") > 0 and text.find(head) > 0:
             yield from self._mode_frame(text)
         elif self._mode != 0:
             pass  # row "a general stop in a mode other than 0"
         elif not (yield from self._named_frame(text)):
-            if "4WD" in text:
+            if head in text:
                 return False  # row "a named frame it does not know": neither obeyed nor cleared
             yield from self._general_frame(text)
         self._string = ""
@@ -137,14 +132,15 @@ class ArduinoCar(Firmware):
         return True
 
     def _mode_frame(self, text: str) -> Program:
-        """Read the digits at places 9 and 10 of the string, whatever they are."""
+        """Read the digits at places 9 and 10 of the string (with a head of three letters), whatever they are."""
         self._pressed = None
-        if text[10:11] == "0":
+        place = len(self._traits.head) + 6
+        if text[place + 1 : place + 2] == "0":
             self._drive(0, 0)
             self._mode = 0
-            yield from self._busy(CLOSE_S)
+            yield from self._busy(self._traits.close_s)
             return
-        digit = text[9:10]
+        digit = text[place : place + 1]
         known = digit in ("0", "1", "2", "3", "4", "5", "6")
         self._mode = int(digit) if known else 0
         # Row "a mode opened while driving": nothing here touches the motors.
@@ -165,11 +161,11 @@ class ArduinoCar(Firmware):
         elif text[9:10] == "2":
             yield from self._turn_servo(0)
         self._rgb = ARDUINO_LIGHTS.get(text[13:14], self._rgb)
-        if text[15:16] == "1":
-            self._fan = not self._fan
+        self._set_fan(text[15:16])
         if text[17:18] == "1":
             yield from self._turn_servo(90)
         self._drive(left * self._speed, right * self._speed)
+        self._print_text()
 
     def _faster(self) -> None:
         self._speed = min(255, self._speed + 50)
@@ -183,7 +179,7 @@ class ArduinoCar(Firmware):
         if (at := text.find("PTZ")) > 0:
             end = text.find("#", at)
             if end > at:
-                yield from self._turn_servo(180 - _to_int(text[at + 3 : end]))
+                yield from self._turn_servo(self._servo_deg(to_int(text[at + 3 : end])))
                 return True
         elif text.find("CLR") > 0:
             red, green, blue = (_field(text, word) for word in ("CLR", "CLG", "CLB"))
@@ -196,17 +192,14 @@ class ArduinoCar(Firmware):
                 )
                 yield from self._busy(COLOR_S)
                 return True
-        elif "arm" in self._options and (joints := _JOINTS.search(text)):
-            self._joints = [min(180, int(value)) for value in joints.groups()]
-            return True
-        return False
+        return self._set_joints(text)
 
     # Mode 0.
 
     def _manual(self) -> Program:
         """Wait for a byte or the next frame to send. While the fan runs, loop turns do not count."""
         since = self._now
-        due = inf if self._fan else since + min(self._due.values())
+        due = inf if self._fan else since + min(self._due.values(), default=inf)
         yield Wait(due, wakes=True)
         if self._fan:
             return
@@ -214,180 +207,45 @@ class ArduinoCar(Firmware):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = self.report_interval_s
+            self._due[what] = self._next_interval_s(self.report_interval_s)
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:
         if what == "arm":
-            self._send(("$4WD," + ",".join(f"J{n}{deg}" for n, deg in enumerate(self._joints, 1)) + "#").encode())
+            self._send(self._arm_frame(self._joints))
         elif what == "imu":
             self._send(self._imu_frame())
         else:
             cm = yield from self._ranging()
-            now, body = self._now, self._body
-            gray = min(1023, max(0, body.grayscale(now) + round(4 * (self._rng.random() - 0.5))))
-            yield from self._print(
-                f"$4WD,CSB{0.0 if cm is None else cm:.2f},PV{body.battery_v(now):.2f},GS{gray},"
-                f"LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}#"
-            )
+            if not self._is_silent:
+                yield from self._print(self._report_frame(cm))
 
-    def _print(self, text: str) -> Program:
+    def _on_alarm(self) -> None:
+        """Report by the timer, also during a block. Its ranging blocks nothing."""
+        self._alarm_at += self._next_interval_s(self._traits.interval_s)
+        if self._mode == 0 and not self._is_silent:
+            self._send(self._report_frame(self._range()))
+
+    def _print(self, data: bytes) -> Program:
         """Send a frame; block while the 64-byte transmit buffer is full."""
-        data = text.encode()
         room_at = self._tx_free - (TX_BUFFER - len(data)) / self._rate
         if room_at > self._now:
             yield Wait(room_at)
         self._send(data)
 
-    def _turn(self, frame: str) -> Program:
+    def _turn(self, fields: str) -> Program:
         """Send the frame of one loop turn in modes 2, 5 and 6, at the rate of the UART."""
-        if self._fan:
+        frame = self._frame(fields)
+        if self._mode == 6:
+            frame = frame[:-1]  # row "6 following": no `#`
+        if self._fan or self._is_silent:
             yield Wait(self._now + len(frame) / self._rate)
         else:
             yield from self._print(frame)
-
-    # Mode 1.
-
-    def press(self, button: Button, now: float) -> bool:
-        """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
-        self._run(now)
-        if self._mode != 1 or self._pressed is not None:
-            return False
-        self._pressed = button
-        self._run(now)
-        return True
-
-    def _remote(self) -> Program:
-        """Obey only the infrared remote (row "remote control")."""
-        yield Wait(inf, wakes=True)
-        button, self._pressed = self._pressed, None
-        match button:
-            case None:
-                pass
-            case Button.WHISTLE:
-                yield from self._busy(WHISTLE_S)
-            case Button.FASTER:
-                self._faster()
-            case Button.SLOWER:
-                self._slower()
-            case _:
-                left, right = SIGNS[button]
-                self._drive(left * self._speed, right * self._speed)
-
-    # The other modes. Each sets the speed, which mode 0 keeps afterwards.
-
-    def _go(self, left: int, right: int, speed: int) -> None:
-        self._speed = speed
-        self._drive(left * speed, right * speed)
-
-    def _tracking(self) -> Program:
-        line = self._body.line(self._now)
-        left_outer, left_inner, right_inner, right_outer = line
-        yield from self._turn(f"$4WD,CSB0,PV8,GS0,LF{bits(line)},HW00,GM00#")
-        if (left_outer or left_inner) and right_outer:
-            self._go(1, -1, 250)
-            yield from self._busy(SHARP_S)
-        elif left_outer and right_inner:
-            self._go(-1, 1, 250)
-            yield from self._busy(SHARP_S)
-        elif left_outer:
-            self._go(-1, 1, 150)
-        elif right_outer:
-            self._go(1, -1, 150)
-        elif left_inner and not right_inner:
-            self._go(0, 1, 220)
-        elif right_inner and not left_inner:
-            self._go(1, 0, 220)
-        elif left_inner and right_inner:
-            self._go(1, 1, 250)
-        # No line under any sensor: the motors stay as they were.
-
-    def _light_seeking(self) -> Program:
-        seen = self._body.light(self._now)
-        yield from self._turn(f"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}#")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
-
-    def _following(self) -> Program:
-        """Follow an object (row "6 following"): no `#`, inverted bits, 0 = object seen."""
-        seen = self._body.obstacle(self._now)
-        yield from self._turn(f"$4WD,CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
-
-    def _color_led(self) -> Program:
-        yield from self._turn_servo(self._color_position)
-        red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
-        self._rgb = (red, green, blue)
-        yield from self._busy(COLOR_S)
-        self._color_position = (self._color_position + 10) % 190
-
-    def _avoidance(self) -> Program:
-        cm = yield from self._distance()
-        if cm < 20:
-            self._blocked = True
-            yield from self._maneuver()
-            self._blocked = False
-            return
-        left, right = self._body.obstacle(self._now)
-        if right and not left:
-            self._go(-1, 1, 200)
-            yield from self._busy(0.2)
-        elif left:
-            self._go(1, -1, 200)
-            yield from self._busy(0.2)
-        if cm > 30:
-            self._rgb = ARDUINO_LIGHTS["3"]
-            self._go(1, 1, 200)
-        else:
-            self._go(1, 1, 100)
-
-    def _distance(self) -> Generator[Wait, None, float]:
-        """Return the distance of five rangings, 0.1 s. Without echo, brake and block for ever."""
-        found = []
-        for _ in range(AVOIDANCE_RANGINGS):
-            while (cm := self._range()) is None or cm >= FAR_CM:
-                self._drive(0, 0)
-                yield from self._busy(NO_ECHO_S)
-            found.append(cm)
-            yield Wait(self._now + 0.1 / AVOIDANCE_RANGINGS)
-        return sum(sorted(found)[1:4]) / 3
-
-    def _maneuver(self) -> Program:
-        """Back off, range right, left and ahead, turn: 4.2 s with the ranging before it, 4.3 s if hemmed in."""
-        self._rgb = ARDUINO_LIGHTS["2"]
-        self._go(-1, -1, 80)
-        yield from self._busy(0.08)
-        self._drive(0, 0)
-        seen = []
-        for degrees in (0, 180, 90):
-            yield from self._turn_servo(degrees)
-            yield from self._busy(0.5)
-            seen.append((yield from self._distance()))
-        right, left, _ = seen
-        if max(seen) < 10:
-            self._rgb = ARDUINO_LIGHTS["6"]
-            self._go(1, -1, 200)
-            yield from self._busy(0.37)
-        elif left >= right:
-            self._rgb = ARDUINO_LIGHTS["4"]
-            self._go(-1, 1, 200)
-            yield from self._busy(0.28)
-        else:
-            self._rgb = ARDUINO_LIGHTS["6"]
-            self._go(1, -1, 200)
-            yield from self._busy(0.28)
-        self._drive(0, 0)
-
-
-def _to_int(text: str) -> int:
-    """Return the leading digits as a number, 0 without any, as Arduino's String.toInt()."""
-    digits = re.match(r"\s*[+-]?\d{1,9}", text)
-    return int(digits[0]) if digits else 0
 
 
 def _field(text: str, word: str) -> int | None:
     """Return the number after a word of a color frame, 0..255. None if the number or its end is missing."""
     at = text.find(word)
     end = text.find("#" if word == "CLB" else ",", at) if at >= 0 else -1
-    return min(255, max(0, _to_int(text[at + 3 : end]))) if end > at else None
+    return min(255, max(0, to_int(text[at + 3 : end]))) if end > at else None

@@ -2,11 +2,14 @@
 
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
+from gateway.sim.model.course import CourseCar
 from gateway.sim.model.firmware import Firmware, Rng
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.stm32 import Stm32Car
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 
-PLATFORMS = ("arduino", "stm32", "raspberry_pi")
+PLATFORMS = ("arduino", "stm32", "raspberry_pi", "course")
 OPTIONS = ("arm", "imu")
 
 
@@ -20,18 +23,25 @@ def build(
     transport: Transport = Transport.SERIAL,
     now: float = 0.0,
     name: str = "",
+    traits: CarTraits | None = None,
 ) -> Firmware:
     """Return car number `index` of the world, at rest on its start pose, with its program just started.
 
     `name`: its name in the world file, which gives its place and the things that it carries. `transport` is used for a
-    Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
+    Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART. `traits`: None for those of the platform;
+    the course's program has none.
     """
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware
-    if platform == "raspberry_pi":
-        car = RaspberryPiCar(body, rng, transport=transport, options=options, now=now)
-    else:
-        car = ArduinoCar(body, rng, options=options, now=now)
+    match platform:
+        case "raspberry_pi":
+            car = RaspberryPiCar(body, rng, transport=transport, options=options, traits=traits, now=now)
+        case "course":
+            car = CourseCar(body, rng, transport=transport, now=now)
+        case "stm32":
+            car = Stm32Car(body, rng, options=options, traits=traits, now=now)
+        case _:
+            car = ArduinoCar(body, rng, options=options, traits=traits, now=now)
     if world.lively:
         car.scheduler = world.scheduler
         world.scheduler.join(car)

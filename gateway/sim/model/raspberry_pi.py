@@ -11,7 +11,6 @@ from typing import Final
 from gateway.sim.model.firmware import (
     BYTES_PER_S,
     COLOR_S,
-    REPORT_INTERVAL_S,
     WHISTLE_S,
     CarBodyState,
     Firmware,
@@ -21,6 +20,7 @@ from gateway.sim.model.firmware import (
     bits,
     motion,
 )
+from gateway.sim.model.traits import CarTraits
 
 TCP_RECEIVE: Final = 128
 """Maximum bytes of one receive."""
@@ -70,11 +70,12 @@ class RaspberryPiCar(Firmware):
         *,
         transport: Transport = Transport.TCP,
         options: frozenset[str] = frozenset(),
+        traits: CarTraits | None = None,
         now: float = 0.0,
     ) -> None:
         tcp = transport is Transport.TCP
         rate, buffer = (inf, SOCKET_BUFFER) if tcp else (BYTES_PER_S, TTY_BUFFER)
-        super().__init__(body, rng, options=options, rate=rate, buffer=buffer, now=now)
+        super().__init__(body, rng, options=options, traits=traits, rate=rate, buffer=buffer, now=now)
         self._tcp = tcp
         self._camera = {"vertical": 90.0, "horizontal": 90.0}
         self._joints = [90] * 6
@@ -88,7 +89,7 @@ class RaspberryPiCar(Firmware):
         self._turning: tuple[str, int, float] | None = None
         self._client = False
         self._client_gone = False
-        self._due = {"report": REPORT_INTERVAL_S}
+        self._due = {"report": self._next_interval_s(self._traits.loop_s)}
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
@@ -162,15 +163,16 @@ class RaspberryPiCar(Firmware):
 
     def _parse(self, text: str) -> Program:
         servo: int | None = None
-        if "$4WD,PTZ" in text:
-            servo = 180 - _number(text, "PTZ", "#")
+        head = "$" + self._traits.head
+        if f"{head},PTZ" in text:
+            servo = self._servo_deg(_number(text, "PTZ", "#"))
         if "CLR" in text:
             self._rgb = (_number(text, "CLR", ",CLG"), _number(text, "CLG", ",CLB"), _number(text, "CLB", "#"))
             yield from self._busy(COLOR_S)
         if "arm" in self._options and "ServoJ1" in text:
             ends = [*(f",J{n}" for n in range(2, 7)), "#"]
             self._joints = [min(180, _number(text, f"J{n}", end)) for n, end in enumerate(ends, 1)]
-        if "$4WD" not in text:
+        if head not in text:
             servo = yield from self._general_frame(text)
         if servo is not None:
             yield from self._turn_servo(servo)
@@ -193,12 +195,13 @@ class RaspberryPiCar(Firmware):
         elif text[13] in PI_LIGHTS:
             self._rgb = PI_LIGHTS[text[13]]
             yield from self._busy(LIGHT_S)
+        self._set_fan(text[15])
         if text[15] == "1":
-            self._fan = not self._fan
             yield from self._busy(FAN_S)
         self._turn_camera(text[9])
         pwm = self._pwm()
         self._drive(left * pwm, right * pwm)
+        self._print_text()
         return 90 if text[17] == "1" else {"1": 180, "2": 0}.get(text[9])
 
     def _turn_camera(self, digit: str) -> None:
@@ -227,21 +230,21 @@ class RaspberryPiCar(Firmware):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = REPORT_INTERVAL_S
+            self._due[what] = self._next_interval_s(self._traits.loop_s)
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:
         if what == "arm":
-            frame = ("$4WD," + ",".join(f"J{n}{deg}" for n, deg in enumerate(self._joints, 1)) + "#").encode()
+            frame = self._arm_frame(self._joints)
         elif what == "imu":
             frame = self._imu_frame()
         else:
             cm = yield from self._ranging()
             now, body = self._now, self._body
-            frame = (
-                f"$4WD,CSB{int(cm or 0)},PV8.4,GS0,"
-                f"LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}#"
-            ).encode()
+            frame = self._frame(
+                f"CSB{int(cm or 0)},PV{4.2 * self._traits.cells:.1f},GS0,"
+                f"LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}"
+            )
         if self._tcp:
             if self._client_gone:
                 raise _Died

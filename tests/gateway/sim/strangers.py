@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import serial
 
 from gateway.sim.car_spec import parse_cars
-from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware, Truth
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
 
@@ -102,12 +102,17 @@ class VirtualStranger:
 
 
 def virtual(
-    platform: str = "arduino", *, world: World | None = None, tcp: bool = False, seed: int = 1, options: str = ""
+    platform: str = "arduino",
+    *,
+    world: World | None = None,
+    tcp: bool = False,
+    seed: int = 1,
+    options: str = "",
+    traits: CarTraits | None = None,
 ) -> VirtualStranger:
     transport = Transport.TCP if tcp else Transport.SERIAL
-    chosen = frozenset(options.split())
-    car = build(platform, world or World.room(), 0, random.Random(seed), options=chosen, transport=transport)
-    assert isinstance(car, ArduinoCar | RaspberryPiCar)
+    rng, chosen = random.Random(seed), frozenset(options.split())
+    car = build(platform, world or World.room(), 0, rng, options=chosen, transport=transport, traits=traits)
     return VirtualStranger(car)
 
 

@@ -48,12 +48,11 @@ BLOCKS = [
 ]
 
 
-@pytest.mark.parametrize("platform", ["arduino", "stm32"])
 @pytest.mark.parametrize(("what", "frame", "least", "most"), BLOCKS, ids=[row[0] for row in BLOCKS])
 async def test_a_frame_sent_while_blocked_is_obeyed_when_the_block_is_over(
-    platform: str, what: str, frame: bytes, least: float, most: float
+    what: str, frame: bytes, least: float, most: float
 ) -> None:
-    car = virtual(platform)
+    car = virtual()
     await car.wait(0.2)  # well before the first report
     await car.write(frame)
     obeyed = car.now + len(frame) / 960

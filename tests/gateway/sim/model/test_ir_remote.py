@@ -15,15 +15,15 @@ async def in_mode(mode: int, platform: str = "arduino") -> VirtualStranger:
     return car
 
 
-@pytest.mark.parametrize("platform", ["arduino", "stm32"])
+@pytest.mark.parametrize(("platform", "pwm"), [("arduino", 150), ("stm32", 51)])
 @pytest.mark.parametrize("button", SIGNS)
-async def test_in_remote_control_it_drives_and_the_motion_holds(platform: str, button: Button) -> None:
+async def test_in_remote_control_it_drives_and_the_motion_holds(platform: str, pwm: int, button: Button) -> None:
     car = await in_mode(1, platform)
     assert car.car.press(button, car.now)
     left, right = SIGNS[button]
     for _ in range(100):
         await car.wait(0.1)
-        assert (car.truth.motor_left, car.truth.motor_right) == (left * 150, right * 150)
+        assert (car.truth.motor_left, car.truth.motor_right) == (left * pwm, right * pwm)
     assert car.car.press(Button.STOP, car.now)
     assert not car.truth.driving
     assert not car.received, "remote control is silent"

@@ -1,0 +1,234 @@
+"""The modes of the Arduino and STM32 programs: what a car does by itself, and the infrared remote.
+
+"Row" in a comment means the row of that name in docs/reference/protocol.md.
+"""
+
+import re
+from collections.abc import Generator
+from math import inf
+from typing import Final
+
+from gateway.sim.model.firmware import (
+    COLOR_S,
+    MODE_OF_DIGIT,
+    NO_ECHO_S,
+    WHISTLE_S,
+    CarBodyState,
+    Firmware,
+    Program,
+    Rng,
+    Wait,
+    bits,
+)
+from gateway.sim.model.ir_remote import SIGNS, Button
+from gateway.sim.model.traits import CarTraits
+
+AVOIDANCE_RANGINGS: Final = 5
+SHARP_S: Final = 0.08
+FAR_CM: Final = 500.0
+"""In avoidance, the program discards a distance from here on like a missing echo."""
+
+ARDUINO_LIGHTS: Final = {
+    "1": (255, 255, 255),
+    "2": (255, 0, 0),
+    "3": (0, 255, 0),
+    "4": (0, 0, 255),
+    "5": (0, 255, 255),
+    "6": (255, 0, 255),
+    "7": (255, 255, 0),
+    "8": (0, 0, 0),
+}
+_JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d+)#")
+
+
+class ModeCar(Firmware):
+    """A car with modes. A subclass has its main loop, obeys the frames and prints."""
+
+    def __init__(
+        self,
+        body: CarBodyState,
+        rng: Rng,
+        *,
+        options: frozenset[str] = frozenset(),
+        traits: CarTraits | None = None,
+        now: float = 0.0,
+    ) -> None:
+        super().__init__(body, rng, options=options, traits=traits, now=now)
+        self._joints = [90] * 6
+        self._color_position = 0
+
+    def _set_joints(self, text: str) -> bool:
+        """Obey the frame of an arm; return True if the text is one and the car has an arm."""
+        found = _JOINTS.search(text) if "arm" in self._options else None
+        if found:
+            self._joints = [min(180, int(value)) for value in found.groups()]
+        return found is not None
+
+    @property
+    def _is_silent(self) -> bool:
+        return MODE_OF_DIGIT[self._mode] in self._traits.silent_modes
+
+    def _turn(self, fields: str) -> Program:
+        """Print the frame of one loop turn in modes 2, 5 and 6, which takes the time of the turn."""
+        raise NotImplementedError
+
+    def _faster(self) -> None:
+        raise NotImplementedError
+
+    def _slower(self) -> None:
+        raise NotImplementedError
+
+    def _mode_turn(self) -> Program:
+        """Run one loop turn of the current mode, which is not mode 0."""
+        match self._mode:
+            case 2:
+                yield from self._tracking()
+            case 3:
+                yield from self._avoidance()
+            case 4:
+                yield from self._color_led()
+            case 5:
+                yield from self._light_seeking()
+            case 6:
+                yield from self._following()
+            case _:
+                yield from self._remote()
+
+    # Mode 1.
+
+    def press(self, button: Button, now: float) -> bool:
+        """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
+        self._run(now)
+        if self._mode != 1 or self._pressed is not None:
+            return False
+        self._pressed = button
+        self._run(now)
+        return True
+
+    def _remote(self) -> Program:
+        """Obey only the infrared remote (row "remote control")."""
+        yield Wait(inf, wakes=True)
+        button, self._pressed = self._pressed, None
+        match button:
+            case None:
+                pass
+            case Button.WHISTLE:
+                yield from self._busy(WHISTLE_S)
+            case Button.FASTER:
+                self._faster()
+            case Button.SLOWER:
+                self._slower()
+            case _:
+                left, right = SIGNS[button]
+                self._drive(left * self._pwm(), right * self._pwm())
+
+    # The other modes. Each sets the speed, which mode 0 keeps afterwards.
+
+    def _go(self, left: int, right: int, speed: int) -> None:
+        self._speed = speed
+        self._drive(left * speed, right * speed)
+
+    def _tracking(self) -> Program:
+        line = self._body.line(self._now)
+        left_outer, left_inner, right_inner, right_outer = line
+        yield from self._turn(f"CSB0,PV8,GS0,LF{bits(line)},HW00,GM00")
+        if (left_outer or left_inner) and right_outer:
+            self._go(1, -1, 250)
+            yield from self._busy(SHARP_S)
+        elif left_outer and right_inner:
+            self._go(-1, 1, 250)
+            yield from self._busy(SHARP_S)
+        elif left_outer:
+            self._go(-1, 1, 150)
+        elif right_outer:
+            self._go(1, -1, 150)
+        elif left_inner and not right_inner:
+            self._go(0, 1, 220)
+        elif right_inner and not left_inner:
+            self._go(1, 0, 220)
+        elif left_inner and right_inner:
+            self._go(1, 1, 250)
+        # No line under any sensor: the motors stay as they were.
+
+    def _light_seeking(self) -> Program:
+        seen = self._body.light(self._now)
+        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}")
+        left, right = seen
+        self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
+
+    def _following(self) -> Program:
+        """Follow an object (row "6 following"): no `#`, inverted bits, 0 = object seen."""
+        seen = self._body.obstacle(self._now)
+        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
+        left, right = seen
+        self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
+
+    def _color_led(self) -> Program:
+        yield from self._turn_servo(self._color_position)
+        red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
+        self._rgb = (red, green, blue)
+        yield from self._busy(COLOR_S)
+        self._color_position = (self._color_position + 10) % 190
+
+    def _avoidance(self) -> Program:
+        cm = yield from self._distance()
+        if cm < 20:
+            self._blocked = True
+            yield from self._maneuver()
+            self._blocked = False
+            return
+        left, right = self._body.obstacle(self._now)
+        if right and not left:
+            self._go(-1, 1, 200)
+            yield from self._busy(0.2)
+        elif left:
+            self._go(1, -1, 200)
+            yield from self._busy(0.2)
+        if cm > 30:
+            self._rgb = ARDUINO_LIGHTS["3"]
+            self._go(1, 1, 200)
+        else:
+            self._go(1, 1, 100)
+
+    def _distance(self) -> Generator[Wait, None, float]:
+        """Return the distance of five rangings, 0.1 s. Without echo, brake and block for ever."""
+        found = []
+        for _ in range(AVOIDANCE_RANGINGS):
+            while (cm := self._range()) is None or cm >= FAR_CM:
+                self._drive(0, 0)
+                yield from self._busy(NO_ECHO_S)
+            found.append(cm)
+            yield from self._busy(0.1 / AVOIDANCE_RANGINGS)
+        return sum(sorted(found)[1:4]) / 3
+
+    def _maneuver(self) -> Program:
+        """Back off, range right, left and ahead, turn: 4.2 s with the ranging before it, 4.3 s if hemmed in."""
+        self._rgb = ARDUINO_LIGHTS["2"]
+        self._go(-1, -1, 80)
+        yield from self._busy(0.08)
+        self._drive(0, 0)
+        seen = []
+        for degrees in (0, 180, 90):
+            yield from self._turn_servo(degrees)
+            yield from self._busy(0.5)
+            seen.append((yield from self._distance()))
+        right, left, _ = seen
+        if max(seen) < 10:
+            self._rgb = ARDUINO_LIGHTS["6"]
+            self._go(1, -1, 200)
+            yield from self._busy(0.37)
+        elif left >= right:
+            self._rgb = ARDUINO_LIGHTS["4"]
+            self._go(-1, 1, 200)
+            yield from self._busy(0.28)
+        else:
+            self._rgb = ARDUINO_LIGHTS["6"]
+            self._go(1, -1, 200)
+            yield from self._busy(0.28)
+        self._drive(0, 0)
+
+
+def to_int(text: str) -> int:
+    """Return the leading digits as a number, 0 without any, as Arduino's String.toInt()."""
+    digits = re.match(r"\s*[+-]?\d{1,9}", text)
+    return int(digits[0]) if digits else 0

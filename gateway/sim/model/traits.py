@@ -1,0 +1,53 @@
+"""In what the cars of one program differ. Pure.
+
+Public programs of one family differ in the rhythm of their reports, in what blocks them and in what they print. A trait
+is a parameter of a simulated car, so that each of these cars can be tried.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.protocol.enums import Mode
+
+# A ranging at 120 cm, where the intervals of real cars were measured: 4 ms, and the echo's way at the speed of sound.
+ECHO_RANGING_S: Final = 0.011
+"""Time of one ranging with an echo, which is part of the interval between two reports."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarTraits:
+    """The parameters of one car. The defaults are those of the simulated Arduino car."""
+
+    interval_s: float = 0.911
+    """Time from one mode-0 report to the next on the wire, with an echo. Without one, the ranging makes it longer."""
+    spread_s: float = 0.0
+    """Maximum by which each interval differs from `interval_s`, either way."""
+    timer: bool = False
+    """True if a hardware timer sends the reports, so that no frame delays them."""
+    close_s: float = 1.0
+    """Block of `MODEx0`."""
+    last_frame_wins: bool = False
+    """True if the last of several whole frames in the buffer counts. A `$` then restarts the string."""
+    silent_modes: frozenset[Mode] = frozenset()
+    """Modes in which this car prints nothing, although the vendor's program prints there."""
+    text: bool = False
+    """True if the car prints the line `EXEC:F` after each general frame."""
+    readings: bool = True
+    """False if the car sends nothing at all."""
+    cells: int = 2
+    """Cells of the battery. Three give up to 12.6 V."""
+    head: str = "4WD"
+    """First word of the frames in both directions."""
+    fan_level: bool = False
+    """True if place 8 is a level: 1 turns the fan on, 0 turns it off in every general frame."""
+    ptz_direct: bool = False
+    """True if the servo goes to the angle of a PTZ frame, and not to 180 degrees minus it."""
+    gray_max: int = 1023
+    """Maximum of the grayscale reading."""
+    constants: bool = False
+    """True if the mode-0 report has constants in place of line, obstacle, light and grayscale."""
+
+    @property
+    def loop_s(self) -> float:
+        """Loop time between two reports, without the ranging."""
+        return max(0.0, self.interval_s - ECHO_RANGING_S)
