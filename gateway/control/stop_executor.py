@@ -358,14 +358,14 @@ class StopExecutor:
     def deadlines(self, running: StopInProgress, now: float) -> list[float]:
         """Return when the running stop needs attention."""
         times = [pending.received_at + running.timeout_s for pending in running.commands]
-        if running.frames_sent:
-            times.append(max(running.next_try_at, self.model.pacing.flight_until))
-            if running.obeyed_at > now:
-                times.append(running.obeyed_at)
-        else:
-            times.append(running.due_at(self.model.pacing))
         if self.model.evidence.settles_at is not None:
             times.append(self.model.evidence.settles_at)
+        elif running.frames_sent:
+            times.append(max(running.next_try_at, self.model.pacing.flight_until))
+        if running.frames_sent and running.obeyed_at > now:
+            times.append(running.obeyed_at)
+        if not running.frames_sent:
+            times.append(running.due_at(self.model.pacing))
         if not running.overdue:
             times.append(running.gives_up_at)
         if self.shutting_down:

@@ -17,7 +17,7 @@ class Platform(StrEnum):
     UNKNOWN = "unknown"
 
 
-OPTIONS: Final = frozenset({"arm", "imu"})
+OPTIONS: Final = frozenset({"arm", "imu", "no_readings"})
 AUTO: Final = "auto"
 
 

@@ -12,6 +12,7 @@ from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 
 TICK_S = 0.05
@@ -33,10 +34,11 @@ class Pair:
         transport: Transport = Transport.SERIAL,
         start_s: float = 0.0,
         name: str = "red",
+        traits: CarTraits | None = None,
     ) -> None:
         self.now = 0.0
         self.car: Firmware = build(
-            platform, world or World.room(), 0, random.Random(seed), transport=transport, name=name
+            platform, world or World.room(), 0, random.Random(seed), transport=transport, name=name, traits=traits
         )
         self.transport = transport
         self.control = Controller(name, parse_platform(told or platform))

@@ -61,6 +61,8 @@ SETTLED_SHARE: Final = 0.6
 SETTLED_S: Final = 0.8
 """Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. A reporting mode
 sends 20 frames a second; a damaged one that looks like mode 0 has no silence before it."""
+FASTEST_S: Final = 0.3
+"""Interval of the fastest car, until that of the car is known."""
 BUNCHED_SHARE: Final = 0.3
 BUNCHED_S: Final = 0.4
 """Maximum interval of reports that the link has delayed: this share of the interval, at most this time."""
@@ -283,7 +285,7 @@ class StopEvidence:
     @property
     def settled_s(self) -> float:
         """Return the minimum silence before a mode-0 report that counts."""
-        return min(SETTLED_S, SETTLED_SHARE * self._interval_s)
+        return min(SETTLED_S, SETTLED_SHARE * (self._rhythm.median_s or FASTEST_S))
 
     @property
     def _left_s(self) -> float:
@@ -390,7 +392,7 @@ class StopEvidence:
         self._shapes = 0
         if quiet_s < self.settled_s:
             self._before = self._before_no_echo = None
-            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * self._interval_s):
+            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * (self._rhythm.median_s or FASTEST_S)):
                 self._drop_pauses()
             return Finding.NOTHING
         if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
@@ -537,10 +539,9 @@ class StopEvidence:
         if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
             return Finding.NOTHING
         opening_s = self.profile.shortest_opening_s
-        # Opening alone blocks for so long. During it a slow link delivers older reports, so less silence is no evidence.
-        if silent is not None and (
-            quiet_s < opening_s - LATE_S or at < self._opened_at + opening_s + self.close_s - EARLY_S
-        ):
+        # Opening alone blocks for so long. During it a slow link delivers older reports: less silence is no evidence.
+        earliest_at = self._opened_at + opening_s + self.close_s - EARLY_S
+        if silent is not None and (quiet_s < opening_s - LATE_S or at < earliest_at):
             return Finding.NOTHING
         self._shape_at = self._silent_mode = None
         if not self._plain or at > closed_at + within_s + LATE_S:
