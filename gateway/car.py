@@ -32,7 +32,7 @@ from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import Echo, Event, Rejected
+from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
@@ -293,6 +293,8 @@ class CarGateway:
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)
                 continue
+            if isinstance(event, TextLine):
+                continue  # it shows a program, but not that of a car
             if not isinstance(event, Echo):
                 self._health.on_reading(event.at)
             if self._attempts.check_proven(event.at, has_reading=True):

@@ -24,7 +24,7 @@ from fleet.fleetfile.models import (
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
-from gateway.protocol.platform_name import AUTO, Platform, parse_option
+from gateway.protocol.platform_name import AUTO, Platform, normalize_name, parse_option
 from gateway.protocol.platforms import parse_platform
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.links import BadLink
@@ -170,7 +170,7 @@ def profile_capabilities(platform: str) -> frozenset[str]:
 
 
 def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
-    platform = car.get("platform", AUTO).lower()
+    platform = normalize_name(car.get("platform", AUTO))
     limits = LimitsEntry.model_validate(car.get("limits", {}))
     return FleetCar(
         name=name,
@@ -283,7 +283,7 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
         )
         at = next(where for (where, _), there in zip(layers, given_limits, strict=True) if there)
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
-    platform, given = str(merged.get("platform", AUTO)).lower(), merged.get("without")
+    platform, given = normalize_name(str(merged.get("platform", AUTO))), merged.get("without")
     if car.get("link") == LINK_SIM and platform.partition("+")[0] in (AUTO, Platform.UNKNOWN):
         kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
         yield ("cars", name, "platform"), f"a simulated car needs a platform. There are {kinds}."

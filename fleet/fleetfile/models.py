@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from fleet.links import parse_fleet_link
 from gateway.protocol.enums import Mode
-from gateway.protocol.platform_name import AUTO, OPTIONS, Platform, parse_option
+from gateway.protocol.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS, Platform, parse_option
 from gateway.protocol.platforms import parse_platform
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
@@ -105,7 +105,8 @@ PARTS: Final = frozenset().union(*(parse_platform(f"{kind}+arm+imu").capabilitie
 CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
 _SIZE: Final = re.compile("^([1-9][0-9]{0,5} ?[MG]|[1-9][0-9]{0,2} ?T)B$")
-_PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTIONS))}))*$"
+_OPTIONS: Final = "|".join((*sorted(OPTIONS), *VARIANTS, f"{HEAD}={HEAD_PATTERN}"))
+_PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({_OPTIONS}))*$"
 
 _Name = Annotated[
     str, AfterValidator(validate_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})
@@ -143,7 +144,9 @@ class CommonEntry(Entry):
     """Fields of defaults, types and cars."""
 
     # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
-    platform: _Platform = Field(default=AUTO, description="its program, with +arm, +imu; auto: its gateway finds out")
+    platform: _Platform = Field(
+        default=AUTO, description="its program, with options (arduino+arm); auto: its gateway finds out"
+    )
     color: _Color = Field(
         default_factory=str,
         description='in tables and pictures: red, or "#e01b24" in quotes; left out: the color that is the car\'s name',

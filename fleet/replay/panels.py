@@ -54,7 +54,7 @@ class StateTrack:
 
 
 @dataclass(frozen=True, slots=True)
-class TextLine:
+class TextTopic:
     """A line of text joined from fields in this order, without empty ones."""
 
     topic: str
@@ -238,21 +238,21 @@ SERVICE_PANELS: Final = (
 """Page of the fleet's services."""
 
 TEXT_LINES: Final = (
-    TextLine(
+    TextTopic(
         COMMAND_TOPIC,
         ("car", "verb", "phase", "reason", "words", "sender"),
         "phase",
         {"sender": "by "},
         frozenset({"asked", "queued", "sent", "effect_seen", "complete"}),
     ),
-    TextLine(
+    TextTopic(
         "@coordinator/decision",
         ("subject", "decided", "why", "would_change"),
         before={"would_change": "- changes with: "},
     ),
-    TextLine(ASSIGNMENT, ("roles", "phase")),
-    TextLine("frame/rx", ("data", "verdict"), "verdict", calm=frozenset({"sensors", "arm", "imu", "echo"})),
-    TextLine("frame/tx", ("data", "why", "command_id")),
+    TextTopic(ASSIGNMENT, ("roles", "phase")),
+    TextTopic("frame/rx", ("data", "verdict"), "verdict", calm=frozenset({"sensors", "arm", "imu", "echo", "text"})),
+    TextTopic("frame/tx", ("data", "why", "command_id")),
 )
 """`event/log` needs no row: Rerun reads foxglove.Log as text."""
 

@@ -19,8 +19,8 @@ AWAKE_S: Final = 0.6
 """Maximum time after a report in which the car reads a frame at once: it ranges again an interval later."""
 LINK_DELAY_S: Final = 0.3
 """Maximum delay of a report by the link, which shortens that time."""
-REPORT_MARGIN_S: Final = 0.2
-"""Margin of the longest interval of reports in mode 0."""
+AWAKE_WAIT_S: Final = 0.25
+"""Maximum wait for a report before a mode is opened."""
 
 
 class Pacing:
@@ -137,12 +137,12 @@ class Pacing:
 
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""
-        # The car must be awake, so that the block begins at once, and the end of the mode can be shown. If no report
-        # comes, wait until none is due any more. A car that cannot show it need not wait.
+        # On a car that is awake the block begins at once, and the end of the mode can be shown. A car that cannot show
+        # it need not wait, and no other waits for long.
         alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
         if alone <= self.awake_until or not can_show:
             return alone
-        return max(now, self.buffer_until + self._interval_s + self.profile.ranging_s + REPORT_MARGIN_S)
+        return max(now, self.buffer_until + AWAKE_WAIT_S)
 
     @property
     def repeat_at(self) -> float:

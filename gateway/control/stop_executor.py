@@ -301,6 +301,8 @@ class StopExecutor:
                 self._handle_loss(running, now)
             case _:
                 pass
+        if finding is Finding.UNJUDGED:  # let the next interval be undisturbed, so that the rhythm can be learned
+            running.reported_s = stopping.reported_s(self.model.profile, self.model.learned, slowest=True)
         if self.running is running and running.frames_sent:
             self._await(running, now)
         if self.running is running and finding in _PROBED and self._may_probe(running):

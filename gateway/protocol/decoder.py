@@ -3,7 +3,8 @@
 Linear and bounded: the buffer has at most `max_frame` bytes and is never searched twice. Every byte is in the `raw` of
 exactly one event, with two harmless exceptions. Separators (CR, LF, space, tab) between frames make no event, nor does
 a late `#` after a frame that silence has ended.
-A run of junk is one event per `max_frame` bytes. After an overlong frame, everything up to the next `$` is junk.
+A whole line of text between frames is an event of its own. Other junk is one event for each run of up to `max_frame`
+bytes. After an overlong frame, everything up to the next `$` is junk.
 
 The events depend only on the bytes and on gaps of 50 ms and 0.5 s between them, not on the pieces. `parser` makes the
 reading of one whole frame.
@@ -14,7 +15,7 @@ from math import inf
 from typing import Final
 
 from gateway.protocol.enums import Cause
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.parser import parse
 from gateway.protocol.sensors import (
     Reject,
@@ -35,6 +36,7 @@ __all__ = [
     "Reject",
     "Rejected",
     "Sensors",
+    "TextLine",
 ]
 
 MAX_FRAME: Final = 256  # docs/reference/protocol.md#bad-input: a frame longer than this is cut off as noise
@@ -52,6 +54,12 @@ _SENT_MAX: Final = 256  # the wire carries 101 frames of 19 bytes in 2 s; a lone
 _START, _END = b"$"[0], b"#"[0]
 _MARK = re.compile(rb"[$#]")
 _SEPARATORS = b"\r\n \t"
+_LINE_END_BYTES = frozenset(b"\r\n")
+_LINE = re.compile(rb"[^\r\n]*(?:\r\n|[\r\n])")
+# A piece of a damaged frame ends with a line end, too, where the car prints one after each frame. So a text has a word
+# of its own and none of the protocol's, wherever it begins.
+_TEXT = re.compile(rb"(?=.*[A-Za-z]{2})[\t\x20-\x22\x24-\x7e]+")
+_PROTOCOL_WORD = re.compile(rb"(?<![A-Za-z])(?:4WD|CSB|PV|GS|LF|HW|GM|J[1-6]|MPU|Servo|PTZ|CL[RGB]|MODE)")
 
 
 class Decoder:
@@ -65,6 +73,7 @@ class Decoder:
         self._last = 0.0  # time of the last byte in the buffer
         self._silence_s = inf  # silence after the last byte that would complete an event
         self._late_end = False  # True if silence ended the last frame: its `#` may still come
+        self._is_mid_line = False  # True if an earlier event has the begin of this line
         self._sent: dict[bytes, float] = {}
 
     def feed(self, data: bytes, now: float) -> list[Event]:
@@ -109,9 +118,11 @@ class Decoder:
     def end(self) -> list[Event]:
         """Return the events of the buffered bytes at the end of the link or file, and empty the buffer."""
         self._silence_s, self._late_end = inf, False
-        if not self._buffer:
-            return []
-        return self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
+        events: list[Event] = []
+        if self._buffer:
+            events = self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
+        self._is_mid_line = False
+        return events
 
     def _ending_silence_s(self) -> float:
         """Return the silence that ends the buffered bytes; there is at least one."""
@@ -127,7 +138,12 @@ class Decoder:
         start = data.find(b"$", pos, pos + self._max - len(self._buffer))
         stop = min(len(data), pos + self._max - len(self._buffer)) if start < 0 else start
         if stop > pos:
-            self._buffer += data[pos:stop] if self._buffer else data[pos:stop].lstrip(_SEPARATORS)
+            piece = data[pos:stop]
+            if not self._buffer:
+                piece = piece.lstrip(_SEPARATORS)
+                if self._is_mid_line and not _LINE_END_BYTES.isdisjoint(data[pos : stop - len(piece)]):
+                    self._is_mid_line = False
+            self._buffer += piece
             self._last = now
         if start >= 0:
             events += self._junk()
@@ -153,12 +169,14 @@ class Decoder:
             self._begin(now)
             return stop + 1
         if stop < len(data):
+            self._is_mid_line = True
             events.append(Rejected(self._take(b""), self._last, Cause.OVERLONG, f"no end in {self._max} bytes"))
         return stop
 
     def _begin(self, now: float) -> None:
         self._buffer.append(_START)
         self._last = now
+        self._is_mid_line = False
 
     def _take(self, rest: bytes) -> bytes:
         raw = bytes(self._buffer) + rest
@@ -166,8 +184,25 @@ class Decoder:
         return raw
 
     def _junk(self) -> list[Event]:
-        """Return the event of the buffered junk, if there is any."""
-        raw = self._take(b"").strip(_SEPARATORS)
+        """Return the events of the buffered junk: its whole lines of text, and the runs between them."""
+        raw = self._take(b"")
+        if not raw:
+            return []
+        events: list[Event] = []
+        begin, is_whole = 0, not self._is_mid_line
+        for found in _LINE.finditer(raw):
+            text = found[0].rstrip(_SEPARATORS)
+            if is_whole and _TEXT.fullmatch(text) and not _PROTOCOL_WORD.search(text):
+                events += self._run(raw[begin : found.start()])
+                events.append(TextLine(found[0], self._last))
+                begin = found.end()
+            is_whole = True
+        events += self._run(raw[begin:])
+        self._is_mid_line = raw[-1] not in _LINE_END_BYTES
+        return events
+
+    def _run(self, junk: bytes) -> list[Event]:
+        raw = junk.strip(_SEPARATORS)
         if not raw:
             return []
         if self._is_echo(raw, self._last):
@@ -184,6 +219,7 @@ class Decoder:
         found = fullmatch_sensors(raw)
         if found:
             return [read_sensors(found, at, terminated=False, by_silence=by_silence)]
+        self._is_mid_line = True
         return [
             Rejected(
                 raw,

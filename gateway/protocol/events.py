@@ -47,4 +47,15 @@ class Rejected:
     detail: str = ""
 
 
-Event = Sensors | ArmReading | ImuReading | Echo | Rejected
+@dataclass(frozen=True, slots=True)
+class TextLine:
+    """A whole line of text between frames with its line end, such as a debug print. It is no damage.
+
+    `at` is the time of the last byte of the junk that it came with.
+    """
+
+    raw: bytes
+    at: float
+
+
+Event = Sensors | ArmReading | ImuReading | Echo | Rejected | TextLine

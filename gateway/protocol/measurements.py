@@ -4,7 +4,7 @@ The level of the battery is an estimate of the gateway and is not set here.
 """
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import SENSOR_FIELDS, Fields, Sensors
 
@@ -13,7 +13,7 @@ _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", 
 
 
 def verdict_of(event: Event) -> str:
-    """Return `sensors`, `arm`, `imu`, `echo`, or the cause of the rejection."""
+    """Return `sensors`, `arm`, `imu`, `echo`, `text`, or the cause of the rejection."""
     match event:
         case Sensors():
             return "sensors"
@@ -23,6 +23,8 @@ def verdict_of(event: Event) -> str:
             return "imu"
         case Echo():
             return "echo"
+        case TextLine():
+            return "text"
         case Rejected(cause=cause):
             return str(cause)
 
@@ -40,7 +42,7 @@ def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str
             return {"sensor/arm": {"joint_deg": degrees}} if len(degrees) == len(joints) else {}
         case ImuReading():
             return {"sensor/imu": dict(zip(_IMU, (*event.gyro, *event.accel), strict=True))}
-        case Echo() | Rejected():
+        case Echo() | Rejected() | TextLine():
             return {}
 
 

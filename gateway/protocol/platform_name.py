@@ -1,7 +1,8 @@
-"""The names of platforms as users write them: `arduino`, `raspberry_pi+arm+imu`, `auto`."""
+"""The names of platforms as users write them: `arduino`, `raspberry_pi+arm+imu`, `stm32+head=BALA`, `auto`."""
 
 # A gateway checks the name before it joins the bus. The profiles would delay that by 10 ms.
 
+import re
 from enum import StrEnum
 from typing import Final
 
@@ -17,20 +18,48 @@ class Platform(StrEnum):
     UNKNOWN = "unknown"
 
 
-OPTIONS: Final = frozenset({"arm", "imu", "no_readings"})
+OPTIONS: Final = frozenset({"arm", "imu"})
+"""Options that add a part to a car."""
+# Programs of one family differ in these (docs/reference/protocol.md#programs-that-people-have).
+VARIANTS: Final = ("text", "no_readings", "3s", "fan_level", "ptz_direct")
+"""Options that say in what this car's program differs."""
+HEAD: Final = "head"
+"""The option with a value: the first word of the frames."""
+HEAD_PATTERN: Final = "[A-Za-z0-9]{2,8}"
 AUTO: Final = "auto"
+
+_KNOWN: Final = OPTIONS | frozenset(VARIANTS)
+OPTION_WORDS: Final = ", ".join(f"+{option}" for option in (*sorted(OPTIONS), *VARIANTS, f"{HEAD}=WORD"))
+"""All options, for a person."""
+
+
+def normalize_name(text: str) -> str:
+    """Return a name in small letters, without a change of the head's value."""
+    return "+".join(_normalize_part(part) for part in text.split("+"))
 
 
 def parse_name(text: str) -> tuple[Platform, frozenset[str]]:
     """Return platform and options of a name such as `raspberry_pi+arm+imu` in any case; raise ValueError."""
-    kind, *options = text.lower().split("+")
+    kind, *options = normalize_name(text).split("+")
     if kind not in set(Platform):
         hint = did_you_mean(kind, Platform) or f"There are {', '.join(Platform)}."
         raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
     for option in options:
-        if option not in OPTIONS:
-            raise ValueError(f'Unknown option "+{option[:40]}" of a platform. There are +arm and +imu.')
-    return Platform(kind), frozenset(options)
+        word, equals, value = option.partition("=")
+        if word == HEAD and equals:
+            check_head(value)
+        elif option not in _KNOWN:
+            raise ValueError(f'Unknown option "+{option[:40]}" of a platform. There are {OPTION_WORDS}.')
+    chosen = frozenset(options)
+    if sum(option.startswith(HEAD) for option in chosen) > 1:
+        raise ValueError(f"A car has one head, so write one +{HEAD}=WORD.")
+    return Platform(kind), chosen
+
+
+def check_head(value: str) -> None:
+    """Raise ValueError unless the value is allowed as the first word of a frame."""
+    if not re.fullmatch(HEAD_PATTERN, value):
+        raise ValueError(f'The head "{value[:40]}" is not allowed: 2 to 8 letters and digits, as in +{HEAD}=4WD.')
 
 
 def parse_option(text: str) -> tuple[str, bool]:
@@ -38,7 +67,7 @@ def parse_option(text: str) -> tuple[str, bool]:
 
     `auto` starts as `unknown`.
     """
-    name = text.lower()
+    name = normalize_name(text)
     auto = name.partition("+")[0] == AUTO
     if auto:
         name = name.replace(AUTO, Platform.UNKNOWN, 1)
@@ -47,3 +76,8 @@ def parse_option(text: str) -> tuple[str, bool]:
     except ValueError as error:
         raise ValueError(f"{error} Leave it out to detect it.") from None
     return name, auto
+
+
+def _normalize_part(part: str) -> str:
+    word, equals, value = part.partition("=")
+    return f"{word.lower()}{equals}{value if word.lower() == HEAD else value.lower()}"

@@ -267,7 +267,7 @@ class Profile:
 
 
 def parse_platform(text: str) -> Profile:
-    """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu` in any case; raise ValueError."""
+    """Return the profile of a platform such as `arduino` or `stm32+arm+head=BALA` in any case; raise ValueError."""
     return _profile(*parse_name(text))
 
 
@@ -282,17 +282,25 @@ _LIGHTS_2_TO_4: Final = frozenset({Light.RED, Light.GREEN, Light.BLUE})
 
 
 def _profile(kind: Platform, options: frozenset[str]) -> Profile:
+    parts = options & OPTIONS
     match kind:
         case Platform.ARDUINO:
             return Profile(
-                kind, options, _ALL_MODES, _MODE_CAR | options, _ALL_LIGHTS, _FRONT, StopStyle.MODE_FRAME, ARDUINO_SPEED
+                kind,
+                options,
+                _ALL_MODES,
+                _MODE_CAR | parts,
+                _ALL_LIGHTS,
+                _FRONT,
+                StopStyle.MODE_FRAME,
+                ARDUINO_SPEED,
             )
         case Platform.STM32:
             return Profile(
                 kind,
                 options,
                 _ALL_MODES,
-                _MODE_CAR | options,
+                _MODE_CAR | parts,
                 _ALL_LIGHTS,
                 _FRONT,
                 StopStyle.TIMER,
@@ -304,7 +312,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 kind,
                 options,
                 _MODE_0,
-                _PI_CAR | options,
+                _PI_CAR | parts,
                 _LIGHTS_2_TO_4,
                 _FRONT | _VERTICAL | _HORIZONTAL,
                 StopStyle.GENERAL,
@@ -317,7 +325,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 kind,
                 options,
                 _MODE_0,
-                _EVERY_CAR | options,
+                _EVERY_CAR | parts,
                 _LIGHTS_2_TO_4,
                 _FRONT,
                 StopStyle.GENERAL,

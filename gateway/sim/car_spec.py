@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.sim.model.factory import OPTIONS, PLATFORMS
+from gateway.sim.car_options import BadOption, parse_traits
+from gateway.sim.model.factory import PLATFORMS
+from gateway.sim.model.traits import CarTraits
 from schemas import keys
 
 _TCP: Final = re.compile(r"tcp(?:://(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5}))?")
@@ -38,7 +40,10 @@ class CarSpec:
     name: str
     platform: str
     options: frozenset[str]
+    """As the user writes them, each with its value."""
     link: PtyPath | TcpListen
+    traits: CarTraits | None = None
+    """None: those of the platform."""
 
     @property
     def platform_words(self) -> str:
@@ -68,11 +73,11 @@ def parse_car(text: str) -> CarSpec:
     platform, *options = platform_words.split("+")
     if platform not in PLATFORMS:
         raise BadSpec(f"car {text!r}: platform {platform!r} is not allowed: use {', '.join(PLATFORMS)}")
-    for option in options:
-        if option not in OPTIONS:
-            allowed = ", ".join(f"+{word}" for word in OPTIONS)
-            raise BadSpec(f"car {text!r}: option '+{option}' is not allowed: use {allowed} or none")
-    return CarSpec(name, platform, frozenset(options), _parse_link(f"car {text!r}", link))
+    try:
+        traits = parse_traits(platform, options)
+    except BadOption as error:
+        raise BadSpec(f"car {text!r}: {error}") from None
+    return CarSpec(name, platform, frozenset(options), _parse_link(f"car {text!r}", link), traits)
 
 
 def parse_replay(text: str) -> ReplaySpec:

@@ -31,6 +31,24 @@ EPILOG: Final = """\
 Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A link that comes back
 under another name is printed again: a plain pty after each link_drop; pty:PATH keeps its name.
 
+options of a platform, for the cars that people have; several are joined (--car red:arduino+arm+interval=0.71:pty):
+  +arm +imu                             an arm, a gyroscope
+  +text                                 prints the line EXEC:F after each general frame
+  +no_readings                          sends nothing at all
+  +3s                                   three battery cells: up to 12.6 V
+  +fan_level                            the fan digit is a level: 0 turns the fan off in every frame
+  +ptz_direct                           the servo goes to the angle of the frame, not to 180 degrees minus it
+  +head=WORD                            another first word than 4WD in the frames, 2 to 8 letters and digits
+options of the simulator only:
+  +interval=S +spread=S                 S seconds from report to report (0.1 to 10), each up to +-S longer (0 to 1)
+  +timer                                reports come by a hardware timer: no frame delays them (arduino)
+  +close=S                              MODEx0 blocks for S seconds (0 to 10; arduino)
+  +last_frame                           of several frames in the buffer the last one counts (arduino)
+  +silent=MODE                          prints nothing in this mode; may be repeated (arduino, stm32)
+  +gray=MAX +constants                  the grayscale goes up to MAX; constants for line, obstacle, light and grayscale
+                                        (arduino, stm32)
+an stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows the frames of
+the motions, dies at any other and sends nothing.
 faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
   --fault red:link_drop@5+2             gone for 2 s; without +2 until you end it
   --fault red:rename@5+2                comes back as another device: pty:PATH points to a new one, a plain pty and TCP
@@ -76,7 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:PLATFORM:LINK",
-        help="PLATFORM: arduino, stm32 or raspberry_pi, with +arm, +imu; LINK: pty, pty:PATH or tcp://HOST:PORT",
+        help="PLATFORM: arduino, stm32, raspberry_pi or course, with options such as +arm, see below; LINK: pty, "
+        "pty:PATH or tcp://HOST:PORT",
     )
     parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behavior (default: 0)")
     parser.add_argument(

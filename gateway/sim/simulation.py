@@ -324,7 +324,15 @@ class Simulation:
             transport = Transport.SERIAL if isinstance(spec.link, PtyPath) else Transport.TCP
             rng, options = _rng(seeded), spec.options
             firmware = build(
-                spec.platform, self.world, index, rng, options=options, transport=transport, now=now, name=spec.name
+                spec.platform,
+                self.world,
+                index,
+                rng,
+                options=options,
+                transport=transport,
+                now=now,
+                name=spec.name,
+                traits=spec.traits,
             )
             self.cars[spec.name] = SimCar(spec, firmware, seeded)
         for replay, played in replays:

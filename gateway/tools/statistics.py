@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gateway.control.estimate.platform import PlatformDetector
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected
+from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.measurements import measured
 from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile, parse_platform
@@ -42,13 +42,15 @@ class LinkStatistics:
                 self.kinds["imu"] += 1
             case Echo():
                 self.kinds["echo"] += 1
+            case TextLine():
+                self.kinds["text"] += 1
             case Rejected():
                 self.rejects[event.cause] += 1
 
     @property
     def readings(self) -> int:
-        """The number of good frames, without echoes."""
-        return self.kinds.total() - self.kinds["echo"]
+        """The number of good frames, without echoes and lines of text."""
+        return self.kinds.total() - self.kinds["echo"] - self.kinds["text"]
 
     @property
     def seconds(self) -> float:
@@ -80,6 +82,8 @@ class LinkStatistics:
             text += f", {self.rejects.total()} rejected ({causes})"
         if self.kinds["echo"]:
             text += f", {self.kinds['echo']} echoes of what was sent"
+        if self.kinds["text"]:
+            text += f", {self.kinds['text']} lines of text"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
             text += f"; mode by their shape: {modes}; platform: {self.detector.evidence[0]}"
@@ -101,6 +105,8 @@ def describe(event: Event, profile: Profile) -> dict[str, Any]:
             return {"kind": "imu", "gyro_raw": list(event.gyro), "accel_raw": list(event.accel)}
         case Echo():
             return {"kind": "echo"}
+        case TextLine():
+            return {"kind": "text"}
         case Rejected():
             return {"kind": "rejected", "cause": event.cause, "detail": event.detail}
 

@@ -101,10 +101,14 @@ class Rhythm:
         return max(self.intervals) - min(self.intervals) if self.intervals else 0.0
 
     @property
+    def is_firm(self) -> bool:
+        """Return True if there are enough intervals to know their spread."""
+        return len(self.intervals) >= FIRM_INTERVALS
+
+    @property
     def tolerance_s(self) -> float:
         """Return the maximum difference of an interval of this car, on this link, from the median."""
-        firm_s = 0.0 if len(self.intervals) >= FIRM_INTERVALS else FIRST_TOLERANCE_S
-        return max(self.spread_s + LINK_TOLERANCE_S, firm_s)
+        return max(self.spread_s + LINK_TOLERANCE_S, 0.0 if self.is_firm else FIRST_TOLERANCE_S)
 
     def fits(self, interval_s: float) -> bool:
         """Return True if an interval belongs to this rhythm."""
@@ -177,14 +181,14 @@ class Learned:
         """Return the delays that were learned."""
         return self._blocks
 
-    def add_delay(self, kind: Blocking, delay_s: float, longest_s: float) -> bool:
+    def add_delay(self, kind: Blocking, delay_s: float, longest_s: float, *, controlled: bool) -> bool:
         """Add the delay of an undisturbed report after a frame. Return True if the last delays agree.
 
-        A delay counts if it is clearly longer than the spread, shorter than `longest_s`, and is no number of lost
-        reports.
+        A delay counts if it is clearly longer than the spread and shorter than `longest_s`. If it is as long as lost
+        reports would be, it counts only if `controlled`: other frames of ours delay no report.
         """
         tolerance_s = self.echo.tolerance_s
-        if not 2 * tolerance_s < delay_s < longest_s or self.echo.is_multiple(delay_s, 2 * tolerance_s):
+        if not 2 * tolerance_s < delay_s < longest_s or (not controlled and self.is_confusable(delay_s)):
             self._delays.pop(kind, None)
             return False
         delays = self._delays.setdefault(kind, deque(maxlen=AGREEING_DELAYS))
@@ -211,9 +215,9 @@ class Learned:
         """Record that the car has shown a stop."""
         self.shows, self.doubted, self._unreacted = Shows.YES, False, 0
 
-    def is_confusable(self, block_s: float) -> bool:
-        """Return True if reports that the link loses could look like the delay of this block."""
-        return self.echo.is_multiple(block_s, 2 * self.echo.tolerance_s)
+    def is_confusable(self, delay_s: float) -> bool:
+        """Return True if reports that the link loses could look like this delay."""
+        return self.echo.is_multiple(delay_s, 2 * self.echo.tolerance_s)
 
     def on_number(self, field_name: str, value: float) -> None:
         """Record the value of a field."""

@@ -68,6 +68,8 @@ BUNCHED_S: Final = 0.4
 """Maximum interval of reports that the link has delayed: this share of the interval, at most this time."""
 EARLY_S: Final = 0.05
 """How much earlier than the end of a block a report may seem to come."""
+WIRE_S: Final = 0.02
+"""Time from the end of a block to the report after it: less than the wire takes for a report of 41 bytes."""
 LATE_S: Final = 0.2
 """Additional time of the report that shows the end of a mode, on a slow link. It counts as a pause only."""
 SHAPE_UNTIL_S: Final = 1.0
@@ -291,7 +293,7 @@ class StopEvidence:
     def _left_s(self) -> float:
         """Return the maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
         latest_s = self.close_s + self._interval_s + self._rhythm.tolerance_s
-        return min(latest_s, self.profile.reopened_s) + EARLY_S
+        return min(latest_s + EARLY_S, self.profile.reopened_s + WIRE_S)
 
     @property
     def settling_s(self) -> float:
@@ -422,6 +424,8 @@ class StopEvidence:
             self._pending = None
             return self._report
         if not self._rhythm.is_known:
+            if at > pending + self.close_s - EARLY_S:
+                self._pending = None
             return Finding.UNJUDGED
         return self._compare(before, pending, at, blocking)
 
@@ -453,7 +457,7 @@ class StopEvidence:
         elif len(blocking) == 1 and (kind := blocking[0][0]) is not None and self._rhythm.is_known:
             expected_s = blocking[0][1]
             delay_s = gap_s - self._rhythm.median_s
-            self.learned.add_delay(kind, delay_s, self.profile.reopened_s)
+            self.learned.add_delay(kind, delay_s, self.profile.reopened_s, controlled=True)
             if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
                 self.learned.on_reaction()
                 self.reacted_at = at
@@ -478,27 +482,28 @@ class StopEvidence:
         if after_s <= close_s - EARLY_S:
             return Finding.NOTHING
         matches = -tolerance_s <= delay_s - close_s <= blocked_s + tolerance_s
-        longer = -tolerance_s <= delay_s - close_s <= LONGER_S and not rhythm.is_multiple(delay_s, 2 * tolerance_s)
+        longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
             self._pending = None
             if not matches:
                 self._pauses_needed = PAUSES_IN_DOUBT
-                self.learned.add_delay(Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s)
-            return self._pause(at)
+            return self._pause(at, delay_s, learn=not matches)
         if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:
             return Finding.NOTHING
         self._pending = None
         first_delay_s, self._delay_s = self._delay_s, None
         if first_delay_s is not None and self.learned.add_delay(
-            Blocking.MODE_CLOSE, first_delay_s, self.profile.reopened_s
+            Blocking.MODE_CLOSE, first_delay_s, self.profile.reopened_s, controlled=self._controlled
         ):
             self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
-            return self._pause(at)
+            return self._pause(at, first_delay_s)
+        # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
+        other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
         if not rhythm.fits(gap_s):
             self._drop_pauses()
-            return Finding.REPORT
+            return other
         if first_delay_s is not None and not rhythm.fits(rhythm.median_s + first_delay_s):
-            return Finding.REPORT
+            return other
         self._drop_pauses()
         if not blocking:
             self._learn_interval(gap_s)
@@ -506,13 +511,17 @@ class StopEvidence:
             self.found_out = self.learned.on_no_reaction() or self.found_out
         return Finding.LOST
 
-    def _pause(self, at: float) -> Finding:
-        """Count a pause."""
+    def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
+        """Count a pause. `learn`: it is not as long as expected, and may be the block of this car."""
         self._pauses += 1
         self.reacted_at = at
         self._delay_s = None
         self.learned.on_reaction()
-        if not self._controlled and self.learned.is_confusable(self.close_s):
+        if learn:
+            self.learned.add_delay(
+                Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s, controlled=self._controlled
+            )
+        if not self._controlled and self.learned.is_confusable(delay_s):
             return Finding.CONTROL
         if self._pauses < self._pauses_needed or self._unjudged:
             return Finding.PAUSE

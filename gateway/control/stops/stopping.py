@@ -30,6 +30,8 @@ MAX_ANNOUNCED_WORST_S: Final = 5.0
 # the car reads one of two tries within 15 s of the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
 """Intervals from `MODE00` to the next try, by the number of tries."""
+SLOWEST_S: Final = 3.0
+"""Interval of the slowest car, until that of the car is known."""
 REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
 IN_TIME_S: Final = 0.2
@@ -54,10 +56,13 @@ def evidence_s(profile: Profile, learned: Learned) -> float:
     return max(EVIDENCE_TIMEOUT_S, EVIDENCE_INTERVALS * (learned.echo.median_s + close_s))
 
 
-def reported_s(profile: Profile, learned: Learned) -> float:
-    """Return the time after the last frame of a try in which a car that obeyed it has reported, s."""
+def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
+    """Return the time after the last frame of a try in which a car that obeyed it has reported, s.
+
+    `slowest`: its rhythm is not known, and it may be as slow as any.
+    """
     # Without an echo the car ranges before it reads the frame, is blocked by it, and ranges again before it reports.
-    interval_s = learned.echo.median_s or profile.interval_s
+    interval_s = learned.echo.median_s or (SLOWEST_S if slowest else profile.interval_s)
     close_s = learned.block_s(Blocking.MODE_CLOSE, profile.close_s)
     return 2 * profile.ranging_s + close_s + interval_s + REPORT_MARGIN_S
 

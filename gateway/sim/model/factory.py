@@ -10,7 +10,6 @@ from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "course")
-OPTIONS = ("arm", "imu")
 
 
 def build(

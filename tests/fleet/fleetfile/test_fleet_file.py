@@ -319,6 +319,11 @@ def test_any_pieces_are_a_link_or_a_bad_link(text: str) -> None:
         parse_link(text)
 
 
+def test_the_head_of_a_platform_keeps_its_case() -> None:
+    fleet = _fleet("cars: {red: {link: COM3, platform: STM32+Fan_Level+HEAD=BaLa}}")
+    assert fleet.cars["red"].platform == "stm32+fan_level+head=BaLa"
+
+
 def test_only_fleet_files_know_simulated_links() -> None:
     assert parse_fleet_link("sim") == SimLink()
     with pytest.raises(BadUrl):
@@ -329,5 +334,6 @@ def test_the_schema_is_one_for_editors() -> None:
     made = schema_of(FileEntry, "fleet file")
     assert made["required"] == ["cars"]
     car = made["$defs"]["CarEntry"]["properties"]
-    assert car["platform"]["pattern"] == "^(auto|arduino|stm32|raspberry_pi|unknown)([+](arm|imu))*$"
+    options = "arm|imu|text|no_readings|3s|fan_level|ptz_direct|head=[A-Za-z0-9]{2,8}"
+    assert car["platform"]["pattern"] == f"^(auto|arduino|stm32|raspberry_pi|unknown)([+]({options}))*$"
     assert all("description" in field for field in car.values())

@@ -2,7 +2,8 @@
 
 import pytest
 
-from gateway.protocol.decoder import ArmReading, Cause, Decoder, Echo, Event, ImuReading, Rejected, Sensors
+from gateway.protocol.decoder import ArmReading, Cause, Decoder, Echo, Event, ImuReading, Rejected, Sensors, TextLine
+from gateway.protocol.measurements import verdict_of
 from tests.support.vectors import ids, rows, wire
 
 SENSORS, OTHERS, BAD = rows("sensors"), rows("other_readings"), rows("bad_input")
@@ -136,7 +137,9 @@ def test_silence_ends_a_run_of_junk() -> None:
     assert decoder.feed(b"hel", 1.0) == []
     assert decoder.feed(b"lo\r\n", 1.02) == []
     assert decoder.deadline() == pytest.approx(1.07)
-    assert decoder.tick(1.07) == [Rejected(b"hello", 1.02, Cause.NO_START, "5 bytes outside a frame")]
+    assert decoder.tick(1.07) == [TextLine(b"hello\r\n", 1.02)]
+    decoder.feed(b"hello", 2.0)
+    assert decoder.tick(2.05) == [Rejected(b"hello", 2.0, Cause.NO_START, "5 bytes outside a frame")]
 
 
 def test_separators_between_frames_make_no_event_and_want_no_tick() -> None:
@@ -262,3 +265,66 @@ class TestEnd:
         (event,) = decoder.end()
         assert isinstance(event, Rejected)
         assert event.cause is Cause.NO_START
+
+
+def kinds(events: list[Event]) -> list[tuple[str, bytes]]:
+    return [(verdict_of(event), event.raw) for event in events]
+
+
+@pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r"])
+def test_a_whole_line_of_text_is_no_damage(end: bytes) -> None:
+    line = b"EXEC:F" + end
+    events = Decoder().feed(GOOD + line + GOOD + b"\r\n" + line + b"Motor on, 3 A" + end + GOOD, 1.0)
+    expected = [GOOD, line, GOOD, line, b"Motor on, 3 A" + end, GOOD]
+    assert kinds(events) == [("sensors" if raw == GOOD else "text", raw) for raw in expected]
+
+
+NO_TEXT = [
+    b"EXEC:F",  # cut: another frame began
+    b"EX\x80C:F\r\n",
+    b"EXEC#F\r\n",
+    b"4WD,hello\r\n",
+    b",HW00,GM10\r\n",
+    b"CSB12\r\n",
+    b"J190,J2\r\n",
+    b"1,0,0\r\n",
+    b"F\r\n",
+]
+
+
+@pytest.mark.parametrize("junk", NO_TEXT)
+def test_a_piece_of_a_frame_or_of_a_line_is_no_text(junk: bytes) -> None:
+    assert kinds(Decoder().feed(junk + GOOD, 1.0)) == [("no_start", junk.rstrip()), ("sensors", GOOD)]
+
+
+def test_text_between_damage_is_one_event_and_each_run_of_damage_another() -> None:
+    events = Decoder().feed(b"\xff\r\n\xfe\r\nEXEC:F\r\n\r\n12\r\nEX" + GOOD, 1.0)
+    expected = [("no_start", b"\xff\r\n\xfe"), ("text", b"EXEC:F\r\n"), ("no_start", b"12\r\nEX"), ("sensors", GOOD)]
+    assert kinds(events) == expected
+
+
+def test_the_rest_of_a_line_is_no_line() -> None:
+    decoder = Decoder()
+    decoder.feed(b"\xff\xfe", 1.0)
+    assert kinds(decoder.feed(b"EXEC:F\r\nEXEC:F\r\n", 2.0) + decoder.end()) == [
+        ("no_start", b"\xff\xfe"),
+        ("no_start", b"EXEC:F"),
+        ("text", b"EXEC:F\r\n"),
+    ]
+    decoder.feed(b"\xff\xfe", 3.0)
+    decoder.feed(b"\r\n", 4.0)
+    assert kinds(decoder.feed(b"EXEC:F\r\n", 5.0) + decoder.end()) == [("text", b"EXEC:F\r\n")]
+
+
+def test_the_rest_of_a_frame_is_no_line() -> None:
+    decoder = Decoder()
+    decoder.feed(b"$4WD,CSB1", 1.0)
+    assert kinds(decoder.feed(b"hello\r\n", 2.0) + decoder.end())[-1] == ("no_start", b"hello")
+    overlong = b"$" + b"x" * 300 + b"\r\n"
+    assert [kind for kind, _ in kinds(Decoder().feed(overlong + GOOD, 1.0))] == ["overlong", "no_start", "sensors"]
+
+
+def test_a_recorded_line_of_text_decodes_again() -> None:
+    decoder = Decoder()
+    for raw in (b"\xff", b"EXEC:F\r\n", b"hello", b"EXEC:F\r\n"):
+        assert kinds(decoder.feed(raw, 1.0) + decoder.end()) == [("text" if b"EXEC" in raw else "no_start", raw)]

@@ -8,7 +8,7 @@ from gateway.protocol.decoder import Decoder, Sensors
 from gateway.protocol.enums import Mode, SpeedStep
 from gateway.protocol.frames import ArmSet, parse_sent
 from gateway.protocol.modes import MODES, candidate_modes, only_candidate
-from gateway.protocol.platform_name import Platform
+from gateway.protocol.platform_name import OPTION_WORDS, Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
 from tests.support.vectors import ids, rows, wire
@@ -150,8 +150,8 @@ def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, obse
         ("esp32", 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown.'),
         ("arduno", 'Unknown platform "arduno". Did you mean arduino?'),
         ("arduino imu", 'Unknown platform "arduino imu". Did you mean arduino?'),
-        ("arduino+", 'Unknown option "+" of a platform. There are +arm and +imu.'),
-        ("arduino+wings", 'Unknown option "+wings" of a platform. There are +arm and +imu.'),
+        ("arduino+", f'Unknown option "+" of a platform. There are {OPTION_WORDS}.'),
+        ("arduino+wings", f'Unknown option "+wings" of a platform. There are {OPTION_WORDS}.'),
         ("+arm", 'Unknown platform "". There are'),
     ],
 )

@@ -1,8 +1,13 @@
 """Descriptions of cars on the command line, and one-line errors for invalid ones."""
 
+from dataclasses import replace
+
 import pytest
 
+from gateway.protocol.enums import Mode
 from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec, TcpListen, parse_car, parse_cars, parse_replay
+from gateway.sim.model.stm32 import STM32_TRAITS
+from gateway.sim.model.traits import CarTraits
 
 GOOD_CARS = [
     ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyPath())),
@@ -10,12 +15,42 @@ GOOD_CARS = [
     ("blue:raspberry_pi:tcp://127.0.0.1:0", CarSpec("blue", "raspberry_pi", frozenset(), TcpListen("127.0.0.1", 0))),
     ("blue:raspberry_pi:tcp", CarSpec("blue", "raspberry_pi", frozenset(), TcpListen())),
     ("blue:arduino:tcp://[::1]:8888", CarSpec("blue", "arduino", frozenset(), TcpListen("::1", 8888))),
+    ("blue:course:tcp", CarSpec("blue", "course", frozenset(), TcpListen())),
 ]
 
 
 @pytest.mark.parametrize(("text", "spec"), GOOD_CARS)
 def test_cars(text: str, spec: CarSpec) -> None:
     assert parse_car(text) == spec
+
+
+TRAITS = [
+    ("arduino+arm", None),
+    ("arduino+text", CarTraits(text=True)),
+    ("arduino+no_readings", CarTraits(readings=False)),
+    ("arduino+3s", CarTraits(cells=3)),
+    ("arduino+fan_level", CarTraits(fan_level=True)),
+    ("arduino+ptz_direct", CarTraits(ptz_direct=True)),
+    ("arduino+head=BaLa", CarTraits(head="BaLa")),
+    ("arduino+interval=0.71+spread=0.08", CarTraits(interval_s=0.71, spread_s=0.08)),
+    ("arduino+spread=0.08+interval=0.1", CarTraits(interval_s=0.1, spread_s=0.08)),
+    ("arduino+timer", CarTraits(timer=True)),
+    ("arduino+close=0", CarTraits(close_s=0.0)),
+    ("arduino+last_frame", CarTraits(last_frame_wins=True)),
+    ("arduino+silent=tracking+silent=following", CarTraits(silent_modes=frozenset({Mode.TRACKING, Mode.FOLLOWING}))),
+    ("arduino+gray=4095", CarTraits(gray_max=4095)),
+    ("arduino+constants", CarTraits(constants=True)),
+    ("stm32", None),
+    ("stm32+constants+3s", replace(STM32_TRAITS, constants=True, cells=3)),
+    ("raspberry_pi+text+interval=2", CarTraits(text=True, interval_s=2.0)),
+]
+
+
+@pytest.mark.parametrize(("platform", "traits"), TRAITS)
+def test_options_are_traits(platform: str, traits: CarTraits | None) -> None:
+    spec = parse_car(f"red:{platform}:pty")
+    assert spec.traits == traits
+    assert sorted(spec.platform_words.split("+")) == sorted(platform.split("+"))
 
 
 BAD_CARS = [
@@ -30,6 +65,20 @@ BAD_CARS = [
     (["red:Arduino:pty"], "arduino, stm32, raspberry_pi"),
     (["red:arduino+legs:pty"], "+arm, +imu"),
     (["red:arduino+:pty"], "+arm, +imu"),
+    (["red:arduino+text=1:pty"], "+text,"),
+    (["red:arduino+interval:pty"], "+interval=S"),
+    (["red:arduino+interval=fast:pty"], "a number of seconds from 0.1 to 10"),
+    (["red:arduino+interval=nan:pty"], "a number of seconds from 0.1 to 10"),
+    (["red:arduino+interval=0.05:pty"], "a number of seconds from 0.1 to 10"),
+    (["red:arduino+spread=1.1:pty"], "a number of seconds from 0 to 1"),
+    (["red:arduino+interval=0.5+spread=0.5:pty"], "less than the interval, 0.5 s"),
+    (["red:arduino+close=-1:pty"], "a number of seconds from 0 to 10"),
+    (["red:arduino+gray=0.5:pty"], "a whole number from 1 to 65535"),
+    (["red:arduino+silent=driving:pty"], "manual, remote_control, tracking"),
+    (["red:arduino+head=A:pty"], "2 to 8 letters and digits"),
+    (["red:stm32+timer:pty"], "option '+timer' of stm32 is not allowed: use +arm, +imu"),
+    (["red:raspberry_pi+gray=4095:pty"], "use +arm, +imu"),
+    (["red:course+arm:pty"], "use none"),
     (["red:arduino:usb"], "pty, pty:PATH"),
     (["red:arduino:pty:"], "pty, pty:PATH"),
     (["red:arduino:"], "pty, pty:PATH"),

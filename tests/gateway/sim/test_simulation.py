@@ -571,3 +571,21 @@ async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.Monkey
     publishing.cancel()
     await asyncio.gather(publishing, return_exceptions=True)
     assert said.empty()
+
+
+async def test_the_options_of_a_car_reach_its_program() -> None:
+    simulation = Simulation(parse_cars(["red:arduino+interval=0.2+head=BALA:pty", "blue:course:tcp"]))
+    await simulation.start()
+    data = bytearray()
+    with serial.Serial(simulation.cars["red"].url.removeprefix("serial://"), timeout=0) as port:
+        await until(lambda: data.extend(port.read(4096)) or data.count(b"$BALA,CSB") >= 5, "five reports in its rhythm")
+    host, port_number = where(simulation, "blue")
+    reader, writer = await asyncio.open_connection(host, port_number)
+    writer.write(RUN)
+    await until(lambda: simulation.cars["blue"].truth.driving, "drives")
+    writer.write(MODE00)
+    with pytest.raises(ConnectionResetError):  # its sockets end with it
+        await reader.read()
+    assert simulation.cars["blue"].truth.driving
+    writer.close()
+    await simulation.stop()

@@ -1,0 +1,95 @@
+"""Parses the options of a simulated car, such as `+3s` or `+interval=0.7`, into its traits. Pure."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from gateway.protocol.enums import Mode
+from gateway.protocol.platform_name import HEAD, OPTION_WORDS, OPTIONS, VARIANTS, check_head
+from gateway.sim.model.stm32 import STM32_TRAITS
+from gateway.sim.model.traits import CarTraits
+
+FLAGS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "text": {"text": True},
+    "no_readings": {"readings": False},
+    "3s": {"cells": 3},
+    "fan_level": {"fan_level": True},
+    "ptz_direct": {"ptz_direct": True},
+    "timer": {"timer": True},
+    "last_frame": {"last_frame_wins": True},
+    "constants": {"constants": True},
+}
+"""The traits that each option without a value sets."""
+NUMBERS: Final[Mapping[str, tuple[str, float, float, str]]] = {
+    "interval": ("interval_s", 0.1, 10.0, "a number of seconds"),
+    "spread": ("spread_s", 0.0, 1.0, "a number of seconds"),
+    "close": ("close_s", 0.0, 10.0, "a number of seconds"),
+    "gray": ("gray_max", 1, 65535, "a whole number"),
+}
+"""For each option with a number: its trait, the least and the largest value, and what it is."""
+SILENT: Final = "silent"
+
+_REPORTS: Final = ("interval", "spread")
+_MODE_CAR: Final = (*_REPORTS, SILENT, "gray", "constants")
+SIMULATED: Final[Mapping[str, tuple[str, ...]]] = {
+    "arduino": (*_MODE_CAR, "timer", "close", "last_frame"),
+    "stm32": _MODE_CAR,
+    "raspberry_pi": _REPORTS,
+    "course": (),
+}
+"""For each platform the options that only the simulator knows."""
+_PLACEHOLDERS: Final = {"interval": "S", "spread": "S", "close": "S", "gray": "MAX", SILENT: "MODE"}
+
+
+class BadOption(ValueError):
+    """An option that is not allowed. The message says what is."""
+
+
+def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
+    """Return the traits of a car with these options, None if they are those of its platform; raise BadOption."""
+    base = STM32_TRAITS if platform == "stm32" else CarTraits()
+    traits = base
+    for option in options:
+        traits = _with_option(traits, platform, option)
+    if traits.spread_s >= traits.interval_s:
+        words = f"+spread={traits.spread_s:g} is not allowed: less than the interval, {traits.interval_s:g} s"
+        raise BadOption(f"option {words}")
+    return None if traits == base else traits
+
+
+def allowed_options(platform: str) -> str:
+    """Return the options of a platform, for a person."""
+    own = [f"+{word}={_PLACEHOLDERS[word]}" if word in _PLACEHOLDERS else f"+{word}" for word in SIMULATED[platform]]
+    return "none" if platform == "course" else ", ".join((OPTION_WORDS, *own))
+
+
+def _with_option(traits: CarTraits, platform: str, option: str) -> CarTraits:
+    word, equals, value = option.partition("=")
+    shared = word in (*OPTIONS, *VARIANTS, HEAD) and platform != "course"
+    if not (shared or word in SIMULATED[platform]) or bool(equals) != (word in _PLACEHOLDERS or word == HEAD):
+        allowed = allowed_options(platform)
+        raise BadOption(f"option '+{option}' of {platform} is not allowed: use {allowed}")
+    if word in OPTIONS:
+        return traits
+    if word in FLAGS:
+        return replace(traits, **FLAGS[word])
+    if word == HEAD:
+        try:
+            check_head(value)
+        except ValueError as error:
+            raise BadOption(f"option '+{option}': {error}") from None
+        return replace(traits, head=value)
+    if word == SILENT:
+        if value not in set(Mode):
+            raise BadOption(f"option '+{option}' is not allowed: a mode, one of {', '.join(Mode)}")
+        return replace(traits, silent_modes=traits.silent_modes | {Mode(value)})
+    field, least, most, what = NUMBERS[word]
+    try:
+        number = int(value) if isinstance(least, int) else float(value)
+    except ValueError:
+        number = math.nan
+    if not least <= number <= most:
+        raise BadOption(f"option '+{option}' is not allowed: {what} from {least:g} to {most:g}")
+    changes: dict[str, Any] = {field: number}
+    return replace(traits, **changes)
