@@ -238,7 +238,7 @@ class ArduinoCar(ModeCar):
         frame = self._frame(fields)
         if self._mode == 6:
             frame = frame[:-1]  # row "6 following": no `#`
-        if self._fan or self._is_silent:
+        if self._fan or self._is_silent or not self._traits.readings:
             yield Wait(self._now + len(frame) / self._rate)
         else:
             yield from self._print(frame)
