@@ -135,6 +135,10 @@ class Controller:
         self.model.cut_write = True
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
+    def is_free(self, now: float) -> bool:
+        """Return True if a command of somebody who may command the car would be sent now."""
+        return self.model.link_open and self._executor.accepts_commands(now)
+
     def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
         return self._executor.poll(now)

@@ -234,7 +234,7 @@ class Executor:
                 model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
             case _:
                 model.mode.on_written(block_s, now=now)
-                model.evidence.blocked(blocking_kind(frame), block_s)
+                model.evidence.blocked(blocking_kind(frame), block_s, now)
                 if isinstance(frame, General) and frame.motion is not Motion.STOP:
                     model.evidence.sent_motion()
                     self._end_rest(TrustEvent.MOTION_SENT, now)

@@ -2,7 +2,8 @@
 
 An episode brings a car into a state and lets the link fail around a stop. The car's true motors judge the claims of
 control. `EpisodePlan` has all random values of an episode, so a failure can be shrunk to the faults that it needs.
-Everything runs on virtual time.
+Everything runs on virtual time. Half of the episodes draw the car, too (`any_car.draw_car`): another rhythm, other
+blocks, another program.
 """
 
 import random
@@ -16,6 +17,7 @@ from typing import Any
 
 from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
+from gateway.control.estimate.learned import Shows
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import CarTrust
 from gateway.control.events import CommandRecord
@@ -27,6 +29,8 @@ from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
+from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 
 BYTES_PER_S = 960
@@ -35,11 +39,12 @@ FALSE_S = 0.3
 """Maximum time that a claim may be false."""
 STANDS_S, AVOIDING_STANDS_S = 15.0, 20.0
 """Maximum time from the last fault or stop until the motors are off for good. The second is for obstacle avoidance."""
-ENDS_S = 17.5
-"""Maximum time from the request of a stop to its end."""
-VERDICT_S = 5.5
-"""Maximum time that an ended mode stays confirmed: 3 s of silence, a block of ours, and a reading in transit."""
-READY_S = 14.0
+VERDICT_S = 2.5
+"""Maximum time that an ended mode stays confirmed after the silence that contradicts it: a block of ours, and a reading
+in transit."""
+READY_S = 25.0
+"""Maximum time until the rest of a car is claimed, on a whole link. Of slow cars, and of such whose program blocks for
+another time than the vendor's, it takes longer to learn what they can show."""
 EARLY_S = 3.0
 """Time before the request of a mode in which the link may already fail."""
 
@@ -67,6 +72,10 @@ class Kind(StrEnum):
     """The link holds all bytes, and delivers them at once at the end."""
     DOUBLED = "doubled"
     """Each piece comes twice."""
+    HALF_DUPLEX = "half_duplex"
+    """Each write of ours mutes the reception for `delay_s`."""
+    FLIPPED = "flipped"
+    """The link changes single bits of some bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +123,7 @@ class EpisodePlan:
     faults: tuple[LinkFault, ...]
     opening: bool = False
     """True if `load_s` counts from the frame that opens the mode. If not, it counts from the open mode."""
-    report_every_s: float = 0.9
+    traits: CarTraits = CarTraits()
     again_s: float = 0.0
     """Time from the first stop to a second stop. 0 for none."""
     drive_again_s: float = 0.0
@@ -143,9 +152,16 @@ class Report:
 
 
 def draw(seed: int) -> EpisodePlan:
-    """Return the plan of a seed. Even seeds play themes that are known to be hard. Odd seeds play anything."""
+    """Return the plan of a seed. Even seeds play themes that are known to be hard. Odd seeds play anything.
+
+    Of both, every other pair of seeds also draws the car.
+    """
     moments = random.Random(f"episode {seed}")
-    return _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
+    plan = _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
+    if seed // 2 % 2 == seed // 2 // len(THEMES) % 2:
+        return plan
+    car = draw_car(random.Random(f"car {seed}"), modes=plan.load in _MODE_WORDS)
+    return replace(plan, platform=car.platform, told=car.told, traits=car.traits)
 
 
 def _theme(seed: int, load: str, load_s: float, faults: tuple[LinkFault, ...], **more: Any) -> EpisodePlan:
@@ -158,7 +174,7 @@ def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
     gap = LinkFault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
     return _theme(
         seed, moments.choice(["drive", "steer"]), moments.uniform(0.5, 4.0), (gap,),
-        report_every_s=moments.uniform(0.93, 1.0), ending=moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN]),
+        traits=_every(moments.uniform(0.93, 1.0)), ending=moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN]),
     )  # fmt: skip
 
 
@@ -167,12 +183,12 @@ def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
     at_s, for_s = moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
     load = moments.choice(["tracking", "light_seeking", "following", "obstacle_avoidance", "color_led"])
-    load_s, report_every_s = moments.uniform(0.5, 6.0), moments.uniform(0.9, 1.0)
+    load_s, traits = moments.uniform(0.5, 6.0), _every(moments.uniform(0.9, 1.0))
     rest_s = moments.choice([0.0, moments.uniform(3.0, 5.0)])
     if moments.random() < 0.5:
         at_s, for_s = 9.5 / BYTES_PER_S, 2 / BYTES_PER_S
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, at_s, for_s)
-    return _theme(seed, load, load_s, (lost, later), report_every_s=report_every_s, rest_s=rest_s)
+    return _theme(seed, load, load_s, (lost, later), traits=traits, rest_s=rest_s)
 
 
 def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePlan:
@@ -182,7 +198,7 @@ def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePl
     held_s = moments.uniform(1.0, 1.6)
     held = LinkFault(Kind.STUCK, Way.TO_HOST, moments.uniform(0.95, 1.18) - held_s, held_s)
     return _theme(
-        seed, "drive", moments.uniform(0.5, 4.0), (lost, later, held), report_every_s=moments.uniform(0.93, 1.0)
+        seed, "drive", moments.uniform(0.5, 4.0), (lost, later, held), traits=_every(moments.uniform(0.93, 1.0))
     )
 
 
@@ -256,6 +272,21 @@ def _driven_over(seed: int, moments: random.Random) -> EpisodePlan:
     )  # fmt: skip
 
 
+def _half_duplex(seed: int, moments: random.Random) -> EpisodePlan:
+    """Mute the reception at each write of ours, while the car is deaf: each stop seems to make a pause."""
+    deaf = LinkFault(Kind.DEAD, Way.TO_CAR, -0.1, moments.uniform(14.0, 30.0))
+    muted = LinkFault(Kind.HALF_DUPLEX, Way.TO_HOST, -0.1, deaf.for_s, delay_s=moments.uniform(0.1, 1.5))
+    return _theme(
+        seed, "drive", moments.uniform(0.5, 4.0), (deaf, muted), traits=_every(moments.uniform(0.3, 1.3)),
+        again_s=moments.choice([0.0, moments.uniform(1.0, 9.0)]),
+    )  # fmt: skip
+
+
+def _every(loop_s: float) -> CarTraits:
+    """Return the traits of a car that reports so often, without the ranging."""
+    return CarTraits(interval_s=loop_s + ECHO_RANGING_S)
+
+
 THEMES = (
     _report_swallowed,
     _digit_lost,
@@ -268,6 +299,7 @@ THEMES = (
     _joined_reports,
     _misread_and_lost,
     _driven_over,
+    _half_duplex,
 )
 
 
@@ -312,7 +344,7 @@ def _any(seed: int, moments: random.Random) -> EpisodePlan:
         moments.choice(endings),
         _faults(moments),
         opening=opening,
-        report_every_s=moments.choice([0.9, 0.9, moments.uniform(0.9, 1.0)]),
+        traits=_every(moments.choice([0.9, 0.9, moments.uniform(0.9, 1.0)])),
         again_s=moments.uniform(0.3, 6.0) if moments.random() < 0.15 else 0.0,
         drive_again_s=moments.uniform(4.0, 14.0) if moments.random() < 0.15 else 0.0,
         early=opening and moments.random() < 0.5,
@@ -321,6 +353,7 @@ def _any(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 _WITH_MODES = {("arduino", "arduino"), ("arduino", "stm32")}
+_MODE_WORDS = frozenset(mode.value for mode in Mode if mode is not Mode.MANUAL)
 _FRAME_S = 12 / BYTES_PER_S
 """Time of `$4WD,MODE00#` on the wire."""
 
@@ -350,7 +383,7 @@ def _faults(moments: random.Random) -> tuple[LinkFault, ...]:
 def _fault(moments: random.Random) -> LinkFault:
     for_s = 0.05 * 400 ** moments.random()  # 0.05 to 20 s, log-uniform
     at_s = moments.uniform(-min(for_s, 4.0), 2.5)
-    kind = moments.choices(list(Kind), [8, 4, 2, 2, 1])[0]
+    kind = moments.choices(list(Kind), [8, 4, 2, 2, 1, 1, 0])[0]
     return LinkFault(
         kind,
         moments.choice(list(Way)),
@@ -368,6 +401,8 @@ class SearchedDirection:
         self._faults = faults
         self._moments = moments
         self._held: deque[tuple[float, bytes]] = deque()
+        self.written_at = float("-inf")
+        """When the last frame was written to the other direction, for a half-duplex link."""
 
     def put(self, data: bytes, at: float, end: float) -> None:
         """Send bytes that occupy the wire from `at` to `end`, in seconds from the stop."""
@@ -392,6 +427,11 @@ class SearchedDirection:
                         due = max(due, fault.end_s)
                     case Kind.DOUBLED:
                         twice = True
+                    case Kind.HALF_DUPLEX:
+                        lost = lost or self.written_at <= now < self.written_at + fault.delay_s
+                    case Kind.FLIPPED:
+                        if self._moments.random() < fault.share:
+                            byte ^= 1 << self._moments.randrange(8)
             if not lost:
                 out.append(byte)
         if self._held:
@@ -419,9 +459,15 @@ class Episode:
         moments = self._moments = random.Random(f"chances {plan.seed}")
         self.report = Report(plan)
         world = ALL_WORLDS[plan.world]()
-        self.car = build(plan.platform, world, 0, random.Random(plan.seed), transport=Transport.SERIAL, name="red")
-        if isinstance(self.car, ArduinoCar):
-            self.car.report_interval_s = plan.report_every_s
+        self.car = build(
+            plan.platform,
+            world,
+            0,
+            random.Random(plan.seed),
+            transport=Transport.SERIAL,
+            name="red",
+            traits=plan.traits if plan.platform == "arduino" else None,
+        )
         self.control = Controller("red", parse_platform(plan.told))
         self.decoder = Decoder()
         self.now = 0.0
@@ -456,7 +502,14 @@ class Episode:
         plan = self.plan
         self._run(2.0)
         self._connect()
-        self._until(lambda: self.control.model.motors == "off", READY_S)
+        self._until(lambda: self.control.is_free(self.now), USABLE_S, fails=False)
+        if not self.control.is_free(self.now):
+            self._violate(f"(5) takes no command {USABLE_S:g} s after the connect")
+        self._until(
+            lambda: self.control.model.motors == "off",
+            READY_S,
+            fails=plan.traits.close_s == 1.0 and plan.traits.interval_s < 1.5,
+        )
         self._run(self._moments.random() + plan.rest_s)
         self.zero = self.now + 60.0  # `_load` sets the time
         self._load()
@@ -656,6 +709,7 @@ class Episode:
             if write is None:
                 break
             self._note(f"write {write.data!r} {write.why}")
+            self._up.written_at = now - self.zero if self.zero < float("inf") else float("-inf")
             zero = self.zero if self.zero < float("inf") else 0.0
             took_s = len(write.data) / BYTES_PER_S
             if self.zero < float("inf") and (
@@ -696,7 +750,7 @@ class Episode:
             self._complete = False
         if identity in self._ends and last:
             self._ends[identity].append(last)
-            if self.now - self._asked_at[identity] > ENDS_S:
+            if self.now - self._asked_at[identity] > self._ends_s:
                 self._violate(f"(4) {identity} ended after {self.now - self._asked_at[identity]:.0f} s")
             self.report.ends[last] += 1
             if last == "sent" and self._shows:
@@ -707,12 +761,19 @@ class Episode:
             self._ends[identity].append(record.phase)
 
     @property
+    def _ends_s(self) -> float:
+        """Return the maximum time from the request of a stop to its end."""
+        traits = self.plan.traits
+        return 5.5 + max(12.0, 3 * (traits.interval_s + traits.spread_s + traits.close_s + 0.1))
+
+    @property
     def _shows(self) -> bool:
-        """Return True if the car can show a stop, and nothing hides the evidence."""
+        """Return True if the car has shown a stop before, and nothing hides the evidence."""
         plan = self.plan
         return (
-            (plan.platform, plan.told) in _WITH_MODES
+            (plan.platform, plan.told) == ("arduino", "arduino")
             and plan.world == "echo"
+            and self.control.model.learned.shows is Shows.YES
             and not (self.car.truth.fan or self._platform_doubted)
         )
 
@@ -767,13 +828,14 @@ class Episode:
             return
         if mode.verdict is Verdict.CONFIRMED and mode.inferred is None:
             self._violate("(3) confirmed, inferred unknown")
-        if mode.verdict is Verdict.CONFIRMED and self.now - (mode.evidence_at or 0.0) > VERDICT_S:
+        verdict_s = mode.manual_silence_s + VERDICT_S
+        if mode.verdict is Verdict.CONFIRMED and self.now - (mode.evidence_at or 0.0) > verdict_s:
             self._violate("(3) confirmed by old evidence")
         if mode.verdict is not Verdict.CONFIRMED or mode.asked is true or not self.car.alive:
             self._verdict_since = None
         elif self._verdict_since is None:
             self._verdict_since = self.now
-        elif self.now - self._verdict_since > VERDICT_S:
+        elif self.now - self._verdict_since > verdict_s:
             self._violate(f"(3) {mode.asked} is confirmed, {true} is true")
 
     def _judge_rest(self, seconds: float) -> None:
@@ -781,8 +843,10 @@ class Episode:
         end = self.now + seconds
         while self.now < end:
             if self.car.truth.driving and self.car.alive:
-                if _is_lost(self.car) or (_is_wedged(self.car) and self.control.model.basis == "sent"):
+                if _is_wedged(self.car) and self.control.model.basis == "sent":
                     self.report.wedged = True
+                elif not self.control.model.is_heard or not self.plan.traits.readings:
+                    self.report.false_sent["no readings"] += 1  # nothing shows it, and the words say so
                 elif self._ended_as_sent:
                     self.report.false_sent["shutdown"] += 1  # nothing showed the stop, and no gateway is left
                 else:
@@ -790,7 +854,7 @@ class Episode:
                 break
             self._turn(end)
         for identity, ends in self._ends.items():
-            if self.now - self._asked_at[identity] > ENDS_S and self._linked and len(ends) != 1:
+            if self.now - self._asked_at[identity] > self._ends_s and self._linked and len(ends) != 1:
                 self._violate(f"(4) {identity} ended as {ends}")
 
     def _violate(self, words: str) -> None:
@@ -798,11 +862,6 @@ class Episode:
         if not any(each.startswith(short) for each in self.report.violations):
             self.report.violations.append(words)
             self._note(f"VIOLATION {words}")
-
-
-def _is_lost(car: object) -> bool:
-    """Return True if the car keeps a string without its first bytes, which no recovery clears (test_stopping.py)."""
-    return isinstance(car, ArduinoCar) and car._string.startswith(("4WD", "WD", "D,", "MODE"))
 
 
 def _is_wedged(car: object) -> bool:

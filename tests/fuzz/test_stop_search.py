@@ -2,6 +2,7 @@
 
 import pytest
 
+from gateway.sim.model.traits import CarTraits
 from tests.fuzz.stop_search import BYTES_PER_S, Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
 
 PARTS = 4
@@ -24,7 +25,7 @@ FOUND = (
             LinkFault(Kind.DEAD, Way.TO_HOST, -1.183403621766109, 3.2037874071570047),
             LinkFault(Kind.DEAD, Way.TO_CAR, -0.5901843230079526, 4.990518586147078),
         ),
-        report_every_s=0.9099851621644699, driven=True,
+        traits=CarTraits(interval_s=0.9209851621644699), driven=True,
     ),
     EpisodePlan(
         81004327, "arduino", "arduino", "echo", "light_seeking", 5.7784868346822424, Ending.STOP,

@@ -430,8 +430,9 @@ def state_of(pair: Pair) -> str:
     style = control.model.profile.stop_style
     kind = {
         StopStyle.MODE_FRAME: "",
-        StopStyle.UNKNOWN: "unknown platform, ",
-        StopStyle.RASPBERRY_PI: f"{Platform.RASPBERRY_PI}, ",
+        StopStyle.BOTH: "readings contradict the platform, ",
+        StopStyle.GENERAL: f"{control.model.profile.kind}, ",
+        StopStyle.TIMER: f"{Platform.STM32}, ",
     }
     running = control.stops.running
     if control.model.trust.state in (CarTrust.UNHEARD, CarTrust.UNPROVEN):

@@ -30,8 +30,8 @@ were the link's.
 one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
 such a report would have come.
 
-*Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. That needs one
-report only, but the report must begin after `MODE00` was obeyed, and come before a `MODE00` that lost its digits would
+*Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. On a car that was
+seen to block, that needs one report only, but the report must begin after `MODE00` was obeyed, and come before a `MODE00` that lost its digits would
 let one through: without its digits the frame opens mode 0 with the motors on, which blocks longer. A silent mode shows
 nothing by its silence. If it was opened from a shown rest, the end of the silence shows that it was left.
 
@@ -50,7 +50,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from gateway.control.estimate.learned import SAME_S, Blocking, Learned, Rhythm
+from gateway.control.estimate.learned import SAME_S, Blocking, Learned, Rhythm, Shows
 from gateway.protocol.enums import Mode
 from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile
@@ -86,6 +86,8 @@ SHAPES: Final = 2
 """Number of consecutive readings with the shape of another mode that show that mode."""
 ROUND_TRIP_S: Final = 2.5
 """Round trip of a slow link, from the second try on: the car may have sent earlier reports before `MODE00`."""
+READ_LATE_S: Final = 0.3
+"""Maximum time from a frame to a report that was under way before the car read the frame."""
 IN_FLIGHT_S: Final = 0.1
 """Minimum time from a frame to a report that the car sent after it could have read the frame."""
 
@@ -219,6 +221,15 @@ class Finding(StrEnum):
 _NEVER: Final = float("-inf")
 
 
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """A frame that blocks the car: its kind, its maximum block, and when it was written."""
+
+    kind: Blocking | None
+    block_s: float
+    at: float
+
+
 @dataclass(slots=True)
 class StopEvidence:
     """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
@@ -252,8 +263,10 @@ class StopEvidence:
     """True if a frame was written after the `MODE00` that the next pause would judge."""
     _controlled: bool = False
     """True if a general frame of this stop did not delay a report."""
-    _blocking: list[tuple[Blocking | None, float]] = field(default_factory=list)
-    """The other frames that block, since the last report: kind and maximum block."""
+    _blocking: list[_Block] = field(default_factory=list)
+    """The other frames that block, since the last report."""
+    _fast_before: bool = False
+    """True if the last bytes were a report with an echo, however soon it came."""
     _general: bool = False
     """True if a general frame that does not block was written since the last report."""
     _window_s: float = 0.0
@@ -337,16 +350,16 @@ class StopEvidence:
         if self._closed_at is None:
             self._plain = False
 
-    def blocked(self, kind: Blocking | None, block_s: float) -> None:
+    def blocked(self, kind: Blocking | None, block_s: float, now: float) -> None:
         """Record a frame that blocks the car for at most so long: the next report comes later."""
         if block_s > FRAME_S:
-            self._blocking.append((kind, block_s))
+            self._blocking.append(_Block(kind, block_s, now))
 
     def closed(self, now: float, *, awake: bool) -> None:
         """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly its block."""
         self._pending = now if awake else None
         if not awake:
-            self._blocking.append((None, self.close_s))  # this interval is no measure
+            self._blocking.append(_Block(None, self.close_s, now))  # this interval is no measure
         self._delay_s = None
         self._unjudged = False
         self.settles_at = None
@@ -365,6 +378,7 @@ class StopEvidence:
         """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
         self._last_at = at
         self._before = self._before_no_echo = self.settles_at = None
+        self._fast_before = False
         if damaged:
             self._foreign_at = at
 
@@ -386,6 +400,7 @@ class StopEvidence:
         on_time = self.settles_at is not None and quiet_s >= self._interval_s - self._rhythm.tolerance_s
         if on_time and Mode.MANUAL in candidate_modes(event):
             self._before, self._blocking, self._general = at if event.range_cm else None, [], False
+            self._fast_before = bool(event.range_cm)
             return self._obeyed(at)
         self.settles_at = None
         if Mode.MANUAL not in candidate_modes(event):
@@ -393,16 +408,20 @@ class StopEvidence:
             return Finding.NOTHING
         self._shapes = 0
         if quiet_s < self.settled_s:
+            self._learn_faster(event, quiet_s)
             self._before = self._before_no_echo = None
             if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * (self._rhythm.median_s or FASTEST_S)):
                 self._drop_pauses()
             return Finding.NOTHING
+        self._fast_before = bool(event.range_cm)
         if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
             self._before = self._before_no_echo = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
         before_no_echo, self._before_no_echo = self._before_no_echo, None if event.range_cm else at
-        blocking, self._blocking = self._blocking, []
+        blocking = self._blocking
+        # A frame that was written just before this report may be read after it.
+        self._blocking = [each for each in blocking if at - each.at < READ_LATE_S]
         general, self._general = self._general, False
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         within_s = self._left_s if event.range_cm else self._left_s + self.profile.ranging_s
@@ -441,9 +460,7 @@ class StopEvidence:
     def _report(self) -> Finding:
         return Finding.REPORT if self._rhythm.is_known else Finding.UNJUDGED
 
-    def _without_mode_00(
-        self, before: float | None, at: float, blocking: list[tuple[Blocking | None, float]], *, general: bool
-    ) -> Finding:
+    def _without_mode_00(self, before: float | None, at: float, blocking: list[_Block], *, general: bool) -> Finding:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
         if before is None:
             return self._report
@@ -454,8 +471,8 @@ class StopEvidence:
                 if not self._controlled:
                     self._drop_pauses()  # the link loses reports when it is written to
             self._learn_interval(gap_s)
-        elif len(blocking) == 1 and (kind := blocking[0][0]) is not None and self._rhythm.is_known:
-            expected_s = blocking[0][1]
+        elif len(blocking) == 1 and (kind := blocking[0].kind) is not None and self._rhythm.is_known:
+            expected_s = blocking[0].block_s
             delay_s = gap_s - self._rhythm.median_s
             self.learned.add_delay(kind, delay_s, self.profile.reopened_s, controlled=True)
             if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
@@ -465,18 +482,23 @@ class StopEvidence:
                 self.found_out = self.learned.on_no_reaction()
         return self._report
 
+    def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
+        """Learn the rhythm of a car that reports faster than it did."""
+        clean = self._fast_before and self._pending is None and not self._blocking
+        self._fast_before = bool(event.range_cm)
+        if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:
+            self._learn_interval(quiet_s)
+
     def _learn_interval(self, gap_s: float) -> None:
         if self.learned.add_interval(gap_s, echo=True):
             self.found_out = True
             self._drop_pauses()
 
-    def _compare(
-        self, before: float, pending: float, at: float, blocking: list[tuple[Blocking | None, float]]
-    ) -> Finding:
+    def _compare(self, before: float, pending: float, at: float, blocking: list[_Block]) -> Finding:
         """Judge the interval of two reports. `MODE00` was written at `pending`."""
         gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
         delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
-        blocked_s = sum(block_s for _, block_s in blocking)
+        blocked_s = sum(each.block_s for each in blocking)
         if pending >= before and after_s > IN_FLIGHT_S and not blocking:
             self._delay_s = delay_s
         if after_s <= close_s - EARLY_S:
@@ -499,13 +521,14 @@ class StopEvidence:
             return self._pause(at, first_delay_s)
         # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
         other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
-        if not rhythm.fits(gap_s):
+        none_s = max(SAME_S, 2 * tolerance_s)  # a delay that is no longer than this is none
+        if abs(delay_s) > none_s:
             self._drop_pauses()
             return other
-        if first_delay_s is not None and not rhythm.fits(rhythm.median_s + first_delay_s):
+        if first_delay_s is not None and abs(first_delay_s) > none_s:
             return other
         self._drop_pauses()
-        if not blocking:
+        if not blocking and rhythm.fits(gap_s):
             self._learn_interval(gap_s)
         if self.profile.close_s > 2 * tolerance_s:
             self.found_out = self.learned.on_no_reaction() or self.found_out
@@ -518,9 +541,7 @@ class StopEvidence:
         self._delay_s = None
         self.learned.on_reaction()
         if learn:
-            self.learned.add_delay(
-                Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s, controlled=self._controlled
-            )
+            self.learned.add_delay(Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s, controlled=self._controlled)
         if not self._controlled and self.learned.is_confusable(delay_s):
             return Finding.CONTROL
         if self._pauses < self._pauses_needed or self._unjudged:
@@ -536,6 +557,7 @@ class StopEvidence:
         self._shapes += 1
         self._foreign_at = at
         self._before = self._before_no_echo = None
+        self._fast_before = False
         self._drop_pauses()
         if self._shapes >= SHAPES or self._shape_at is not None:
             self._shape_at = at
@@ -559,7 +581,8 @@ class StopEvidence:
             return Finding.NOTHING
         mode = "the mode that it reported" if silent is None else silent
         self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
-        is_judged = at <= closed_at + within_s and not self._unjudged
+        # On a car that was never seen to block, a report may come in the middle of a block, with the motors on.
+        is_judged = at <= closed_at + within_s and not self._unjudged and self.learned.shows is Shows.YES
         return Finding.SHOWN if is_judged else Finding.PAUSE
 
     def _left_late(self, at: float) -> Finding:
