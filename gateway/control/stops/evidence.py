@@ -521,7 +521,8 @@ class StopEvidence:
             return self._pause(at, first_delay_s)
         # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
         other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
-        none_s = max(SAME_S, 2 * tolerance_s)  # a delay that is no longer than this is none
+        # A delay that is no longer than this is none.
+        none_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
         if abs(delay_s) > none_s:
             self._drop_pauses()
             return other
