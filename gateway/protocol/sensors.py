@@ -166,4 +166,13 @@ def sensors_matcher(head: str) -> SensorsMatcher:
     return SensorsMatcher(head)
 
 
+_ANY_HEAD: Final = re.compile(rb"\$([A-Za-z0-9]{2,8})" + sensors_pattern(head=b"")[2:] + rb"#?")
+
+
+def head_of(raw: bytes) -> str | None:
+    """Return the first word of a sensors frame, whatever it is. None if these bytes are no sensors frame."""
+    found = _ANY_HEAD.fullmatch(raw)
+    return found[1].decode() if found else None
+
+
 fullmatch_sensors = sensors_matcher("4WD").fullmatch_unended
