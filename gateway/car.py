@@ -110,7 +110,7 @@ class CarGateway:
         )
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
-        self._decoder = Decoder()
+        self._decoder = self._new_decoder()
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
@@ -231,7 +231,7 @@ class CarGateway:
             may_fail = True
             now = self._loop.time()
             self._link = link
-            self._decoder = Decoder()
+            self._decoder = self._new_decoder()
             self._health.on_open(now)
             self._control.link_up(now)
             if self._attempts.on_open(now):
@@ -280,6 +280,9 @@ class CarGateway:
             )
             self._commands.log(Level.WARNING, "flood", words)
         self._flood_until = now + FLOOD_LOG_PAUSE_S
+
+    def _new_decoder(self) -> Decoder:
+        return Decoder(head=self._settings.profile.dialect.head)
 
     def _on_events(self, events: list[Event]) -> None:
         """Publish the measurements of the events, then update the state of the car with them."""

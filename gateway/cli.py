@@ -119,7 +119,9 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         "(`fleet scan` shows them)",
     )
     run.add_argument(
-        "--platform", default="auto", help="arduino, stm32, raspberry_pi, unknown; +arm, +imu (default auto: found out)"
+        "--platform",
+        default="auto",
+        help="arduino, stm32, raspberry_pi, unknown; with options as in arduino+arm (default auto: found out)",
     )
     run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
     run.add_argument(

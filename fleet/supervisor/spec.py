@@ -145,7 +145,8 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
     for index, name in enumerate(names):
         car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car needs a platform. The platform of a real car can be detected.
-        platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
+        kind, *words = car.platform.split("+")
+        platform = "+".join(("arduino" if kind in ("auto", "unknown") else kind, *words))
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
     people = file.people if file else None
     if people is not None:

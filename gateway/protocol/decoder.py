@@ -16,15 +16,9 @@ from typing import Final
 
 from gateway.protocol.enums import Cause
 from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
+from gateway.protocol.frames import STANDARD_HEAD
 from gateway.protocol.parser import parse
-from gateway.protocol.sensors import (
-    Reject,
-    Sensors,
-    fullmatch_sensors,
-    is_complete,
-    match_ended_sensors,
-    read_sensors,
-)
+from gateway.protocol.sensors import Reject, Sensors, read_sensors, sensors_matcher
 
 __all__ = [
     "ArmReading",
@@ -65,10 +59,14 @@ _PROTOCOL_WORD = re.compile(rb"(?<![A-Za-z])(?:4WD|CSB|PV|GS|LF|HW|GM|J[1-6]|MPU
 class Decoder:
     """Decodes the bytes of one connection, so that a new link never completes an old frame."""
 
-    def __init__(self, max_frame: int = MAX_FRAME) -> None:
+    def __init__(self, max_frame: int = MAX_FRAME, *, head: str = STANDARD_HEAD) -> None:
+        """`head`: the first word of the frames of this car."""
         if not _MIN_FRAME <= max_frame <= MAX_FRAME:
             raise ValueError(f"max_frame: {max_frame}, allowed are {_MIN_FRAME}..{MAX_FRAME}")
         self._max = max_frame
+        self._head, self._head_bytes = head, head.encode()
+        self._matcher = sensors_matcher(head)
+        self._match_ended = self._matcher.match_ended
         self._buffer = bytearray()  # a frame from its `$` on, or junk from its first byte that is not a separator
         self._last = 0.0  # time of the last byte in the buffer
         self._silence_s = inf  # silence after the last byte that would complete an event
@@ -80,8 +78,9 @@ class Decoder:
         """Return the events that these bytes complete. `now`: their time of arrival in seconds, any fixed origin."""
         events = self.tick(now) if self._buffer else []
         buffer, sent, pos, size, most = self._buffer, self._sent, 0, len(data), self._max
+        match_ended = self._match_ended
         while pos < size:
-            if not buffer and (found := match_ended_sensors(data, pos, pos + most)):  # the fast path
+            if not buffer and (found := match_ended(data, pos, pos + most)):  # the fast path
                 raw = found[0]
                 events.append(Echo(raw, now) if raw in sent and self._is_echo(raw, now) else read_sensors(found, now))
                 pos = found.end()
@@ -126,7 +125,7 @@ class Decoder:
 
     def _ending_silence_s(self) -> float:
         """Return the silence that ends the buffered bytes; there is at least one."""
-        whole = self._buffer[0] != _START or is_complete(self._buffer)
+        whole = self._buffer[0] != _START or self._matcher.is_complete(self._buffer)
         return MISSING_END_SILENCE_S if whole else CUT_FRAME_SILENCE_S
 
     def _outside(self, data: bytes, pos: int, now: float, events: list[Event]) -> int:
@@ -192,7 +191,7 @@ class Decoder:
         begin, is_whole = 0, not self._is_mid_line
         for found in _LINE.finditer(raw):
             text = found[0].rstrip(_SEPARATORS)
-            if is_whole and _TEXT.fullmatch(text) and not _PROTOCOL_WORD.search(text):
+            if is_whole and self._is_text(text):
                 events += self._run(raw[begin : found.start()])
                 events.append(TextLine(found[0], self._last))
                 begin = found.end()
@@ -200,6 +199,9 @@ class Decoder:
         events += self._run(raw[begin:])
         self._is_mid_line = raw[-1] not in _LINE_END_BYTES
         return events
+
+    def _is_text(self, line: bytes) -> bool:
+        return bool(_TEXT.fullmatch(line)) and not _PROTOCOL_WORD.search(line) and self._head_bytes not in line
 
     def _run(self, junk: bytes) -> list[Event]:
         raw = junk.strip(_SEPARATORS)
@@ -210,13 +212,13 @@ class Decoder:
         return [Rejected(raw, self._last, Cause.NO_START, f"{len(raw)} bytes outside a frame")]
 
     def _ended(self, raw: bytes, at: float) -> Event:
-        return Echo(raw, at) if self._is_echo(raw, at) else parse(raw, at)
+        return Echo(raw, at) if self._is_echo(raw, at) else parse(raw, at, self._head)
 
     def _unended(self, *, by_silence: bool = False) -> list[Event]:
         raw, at = self._take(b""), self._last
         if self._is_echo(raw, at):
             return [Echo(raw, at)]
-        found = fullmatch_sensors(raw)
+        found = self._matcher.fullmatch_unended(raw)
         if found:
             return [read_sensors(found, at, terminated=False, by_silence=by_silence)]
         self._is_mid_line = True

@@ -11,6 +11,7 @@ from typing import Final, TypeVar
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.modes import MODES
 
+STANDARD_HEAD: Final = "4WD"
 ARM_JOINTS: Final = 6
 DEG_MAX: Final = 180  # docs/reference/protocol.md#named-frames: PTZ and joints 0..180 degrees
 COLOR_MAX: Final = 255  # docs/reference/protocol.md#named-frames: color LED 0..255 each
@@ -21,10 +22,26 @@ class EncodeError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
+class Dialect:
+    """The spelling of the frames of one program.
+
+    `head` is the first word of named frames and readings. `swaps_green_and_blue`: place 7 has 3 for blue and 4 for
+    green (docs/reference/protocol.md#programs-that-people-have).
+    """
+
+    head: str = STANDARD_HEAD
+    swaps_green_and_blue: bool = False
+
+
+STANDARD: Final = Dialect()
+
+
+@dataclass(frozen=True, slots=True)
 class General:
     """The nine-field frame. It always carries a motion.
 
-    All other fields are one-shot: sent again, they act again (the fan toggles, the speed climbs).
+    All other fields are one-shot: sent again, they act again (the fan toggles, the speed climbs). For a program that
+    takes the fan as a level, `fan` is that level (`Profile.fan_is_level`).
     """
 
     motion: Motion
@@ -38,7 +55,10 @@ class General:
 
 @dataclass(frozen=True, slots=True)
 class Ptz:
-    """The angle of the front servo, 0..180 degrees. Observed: the car drives its servo to 180 - deg."""
+    """The angle of the front servo, 0..180 degrees, as on the wire.
+
+    The vendor's programs drive the servo to 180 - deg, some forks to deg (`Profile.ptz_direct`).
+    """
 
     deg: int
 
@@ -82,33 +102,39 @@ _Word = TypeVar("_Word", bound=StrEnum)
 Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
     """Return the bytes of a frame; raise EncodeError for a value that the table does not allow."""
     match frame:
         case General():
-            return _general(frame)
+            return _general(frame, dialect)
+        case Reset():
+            return b"#"
+        case _:
+            return b"$%b,%b#" % (dialect.head.encode(), _named(frame))
+
+
+def _named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> bytes:
+    match frame:
         case Ptz(deg):
-            return b"$4WD,PTZ%d#" % _ranged("deg", deg, DEG_MAX)
+            return b"PTZ%d" % _ranged("deg", deg, DEG_MAX)
         case ColorLed(r, g, b):
             rgb = (_ranged("r", r, COLOR_MAX), _ranged("g", g, COLOR_MAX), _ranged("b", b, COLOR_MAX))
-            return b"$4WD,CLR%d,CLG%d,CLB%d#" % rgb
+            return b"CLR%d,CLG%d,CLB%d" % rgb
         case ModeOpen(mode):
             digit = MODES[_member("mode", mode, Mode)].digit
             if not digit:
                 raise EncodeError("mode: 'manual' cannot be opened (MODE01); allowed are the other six, or close it")
-            return b"$4WD,MODE%d1#" % digit
+            return b"MODE%d1" % digit
         case ModeClose(mode):
-            return b"$4WD,MODE%d0#" % MODES[_member("mode", mode, Mode)].digit
+            return b"MODE%d0" % MODES[_member("mode", mode, Mode)].digit
         case ArmSet(joints):
             if len(joints) != ARM_JOINTS:
                 raise EncodeError(f"joint_deg: {len(joints)} values, allowed are {ARM_JOINTS}, each 0..{DEG_MAX}")
             degs = tuple(_ranged(f"joint_deg[{i}]", deg, DEG_MAX) for i, deg in enumerate(joints))
-            return b"$4WD,ServoJ1%d,J2%d,J3%d,J4%d,J5%d,J6%d#" % degs
-        case Reset():
-            return b"#"
+            return b"ServoJ1%d,J2%d,J3%d,J4%d,J5%d,J6%d" % degs
 
 
-def parse_sent(data: bytes) -> Frame | None:
+def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
     """Return the frame with these bytes. None if they are not one whole frame of the table.
 
     Rotation wins over place 1, as in the car. A `Frame` cannot express MODE01, nor a servo that moves (place 5) and
@@ -117,8 +143,9 @@ def parse_sent(data: bytes) -> Frame | None:
     if data == b"#":
         return Reset()
     if found := _GENERAL.fullmatch(data):
-        return _parse_general(*map(int, found.groups()))
-    if found := _NAMED.fullmatch(data):
+        return _parse_general(dialect, *map(int, found.groups()))
+    head = f"${dialect.head},".encode()
+    if data.startswith(head) and (found := _NAMED.fullmatch(data, len(head))):
         frame = _parse_named({name: int(text) for name, text in found.groupdict().items() if text is not None})
         try:
             encode(frame)
@@ -128,13 +155,17 @@ def parse_sent(data: bytes) -> Frame | None:
     return None
 
 
-def _general(frame: General) -> bytes:
+def _general(frame: General, dialect: Dialect) -> bytes:
     run, spin = _member("motion", frame.motion, Motion).digits
     speed = 0 if frame.speed is None else _member("speed", frame.speed, SpeedStep).digit
     servo, reset = (0, 0) if frame.servo is None else _member("servo", frame.servo, ServoAction).digits
-    light = 0 if frame.light is None else _member("light", frame.light, Light).digit
+    light = 0 if frame.light is None else _light_digit(_member("light", frame.light, Light), dialect)
     places = (run, spin, bool(frame.whistle), speed, servo, bool(frame.sing), light, bool(frame.fan), reset)
     return b"$%d,%d,%d,%d,%d,%d,%d,%d,%d#" % places
+
+
+def _light_digit(light: Light, dialect: Dialect) -> int:
+    return _SWAPPED.get(light, light).digit if dialect.swaps_green_and_blue else light.digit
 
 
 def _ranged(field: str, value: int, top: int) -> int:
@@ -150,17 +181,27 @@ def _member(field: str, value: _Word, kind: type[_Word]) -> _Word:
 
 
 def _parse_general(
-    run: int, spin: int, whistle: int, speed: int, servo: int, sing: int, light: int, fan: int, reset: int
+    dialect: Dialect,
+    run: int,
+    spin: int,
+    whistle: int,
+    speed: int,
+    servo: int,
+    sing: int,
+    light: int,
+    fan: int,
+    reset: int,
 ) -> General | None:
     if servo and reset:
         return None
+    color = _LIGHT_AT.get(light)
     return General(
         motion=_MOTION_AT[(0, spin) if spin else (run, 0)],
         whistle=bool(whistle),
         speed=_SPEED_AT.get(speed),
         servo=_SERVO_AT.get((servo, reset)),
         sing=bool(sing),
-        light=_LIGHT_AT.get(light),
+        light=_SWAPPED.get(color, color) if color and dialect.swaps_green_and_blue else color,
         fan=bool(fan),
     )
 
@@ -180,13 +221,14 @@ _MOTION_AT = {motion.digits: motion for motion in Motion}
 _SPEED_AT = {step.digit: step for step in SpeedStep}
 _SERVO_AT = {action.digits: action for action in ServoAction}
 _LIGHT_AT = {light.digit: light for light in Light}
+_SWAPPED = {Light.GREEN: Light.BLUE, Light.BLUE: Light.GREEN}
 _MODE_AT = {row.digit: mode for mode, row in MODES.items()}
 
 # Nine one-digit fields, always all nine (docs/reference/protocol.md#general-frame).
 _GENERAL = re.compile(rb"\$([0-4]),([0-2]),([01]),([0-2]),([0-8]),([01]),([0-8]),([01]),([01])#")
 # docs/reference/protocol.md#named-frames
 _NAMED = re.compile(
-    rb"\$4WD,(?:PTZ(?P<deg>\d{1,3})"
+    rb"(?:PTZ(?P<deg>\d{1,3})"
     rb"|CLR(?P<r>\d{1,3}),CLG(?P<g>\d{1,3}),CLB(?P<b>\d{1,3})"
     rb"|MODE(?P<mode>[%b])(?P<open>[01])"
     rb"|ServoJ1(?P<j1>\d{1,3}),J2(?P<j2>\d{1,3}),J3(?P<j3>\d{1,3}),J4(?P<j4>\d{1,3}),J5(?P<j5>\d{1,3}),J6(?P<j6>\d{1,3})"

@@ -8,7 +8,7 @@ from typing import Final
 
 from gateway.protocol.enums import Cause
 from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected
-from gateway.protocol.sensors import SENSOR_FIELDS, Reject, match_ended_sensors, read_sensors
+from gateway.protocol.sensors import SENSOR_FIELDS, Reject, read_sensors, sensors_matcher
 
 JOINT_MAX: Final = 180.0  # docs/reference/protocol.md#ranges: "ranges a reading must be in"
 
@@ -24,13 +24,16 @@ _NUMBER: Final = {
 }
 
 
-def parse(raw: bytes, at: float) -> Event:
-    """Return the event of one frame, whose `raw` goes from its `$` to its `#`; never raise."""
-    if found := match_ended_sensors(raw):
+def parse(raw: bytes, at: float, head: str) -> Event:
+    """Return the event of one frame, whose `raw` goes from its `$` to its `#`; never raise.
+
+    `head`: the first word of the frames of this car.
+    """
+    if found := sensors_matcher(head).match_ended(raw):
         return read_sensors(found, at)
-    head, *fields = raw[1:-1].split(b",")
-    if head != b"4WD":
-        return Rejected(raw, at, Cause.UNKNOWN_WORD, f"{_printable(head)} is not 4WD")
+    first, *fields = raw[1:-1].split(b",")
+    if first != head.encode():
+        return Rejected(raw, at, Cause.UNKNOWN_WORD, f"{_printable(first)} is not {head}")
     words: list[bytes] = []
     texts: list[bytes] = []
     for field in fields:

@@ -9,11 +9,31 @@ from functools import cache
 from typing import Final
 
 from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
-from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
+from gateway.protocol.frames import (
+    STANDARD_HEAD,
+    ArmSet,
+    ColorLed,
+    Dialect,
+    Frame,
+    General,
+    ModeClose,
+    ModeOpen,
+    Ptz,
+    Reset,
+    encode,
+    parse_sent,
+)
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
-from gateway.protocol.platform_name import OPTIONS, Platform, parse_name
-from gateway.protocol.sensors import ATTRIBUTES, Sensors
-from gateway.protocol.timing import DIGITLESS_OPEN_S, RANGING_S, RASPBERRY_PI_FAN_S, REPORT_INTERVAL_S, block_s
+from gateway.protocol.platform_name import HEAD, OPTIONS, Platform, parse_name
+from gateway.protocol.sensors import ATTRIBUTES, Reject, Sensors
+from gateway.protocol.timing import (
+    DIGITLESS_OPEN_S,
+    FRAME_S,
+    RANGING_S,
+    RASPBERRY_PI_FAN_S,
+    REPORT_INTERVAL_S,
+    block_s,
+)
 
 
 class StopStyle(StrEnum):
@@ -60,12 +80,21 @@ class SpeedModel:
 
 # platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step down to less than 50 becomes 100
 ARDUINO_SPEED: Final = SpeedModel(start=150, increment=50, low=50, rebound=100, top=255)
+# programs that people have: 200 of 1000, steps of 100. The slowest speed was not measured: one step is assumed
+STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000)
 # platforms: speed. Raspberry Pi +-20 in 20..100 %; the table has no start value: half of full speed is assumed
 RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=20, top=100)
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
 _CONSTANTS: Final = (("battery", _PI_VOLTAGE_V), ("grayscale", float(_PI_GRAYSCALE)))
+# programs that people have: the tracking, light seeking and following of stm32 print nothing
+_STM32_SILENT: Final = frozenset({Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
+# programs that people have: one stm32 program has these constants in its mode-0 report, all of them or none
+_STM32_CONSTANTS: Final = frozenset({"grayscale", "line", "obstacle", "light"})
+# docs/reference/protocol.md#ranges
+_PV_MAX: Final = {2: 12.0, 3: 13.0}
+_GRAY_10_BIT, _GRAY_12_BIT = 1023, 4095
 
 
 @cache
@@ -103,9 +132,45 @@ class Profile:
         return not self.not_observed
 
     @property
+    def dialect(self) -> Dialect:
+        """The spelling of its frames, for `Decoder` and `encode`."""
+        head = next((option.partition("=")[2] for option in self.options if option.startswith(HEAD)), STANDARD_HEAD)
+        return Dialect(head, swaps_green_and_blue=self.kind is Platform.STM32)
+
+    @property
+    def fan_is_level(self) -> bool:
+        """True if place 8 is a level, so that each general frame with 0 turns the fan off. False if 1 toggles it."""
+        return "fan_level" in self.options
+
+    @property
+    def ptz_direct(self) -> bool:
+        """True if the servo goes to the angle of a PTZ frame. False if it goes to 180 degrees minus it."""
+        return "ptz_direct" in self.options
+
+    @property
+    def prints_text(self) -> bool:
+        """True if the program prints lines of text between its frames."""
+        return "text" in self.options
+
+    @property
     def has_readings(self) -> bool:
-        """True if the car sends readings."""
+        """False if the car never sends a reading, so that nothing shows what it does."""
         return "no_readings" not in self.options
+
+    @property
+    def cells(self) -> int:
+        """The number of cells of its battery."""
+        return 3 if "3s" in self.options else 2
+
+    @property
+    def voltage_max(self) -> float:
+        """The maximum of PV, V. A greater value is no measurement."""
+        return _PV_MAX[self.cells]
+
+    @property
+    def grayscale_max(self) -> int:
+        """The maximum of GS. A greater value is no measurement."""
+        return _GRAY_12_BIT if self.kind in {Platform.STM32, Platform.UNKNOWN} else _GRAY_10_BIT
 
     @property
     def close_s(self) -> float:
@@ -135,7 +200,9 @@ class Profile:
     @property
     def silent_modes(self) -> frozenset[Mode]:
         """The modes in which this car sends no readings."""
-        return self.modes & SILENT_MODES
+        if not self.has_readings:
+            return self.modes
+        return self.modes & (SILENT_MODES | _STM32_SILENT if self.kind is Platform.STM32 else SILENT_MODES)
 
     @property
     def possible_modes(self) -> frozenset[Mode]:
@@ -146,6 +213,14 @@ class Profile:
     def fan_silences(self) -> bool:
         """True if a running fan may silence the car (hazards: the fan on; a Raspberry Pi only blocks for 1 s)."""
         return self.kind is not Platform.RASPBERRY_PI
+
+    def encode(self, frame: Frame) -> bytes:
+        """Return the bytes of a frame as this car spells it; raise EncodeError."""
+        return encode(frame, self.dialect)
+
+    def parse_sent(self, data: bytes) -> Frame | None:
+        """Return the frame with these bytes for this car. None if they are not one whole frame."""
+        return parse_sent(data, self.dialect)
 
     def refusal(self, frame: Frame) -> str | None:
         """Return why the car must not get this frame, for a person. None if the car knows the frame."""
@@ -172,12 +247,15 @@ class Profile:
 
     def block_s(self, frame: Frame) -> float:
         """Return the maximum time in seconds for which this frame blocks the car (see `timing.block_s`)."""
+        if self.kind is Platform.STM32:
+            return FRAME_S
         slow_fan = self.kind in {Platform.RASPBERRY_PI, Platform.UNKNOWN}
         return block_s(frame, fan_s=RASPBERRY_PI_FAN_S if slow_fan else 0.0)
 
     def mode_turn_s(self, mode: Mode) -> float:
         """Return the longest block of one turn of this mode's own loop; the car obeys nothing meanwhile."""
-        return MODES[mode].turn_s
+        # An stm32 car obeys in every mode at once. Only a report of 48 ms delays it.
+        return FRAME_S if self.kind is Platform.STM32 else MODES[mode].turn_s
 
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
         """Return the modes that this frame may come from.
@@ -200,11 +278,28 @@ class Profile:
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
         if self.constants and self._may_be_constant(event):
             names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
-        return frozenset(names)
+        if self.kind is Platform.STM32 and candidate_modes(event) == (Mode.MANUAL,) and _stm32_constants(event):
+            names -= _STM32_CONSTANTS
+        return frozenset(names - self._out_of_range(event))
+
+    def rejects(self, event: Sensors) -> tuple[Reject, ...]:
+        """Return the rejected fields of a frame, with those that are out of the range of this car only."""
+        words = {"battery": ("PV", event.voltage_v), "grayscale": ("GS", event.grayscale)}
+        own = (words[name] for name in sorted(self._out_of_range(event)))
+        return (*event.rejects, *(Reject(word, f"{value:g}") for word, value in own))
+
+    def _out_of_range(self, event: Sensors) -> set[str]:
+        """Return the fields that are out of the range of this car."""
+        found = set()
+        if event.voltage_v is not None and event.voltage_v > self.voltage_max:
+            found.add("battery")
+        if event.grayscale is not None and event.grayscale > self.grayscale_max:
+            found.add("grayscale")
+        return found
 
     def measurable(self, mode: Mode) -> frozenset[str]:
         """Return everything that a car of this kind can measure in this mode, without constants of the platform."""
-        if mode not in self.modes or mode in self.silent_modes:
+        if not self.has_readings or mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
             return MODES[mode].measures
@@ -226,6 +321,8 @@ class Profile:
         found: list[str] = []
         if self.modes.isdisjoint(candidates):
             found.append(f"a reading of mode {' or '.join(candidates)}, which {self._these} do not have")
+        elif self.silent_modes.issuperset(candidates):
+            found.append(f"a reading of mode {' or '.join(candidates)}, in which {self._these} send none")
         if candidates != (Mode.MANUAL,):
             return tuple(found)
         if self.kind is Platform.RASPBERRY_PI:
@@ -278,6 +375,8 @@ _PI_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "servo_vertical", "servo_hori
 _ALL_MODES: Final = frozenset(Mode)
 _MODE_0: Final = frozenset({Mode.MANUAL})
 _ALL_LIGHTS: Final = frozenset(Light)
+_STM32_CAR: Final = _MODE_CAR - {"led"}
+_STM32_LIGHTS: Final = frozenset({Light.WHITE, Light.RED, Light.GREEN, Light.BLUE, Light.OFF})
 _LIGHTS_2_TO_4: Final = frozenset({Light.RED, Light.GREEN, Light.BLUE})
 
 
@@ -300,12 +399,12 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 kind,
                 options,
                 _ALL_MODES,
-                _MODE_CAR | parts,
-                _ALL_LIGHTS,
+                _STM32_CAR | parts,
+                _STM32_LIGHTS,
                 _FRONT,
                 StopStyle.TIMER,
-                ARDUINO_SPEED,
-                not_observed=("the program was read, not run", "constants in mode 0: as arduino", "speed: as arduino"),
+                STM32_SPEED,
+                not_observed=("the slowest speed", "readings while the fan runs"),
             )
         case Platform.RASPBERRY_PI:
             return Profile(
@@ -337,6 +436,10 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
 
 def _whole_cm(event: Sensors) -> bool:
     return b"." not in event.raw.partition(b",PV")[0]
+
+
+def _stm32_constants(event: Sensors) -> bool:
+    return b",GS0,LF0000,HW00,GM00" in event.raw
 
 
 def _pi_constants(event: Sensors) -> bool:

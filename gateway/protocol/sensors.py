@@ -7,6 +7,7 @@ an attribute of `Sensors`, and a variable in `read_sensors`.
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final, NamedTuple
 
 from gateway.protocol.enums import Cause
@@ -61,13 +62,14 @@ def _sides(bits: tuple[bool, bool]) -> Fields:
 
 
 # docs/reference/protocol.md#ranges and docs/reference/protocol.md#spellings. A number is unsigned, with decimals only
-# in CSB and PV. Bits are digits. `[0-9]` in a bytes pattern is ASCII only.
+# in CSB and PV. Bits are digits. `[0-9]` in a bytes pattern is ASCII only. The ranges are those of all cars: a battery
+# of three cells, a grayscale of 12 bits. `Profile` has those of one car.
 SENSOR_FIELDS: Final = (
     SensorField("range", "range_cm", b"CSB", rb"[0-9]+(?:\.[0-9]+)?", float, _range, 1200.0),
     SensorField(
-        "battery", "voltage_v", b"PV", rb"[0-9]+(?:\.[0-9]+)?", float, lambda volts: {"voltage_v": volts}, 12.0
+        "battery", "voltage_v", b"PV", rb"[0-9]+(?:\.[0-9]+)?", float, lambda volts: {"voltage_v": volts}, 13.0
     ),
-    SensorField("grayscale", "grayscale", b"GS", rb"[0-9]+", int, lambda raw: {"raw": raw}, 1023),
+    SensorField("grayscale", "grayscale", b"GS", rb"[0-9]+", int, lambda raw: {"raw": raw}, 4095),
     SensorField("line", "line", b"LF", rb"[0-9]{4}", _BITS_4.get, _line),
     SensorField("obstacle", "obstacle", b"HW", rb"[0-9]{2}", _BITS_2.get, _sides),
     SensorField("light", "light", b"GM", rb"[0-9]{2}", _BITS_2.get, _sides),
@@ -130,22 +132,47 @@ def read_sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, 
     return reading._replace(rejects=rejects, **without)
 
 
-def sensors_pattern(filler: Mapping[str, bytes] | None = None) -> bytes:
+def sensors_pattern(filler: Mapping[str, bytes] | None = None, *, head: bytes = b"[0-9A-Za-z]+") -> bytes:
     """Return the pattern of a sensors frame without its `#`, one group per field.
 
-    `filler`: the exact text of some fields, by measurement.
+    `filler`: the exact text of some fields, by measurement. `head`: the pattern of its first word.
     """
     texts = {name: re.escape(text) for name, text in (filler or {}).items()}
-    return rb"\$4WD" + b"".join(
-        b",%b(%b)" % (field.word, texts.get(field.measurement, field.pattern)) for field in SENSOR_FIELDS
+    return (
+        rb"\$"
+        + head
+        + b"".join(b",%b(%b)" % (field.word, texts.get(field.measurement, field.pattern)) for field in SENSOR_FIELDS)
     )
 
 
-_TEXT: Final = sensors_pattern()
-match_ended_sensors = re.compile(_TEXT + rb"#").match
-fullmatch_sensors = re.compile(_TEXT).fullmatch
+class SensorsMatcher:
+    """Matches the sensors frames of cars with one head."""
+
+    def __init__(self, head: str) -> None:
+        text = sensors_pattern(head=re.escape(head.encode()))
+        self.match_ended = re.compile(text + rb"#").match
+        """Matches a frame with its `#` at a position."""
+        self.fullmatch_unended = re.compile(text).fullmatch
+        """Matches a frame without its `#`."""
+
+    def is_complete(self, raw: bytes | bytearray) -> bool:
+        """Return True if these bytes are a whole sensors frame that only lacks its `#`."""
+        return SENSOR_FIELDS[-1].word in raw and self.fullmatch_unended(raw) is not None
 
 
-def is_complete(raw: bytes | bytearray) -> bool:
-    """Return True if these bytes are a whole sensors frame that only lacks its `#`."""
-    return SENSOR_FIELDS[-1].word in raw and fullmatch_sensors(raw) is not None
+@cache
+def sensors_matcher(head: str) -> SensorsMatcher:
+    """Return the matcher for a head."""
+    return SensorsMatcher(head)
+
+
+_ANY_HEAD: Final = re.compile(rb"\$([A-Za-z0-9]{2,8})" + sensors_pattern(head=b"")[2:] + rb"#?")
+
+
+def head_of(raw: bytes) -> str | None:
+    """Return the first word of a sensors frame, whatever it is. None if these bytes are no sensors frame."""
+    found = _ANY_HEAD.fullmatch(raw)
+    return found[1].decode() if found else None
+
+
+fullmatch_sensors = sensors_matcher("4WD").fullmatch_unended

@@ -15,7 +15,7 @@ from schemas.links import TcpUrl
 from schemas.process import startup, stdio
 
 LINK_HELP: Final = "/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04"
-PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; +arm, +imu (default unknown)"
+PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; with options as in arduino+arm (default unknown)"
 _UNPRINTABLE: Final = re.compile(r"[^ -\[\]-~]")
 _COLORS: Final = {"red": "31", "yellow": "33", "cyan": "36", "dim": "2"}
 

@@ -145,7 +145,7 @@ class MonitorOutput:
     def __init__(self, profile: Profile, *, as_json: bool) -> None:
         self._profile = profile
         self._as_json = as_json
-        self._decoder = Decoder()
+        self._decoder = Decoder(head=profile.dialect.head)
         self._paint = cli_support.Paint(sys.stdout)
         self.statistics = LinkStatistics()
 

@@ -76,7 +76,7 @@ def _run(arguments: argparse.Namespace) -> None:
     cli_support.warn_before_opening(url)
     cli_support.run_until_interrupted(_send(url, data, wait_s))
     sent = f"sent {cli_support.printable(data)} to {url}"
-    cli_support.print_lines([sent, *aftermath(parse_sent(data), profile, arguments.link)])
+    cli_support.print_lines([sent, *aftermath(profile.parse_sent(data), profile, arguments.link)])
 
 
 async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
@@ -103,7 +103,7 @@ def raw_bytes(text: str) -> bytes:
 
 def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
     """Return the bytes of a frame that is in the table and that this car knows; raise WrongUse with the reason."""
-    frame = parse_sent(raw_bytes(text))
+    frame = profile.parse_sent(raw_bytes(text))
     if frame is None:
         raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
     refusal = profile.refusal(frame)
@@ -116,7 +116,7 @@ def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
             f"frame {text!r}: the car would drive, and a Raspberry Pi car's program dies when this connection closes, "
             "after which nothing can stop the car: use `gateway run` (or --platform arduino behind a bridge, or --raw)"
         )
-    return encode(frame)
+    return profile.encode(frame)
 
 
 def why_not(text: str) -> str:

@@ -33,7 +33,7 @@ class LinkStatistics:
             case Sensors():
                 self.kinds["sensors"] += 1
                 self.modes[" or ".join(candidate_modes(event))] += 1
-                self.rejects.update(reject.cause for reject in event.rejects)
+                self.rejects.update(reject.cause for reject in profile.rejects(event))
                 self.contradictions.update(profile.contradictions(event))
             case ArmReading():
                 self.kinds["arm"] += 1
@@ -126,7 +126,7 @@ def _measured(event: Sensors, profile: Profile) -> dict[str, Any]:
     fields["modes"] = list(candidate_modes(event))
     if contradictions := profile.contradictions(event):
         fields["contradicts"] = list(contradictions)
-    return fields | _rejected(event.rejects)
+    return fields | _rejected(profile.rejects(event))
 
 
 def _rejected(rejects: Sequence[Reject]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform
 from gateway.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
+from gateway.protocol.frames import STANDARD_HEAD
 from gateway.protocol.measurements import measured, verdict_of
 from gateway.protocol.platforms import Profile, parse_platform
 
@@ -68,6 +69,7 @@ class Redecoding:
     platform: str | None = None
     counts: Counts = field(default_factory=Counts)
     _decoder: Decoder = field(default_factory=Decoder)
+    _head: str = STANDARD_HEAD
     _waiting: deque[Rx] = field(default_factory=deque)
     _sent: deque[Tx] = field(default_factory=deque)
     _modes: deque[KnownMode] = field(default_factory=deque)
@@ -111,14 +113,15 @@ class Redecoding:
         """Return the possible results of a frame: one, if the recording leaves nothing open."""
         assert self._began_ns is not None
         at = (frame.at_ns - self._began_ns) / 1e9
+        profiles = self._profiles(frame.at_ns)
+        if (head := profiles[0].dialect.head) != self._head:
+            self._decoder, self._head = Decoder(head=head), head
         while self._sent and self._sent[0].at_ns <= frame.at_ns + _MAX_ECHO_LEAD_NS:
             sent = self._sent.popleft()
             self._decoder.sent(sent.data, (sent.at_ns - self._began_ns) / 1e9)
         modes = [each.mode for each in _around(self._modes, frame.at_ns, MAX_MODE_DELAY_NS)] or [None]
         found: list[Outcome] = []
-        for events, profile, mode in product(
-            _decode(self._decoder, frame.data, at), self._profiles(frame.at_ns), dict.fromkeys(modes)
-        ):
+        for events, profile, mode in product(_decode(self._decoder, frame.data, at), profiles, dict.fromkeys(modes)):
             outcome = _outcome(events, profile, mode)
             if outcome not in found:
                 found.append(outcome)

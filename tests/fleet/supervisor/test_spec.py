@@ -116,6 +116,12 @@ def test_simulated_are_first_the_files_cars_then_ours(tmp_path: Path) -> None:
     assert one.cars["bob"].link == "tcp://192.168.1.7:8888"
 
 
+def test_a_simulated_car_keeps_the_options_of_its_platform(tmp_path: Path) -> None:
+    text = "cars: {ann: {link: COM3, platform: auto+text+head=BaLa}, bob: {link: COM4, platform: stm32+3s}}"
+    spec = build_spec(parse_fleet(text, tmp_path / "fleet.yaml"), UpOptions(simulated=2))
+    assert [car.platform for car in spec.simulated] == ["arduino+text+head=BaLa", "stm32+3s"]
+
+
 @pytest.mark.parametrize("count", [1, 8, 9, 50, 200])
 def test_any_number_of_cars_without_a_file(count: int) -> None:
     spec = build_spec(None, UpOptions(simulated=count))

@@ -4,6 +4,7 @@ import pytest
 
 from gateway.protocol.decoder import ArmReading, Cause, Decoder, Echo, Event, ImuReading, Rejected, Sensors, TextLine
 from gateway.protocol.measurements import verdict_of
+from gateway.protocol.sensors import head_of
 from tests.support.vectors import ids, rows, wire
 
 SENSORS, OTHERS, BAD = rows("sensors"), rows("other_readings"), rows("bad_input")
@@ -328,3 +329,17 @@ def test_a_recorded_line_of_text_decodes_again() -> None:
     decoder = Decoder()
     for raw in (b"\xff", b"EXEC:F\r\n", b"hello", b"EXEC:F\r\n"):
         assert kinds(decoder.feed(raw, 1.0) + decoder.end()) == [("text" if b"EXEC" in raw else "no_start", raw)]
+
+
+@pytest.mark.parametrize(
+    ("raw", "head"),
+    [
+        (GOOD, "4WD"),
+        (FOLLOWING.replace(b"4WD", b"BaLa"), "BaLa"),
+        (GOOD.replace(b"4WD", b"A"), None),
+        (GOOD[:-3], None),
+        (b"$4WD,MODE00#", None),
+    ],
+)
+def test_the_head_of_a_sensors_frame_is_known_from_its_bytes(raw: bytes, head: str | None) -> None:
+    assert head_of(raw) == head

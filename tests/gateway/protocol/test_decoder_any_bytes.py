@@ -104,8 +104,8 @@ BITS = st.sampled_from("01")
 
 @given(
     spelled(1200),
-    spelled(12),
-    st.integers(0, 1023),
+    spelled(13),
+    st.integers(0, 4095),
     st.sampled_from([1, 3, 4]),
     st.lists(BITS, min_size=8, max_size=8).map("".join),
     st.booleans(),

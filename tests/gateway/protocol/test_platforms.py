@@ -4,10 +4,11 @@ import re
 
 import pytest
 
-from gateway.protocol.decoder import Decoder, Sensors
-from gateway.protocol.enums import Mode, SpeedStep
-from gateway.protocol.frames import ArmSet, parse_sent
-from gateway.protocol.modes import MODES, candidate_modes, only_candidate
+from gateway.protocol.decoder import Decoder, Rejected, Sensors
+from gateway.protocol.enums import Light, Mode, Motion, SpeedStep
+from gateway.protocol.frames import ArmSet, Dialect, Frame, General, ModeClose, Ptz, Reset, parse_sent
+from gateway.protocol.measurements import verdict_of
+from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
 from gateway.protocol.platform_name import OPTION_WORDS, Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
@@ -79,7 +80,7 @@ def test_what_is_measured(row: dict[str, str], platform: Platform) -> None:
     assert only_candidate(event) == (candidate_modes(event)[0] if len(candidate_modes(event)) == 1 else None)
     assert profile.measured(event) == set((ALL if row[platform] == "all" else row[platform]).split())
     obstacle = None if row["obstacle"] == "-" else tuple(bit == "1" for bit in row["obstacle"])
-    assert profile.obstacle(event) == obstacle
+    assert profile.obstacle(event) == (obstacle if "obstacle" in profile.measured(event) else None)
 
 
 def test_a_confirmed_mode_chooses_among_candidates_and_decides_nothing_else() -> None:
@@ -120,7 +121,7 @@ def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
     ("platform", "modes", "stop", "observed", "capabilities"),
     [
         ("arduino", 7, StopStyle.MODE_FRAME, True, "drive whistle speed servo fan light servo_deg led mode"),
-        ("stm32", 7, StopStyle.MODE_FRAME, False, "drive whistle speed servo fan light servo_deg led mode"),
+        ("stm32", 7, StopStyle.MODE_FRAME, False, "drive whistle speed servo fan light servo_deg mode"),
         (
             "raspberry_pi",
             1,
@@ -162,3 +163,102 @@ def test_a_platform_that_is_none_is_refused_with_the_words_allowed(text: str, wo
 
 def test_a_platform_in_any_case_is_known() -> None:
     assert parse_platform("Arduino").name == "arduino"
+
+
+def test_options_say_in_what_a_car_differs() -> None:
+    plain, other = parse_platform("arduino"), parse_platform("arduino+fan_level+ptz_direct+text+no_readings+3s")
+    assert (plain.fan_is_level, plain.ptz_direct, plain.prints_text) == (False, False, False)
+    assert (other.fan_is_level, other.ptz_direct, other.prints_text) == (True, True, True)
+    assert (plain.has_readings, other.has_readings) == (True, False)
+    assert (plain.cells, other.cells) == (2, 3)
+    assert other.capabilities == plain.capabilities, "none is a part of the car"
+    assert parse_platform(other.name) == other
+
+
+def test_a_car_without_readings_measures_nothing_and_is_silent_in_every_mode() -> None:
+    profile = parse_platform("arduino+no_readings+arm")
+    assert all(profile.measurable(mode) == set() for mode in Mode)
+    assert profile.silent_modes == profile.modes
+
+
+@pytest.mark.parametrize(
+    ("platform", "text", "rejected"),
+    [
+        ("arduino", "PV12.00,GS1023", ""),
+        ("arduino", "PV12.01,GS1024", "battery grayscale"),
+        ("arduino+3s", "PV12.60,GS0", ""),
+        ("stm32", "PV8.00,GS4095", ""),
+        ("raspberry_pi", "PV8.00,GS1024", "grayscale"),
+        ("unknown", "PV12.60,GS4095", "battery"),
+    ],
+)
+def test_the_range_of_a_field_is_that_of_the_car(platform: str, text: str, rejected: str) -> None:
+    event = sensors(f"$4WD,CSB57.24,{text},LF1011,HW01,GM10#".encode(), "#")
+    profile, words = parse_platform(platform), rejected.split()
+    assert profile.measured(event) == EVERY_MEASUREMENT - set(words)
+    assert [reject.word for reject in profile.rejects(event)] == [{"battery": "PV"}.get(word, "GS") for word in words]
+
+
+def test_a_field_that_no_car_has_is_rejected_once() -> None:
+    event = sensors(b"$4WD,CSB1300,PV14,GS5000,LF1011,HW01,GM10#", "#")
+    assert parse_platform("arduino").rejects(event) == event.rejects
+
+
+def test_constants_of_an_stm32_car_are_no_measurements_if_all_are_there() -> None:
+    profile = parse_platform("stm32")
+    assert profile.measured(sensors(b"$4WD,CSB57.24,PV7.91,GS0,LF0000,HW00,GM00#", "#")) == {"range", "battery"}
+    assert profile.measured(sensors(b"$4WD,CSB57.24,PV7.91,GS0,LF0000,HW00,GM01#", "#")) == EVERY_MEASUREMENT
+
+
+def test_no_frame_blocks_an_stm32_car_and_its_modes_are_silent() -> None:
+    profile = parse_platform("stm32")
+    frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
+    assert {profile.block_s(frame) for frame in frames if frame} == {FRAME_S}
+    assert {profile.mode_turn_s(mode) for mode in Mode} == {FRAME_S}
+    assert profile.silent_modes == set(Mode) - {Mode.MANUAL}
+
+
+SPELLED: list[tuple[str, Frame, bytes]] = [
+    ("arduino", General(Motion.STOP, light=Light.GREEN), b"$0,0,0,0,0,0,3,0,0#"),
+    ("stm32", General(Motion.STOP, light=Light.GREEN), b"$0,0,0,0,0,0,4,0,0#"),
+    ("stm32", General(Motion.FORWARD, light=Light.BLUE), b"$1,0,0,0,0,0,3,0,0#"),
+    ("stm32", General(Motion.FORWARD, light=Light.RED), b"$1,0,0,0,0,0,2,0,0#"),
+    ("stm32", General(Motion.FORWARD, fan=True), b"$1,0,0,0,0,0,0,1,0#"),
+    ("stm32+head=BaLa", ModeClose(), b"$BaLa,MODE00#"),
+    ("arduino+head=3WD", Ptz(30), b"$3WD,PTZ30#"),
+    ("arduino+head=3WD+arm", ArmSet((1, 2, 3, 4, 5, 6)), b"$3WD,ServoJ11,J22,J33,J44,J55,J66#"),
+    ("arduino+head=3WD", Reset(), b"#"),
+]
+
+
+@pytest.mark.parametrize(("platform", "frame", "data"), SPELLED)
+def test_a_frame_is_spelled_as_the_car_reads_it(platform: str, frame: Frame, data: bytes) -> None:
+    profile = parse_platform(platform)
+    assert profile.encode(frame) == data
+    assert profile.parse_sent(data) == frame
+
+
+def test_a_frame_of_another_head_is_none() -> None:
+    assert parse_platform("arduino+head=BALA").parse_sent(b"$4WD,MODE00#") is None
+    assert parse_platform("arduino").parse_sent(b"$BALA,MODE00#") is None
+    assert parse_platform("arduino").dialect == Dialect()
+
+
+def test_readings_of_another_head_are_known_in_every_mode() -> None:
+    profile = parse_platform("arduino+head=BALA")
+    decoder = Decoder(head=profile.dialect.head)
+    texts = (b"CSB57.24,PV7.91,GS214,LF1011,HW01,GM10", b"CSB0,PV8,GS0,LF0110,HW00,GM00")
+    events = decoder.feed(b"".join(b"$BALA,%b#" % text for text in texts), 1.0)
+    events += decoder.feed(b"$BALA,CSB120,PV8.3,GS000,LF0000,HW10,GM00", 2.0) + decoder.tick(3.0)
+    readings = [event for event in events if isinstance(event, Sensors)]
+    modes = [(Mode.MANUAL,), (Mode.TRACKING,), (Mode.FOLLOWING,)]
+    assert [candidate_modes(event) for event in readings] == modes
+    assert decoder.feed(b"$BALA,J11,J22,J33,J44,J55,J66#", 4.0)[0].raw.startswith(b"$BALA,J1")
+
+
+def test_readings_of_another_head_than_the_given_one_are_rejected() -> None:
+    good = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
+    (event,) = Decoder(head="BALA").feed(good, 1.0)
+    assert isinstance(event, Rejected)
+    assert event.detail == "'4WD' is not BALA"
+    assert verdict_of(Decoder(head="BALA").feed(b"BALA on\r\n" + b"$", 1.0)[0]) == "no_start"

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from gateway.protocol.enums import Mode
+from gateway.protocol.platform_name import OPTIONS, VARIANTS, Platform, parse_name
 from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec, TcpListen, parse_car, parse_cars, parse_replay
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
@@ -51,6 +52,14 @@ def test_options_are_traits(platform: str, traits: CarTraits | None) -> None:
     spec = parse_car(f"red:{platform}:pty")
     assert spec.traits == traits
     assert sorted(spec.platform_words.split("+")) == sorted(platform.split("+"))
+
+
+@pytest.mark.parametrize("platform", sorted(set(Platform) - {Platform.UNKNOWN}))
+@pytest.mark.parametrize("option", [*sorted(OPTIONS), *VARIANTS, "head=BaLa"])
+def test_each_option_of_a_platform_is_one_of_the_simulator(platform: str, option: str) -> None:
+    # `fleet up --sim` gives a platform of the fleet file to the gateway and to the simulator.
+    assert (parse_car(f"red:{platform}+{option}:pty").traits is not None) == (option not in OPTIONS)
+    assert parse_name(f"{platform}+{option}")
 
 
 BAD_CARS = [

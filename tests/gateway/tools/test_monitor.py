@@ -18,7 +18,7 @@ from tests.gateway.conftest import PATIENCE_S, Command, Started
 from tests.support.processes import GatewayProcess, TcpCar, wait_for
 
 MANUAL = b"$4WD,CSB57.24,PV7.91,GS214,LF0110,HW01,GM10#"
-NO_ECHO = b"$4WD,CSB0.00,PV7.9,GS2140,LF0110,HW01,GM10#"
+NO_ECHO = b"$4WD,CSB0.00,PV7.9,GS5140,LF0110,HW01,GM10#"
 PIECES = [
     CapturedBytes(0.2, b"BT04 ready\x1b[2J\r\n"),
     CapturedBytes(1.0, MANUAL[:10]),
@@ -48,7 +48,7 @@ def test_a_file_is_shown_decoded_beside_its_bytes(command: Command, kept: Path) 
     shown = [
         (0.2, "BT04 ready\\x1b[2J", "rejected, no_start:  14 bytes outside a frame"),
         (1.01, MANUAL.decode(), "0.57 m  7.91 V  grayscale 214  line 0110  obstacle 01  light 10  (manual)"),
-        (2.0, NO_ECHO.decode(), "no echo  7.90 V  line 0110  obstacle 01  light 10  (manual)  rejected: GS2140"),
+        (2.0, NO_ECHO.decode(), "no echo  7.90 V  line 0110  obstacle 01  light 10  (manual)  rejected: GS5140"),
         (3.0, PIECES[4].data.decode(), "line 1001  (tracking)"),
         (3.1, PIECES[5].data.decode(), "obstacle 10  (following)"),
         (3.2, PIECES[6].data.decode(), "arm  joint_deg 90 80 70 60 0 180"),
@@ -81,7 +81,7 @@ def test_json_has_every_event_and_the_whole(command: Command, kept: Path) -> Non
         "raw": MANUAL.decode(),
     }
     assert lines[2]["no_echo"]
-    assert lines[2]["rejected"] == {"GS": "2140"}
+    assert lines[2]["rejected"] == {"GS": "5140"}
     assert lines[-1]["rejects"] == {"no_start": 1, "out_of_range": 1, "truncated": 1}
     assert lines[-1]["frames"] == {"sensors": 4, "arm": 1, "imu": 1}
     assert done.stderr == ""

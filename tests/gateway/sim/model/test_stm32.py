@@ -196,3 +196,13 @@ async def test_its_options_print_after_the_report() -> None:
 
 def test_the_traits_of_the_program() -> None:
     assert (STM32_TRAITS.interval_s, STM32_TRAITS.gray_max, STM32_TRAITS.timer) == (1.0, 4095, True)
+
+
+async def test_the_timer_goes_on_in_every_mode() -> None:
+    car = stm32()
+    last = (await report_times(car, 1.5))[-1]
+    await car.write(opening(2))
+    await car.wait(last + 3.5 - car.now)
+    await car.write(MODE00)
+    await car.write(STOP)
+    assert await report_times(car, 1.0) == [pytest.approx(last + 4.0, abs=0.01)]
