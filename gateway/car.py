@@ -36,6 +36,7 @@ from gateway.protocol.events import Echo, Event, Rejected
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
+from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
 
@@ -85,6 +86,8 @@ class Settings:
     longest_drive_s: float = requests.DEFAULT_MAX_DRIVE_S
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
+    holds_of: str = ""
+    """The car that holds and loans belong to; empty for the car at this link."""
 
 
 class CarGateway:
@@ -96,7 +99,8 @@ class CarGateway:
         self._service = service
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
-        state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car)
+        holds_of = settings.holds_of or car_link(settings.url)
+        state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car, holds_of)
         self._control = Controller(
             settings.car,
             settings.profile,
@@ -108,6 +112,7 @@ class CarGateway:
             now=now,
             now_ns=now_ns,
         )
+        self._state_damage, self._not_taken = state_file.damage, state_file.not_taken
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
@@ -143,6 +148,10 @@ class CarGateway:
         now = self._loop.time()
         self._publish_health(now, 0.0)
         self._publisher.publish_states(self._control, self._health, now)
+        if self._state_damage:
+            self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
+        if self._not_taken:
+            self._commands.log(Level.WARNING, "other_link", self._not_taken)
         self._service.attach(
             self._loop,
             values=self._values_due,

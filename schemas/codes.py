@@ -69,6 +69,8 @@ EVENTS: Final[dict[str, EventCode]] = {
     "trust": EventCode("debug", "The gateway's knowledge about the motion has changed."),
     "flood": EventCode("warning", "More bytes arrive than any car sends."),
     "not_saved": EventCode("error", "The gateway could not save holds and e-stops to the disk."),
+    "other_link": EventCode("warning", "A hold, loan or e-stop of another link is not taken over."),
+    "state_unreadable": EventCode("warning", "The file of holds and e-stops is damaged, so the car is on hold."),
     "no_hub": EventCode("error", "The gateway cannot reach the bus."),
     "parent_gone": EventCode("warning", "The process that started this gateway has ended, so the gateway ends too."),
     "internal_error": EventCode("error", "The coordinator failed in one decision, and continues."),
