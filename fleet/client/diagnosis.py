@@ -20,6 +20,8 @@ _MIN_REJECTED: Final = 10
 MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, "flood_bytes", "raw_not_published"})
+"""Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
 _NO_TROUBLE: Final = ("superseded", "duplicate")
@@ -63,7 +65,7 @@ class CarEvidence:
     def rejected(self) -> dict[str, int]:
         """The rejected frames by cause."""
         link = self.of("state/link")
-        return {} if link is None else {cause: count for cause, count in link.rejects.items() if cause != _NOT_OBEYED}
+        return {} if link is None else {each: count for each, count in link.rejects.items() if each not in _NO_FRAMES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +156,11 @@ def _silent_car(e: CarEvidence) -> str:
 
 def _damaged(e: CarEvidence) -> str:
     link, count = e.of("state/link"), sum(e.rejected.values())
-    if count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * (link.rx_frames + count):
+    # The rejected frames are among those that came.
+    if count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
-    return f"{count} of {link.rx_frames + count} frames were no reading, most of them {worst}: a bad wire or radio."
+    return f"{count} of {link.rx_frames} frames were no reading, most of them {worst}: a bad wire or radio."
 
 
 def _estopped(e: CarEvidence) -> str:

@@ -95,6 +95,16 @@ def test_the_likely_cause_comes_first_and_a_known_refusal_is_not_said_twice() ->
     assert [each.code for each in other] == ["link_down", "held", "refused"]
 
 
+def test_each_rejected_frame_counts_once() -> None:
+    """The frames that came include the rejected ones. Other counts of a link are no frames."""
+    (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
+    assert found.cause == "10 of 40 frames were no reading, most of them truncated: a bad wire or radio."
+    few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1}
+    assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
+    within = pb.Link(state="online", rx_frames=20 * 12 + 1, rejects={"truncated": 12})
+    assert diagnose(with_states(link=within)) == []
+
+
 def test_a_command_that_somebody_replaced_is_no_refusal() -> None:
     assert diagnose(evidence(commands=[refused("superseded", phase="failed")])) == []
 
