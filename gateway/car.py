@@ -25,7 +25,7 @@ from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
-from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.estimate.link_health import LinkHealth, LinkState
 from gateway.control.events import Level
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
@@ -61,6 +61,9 @@ CANCEL_RETRY_S: Final = 0.5
 """Interval after which a task that still runs is cancelled again."""
 MAX_BYTES_AGE_S: Final = 0.25
 """Discard bytes older than this; newer data matters more."""
+MIN_DAMAGED: Final = 3
+LOOK_INTERVAL_S: Final = 10.0
+"""Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
 FLOOD_LOG_PAUSE_S: Final = 10.0
 """Minimum pause after a flood before the next one is logged."""
 
@@ -119,6 +122,11 @@ class CarGateway:
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
+        self._trouble = ""
+        """The trouble of an open link that was logged last."""
+        self._damaged = 0
+        """Frames that were rejected since the last search for the trouble of the link."""
+        self._look_at = now
         self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(settings.url))
         self._wake = asyncio.Event()
         self._commands = CommandHandler(
@@ -255,6 +263,20 @@ class CarGateway:
             await link.close()
             await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
 
+    def _check_link(self) -> None:
+        """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
+        if self._link is None:
+            return
+        now, is_stale = self._loop.time(), self._health.state is LinkState.STALE
+        if now >= self._look_at and (is_stale or self._damaged >= MIN_DAMAGED):
+            self._damaged, self._look_at = 0, now + LOOK_INTERVAL_S
+            self._link.look_for_trouble()
+        trouble = self._link.trouble
+        if trouble and trouble != self._trouble:
+            self._trouble = trouble
+            self._health.on_rejected("port_shared")
+            self._commands.log(Level.WARNING, "port_shared", trouble)
+
     def _log_open(self) -> None:
         self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open. The gateway stops the car first.")
 
@@ -301,6 +323,7 @@ class CarGateway:
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)
+                self._damaged += 1
                 continue
             if not isinstance(event, Echo):
                 self._health.on_reading(event.at)
@@ -429,6 +452,7 @@ class CarGateway:
             else:
                 self._publisher.on_bus_lost(now)
                 self._hub_lost.set()
+            self._check_link()
             before = self._shown_state
             self._control.tick(now)
             self._wake_if_due(now)

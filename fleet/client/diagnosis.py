@@ -20,7 +20,8 @@ _MIN_REJECTED: Final = 10
 MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
-_NO_FRAMES: Final = frozenset({_NOT_OBEYED, "flood_bytes", "raw_not_published"})
+_PORT_SHARED: Final = "port_shared"
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, "flood_bytes", "raw_not_published"})
 """Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
@@ -154,6 +155,13 @@ def _silent_car(e: CarEvidence) -> str:
     return f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
 
 
+def _shared(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or not link.rejects.get(_PORT_SHARED, 0):
+        return ""
+    return "Another program has its port open, too, or had it: bytes may be missing. The log names it."
+
+
 def _damaged(e: CarEvidence) -> str:
     link, count = e.of("state/link"), sum(e.rejected.values())
     # The rejected frames are among those that came.
@@ -274,6 +282,7 @@ CHECKS: Final = (
     DoctorCheck("not_shown", _unproven, "fleet stop {car}"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
     DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
+    DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
     DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
     DoctorCheck("paused", _paused, "fleet unpause"),

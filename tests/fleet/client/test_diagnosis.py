@@ -45,6 +45,7 @@ ODD: dict[str, CarEvidence] = {
     "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
     "fan_silence": with_states(link=STALE, motion=pb.Motion(fan=True)),
     "silent": with_states(link=STALE),
+    "port_shared": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"port_shared": 1})),
     "damaged_frames": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"truncated": 8, "noise": 3})),
     "estopped": with_states(safety=pb.Safety(motors="off", trust="stopped", estops=[pb.Estop(by="ann", why="smoke")])),
     "paused": with_states(safety=pb.Safety(motors="off", trust="stopped", pauses=[pb.Pause(by="ann", why="listen")])),
@@ -101,6 +102,8 @@ def test_each_rejected_frame_counts_once() -> None:
     assert found.cause == "10 of 40 frames were no reading, most of them truncated: a bad wire or radio."
     few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1}
     assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
+    over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})
+    assert [each.code for each in diagnose(with_states(link=over))] == ["damaged_frames"]
     within = pb.Link(state="online", rx_frames=20 * 12 + 1, rejects={"truncated": 12})
     assert diagnose(with_states(link=within)) == []
 
