@@ -30,7 +30,7 @@ from gateway.control.events import Level
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
-from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected
 from gateway.protocol.platforms import Profile
@@ -119,6 +119,7 @@ class CarGateway:
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
+        self._baud = BaudWatch(settings.url)
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
@@ -249,6 +250,7 @@ class CarGateway:
             now = self._loop.time()
             self._link = link
             self._decoder = Decoder()
+            self._baud = BaudWatch(self._settings.url)
             self._health.on_open(now)
             self._control.link_up(now)
             if self._attempts.on_open(now):
@@ -297,6 +299,9 @@ class CarGateway:
                     self._on_flood("flood_bytes", len(data) - start, now)
                     break
                 self._on_events(self._decoder.feed(data[start : start + SLICE_BYTES], now))
+            if (doubt := self._baud.on_bytes(data)) is not None:
+                self._health.on_rejected(doubt.cause, 1)
+                self._commands.log(Level.WARNING, "no_frames", doubt.words)
             if self._shown_state != before:
                 self._wake.set()
             self._wake_if_due(now)
@@ -325,6 +330,7 @@ class CarGateway:
                 self._health.on_rejected(event.cause)
                 self._damaged += 1
                 continue
+            self._baud.on_frame()
             if not isinstance(event, Echo):
                 self._health.on_reading(event.at)
             if self._attempts.check_proven(event.at, has_reading=True):

@@ -68,6 +68,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     "duplicate": EventCode("warning", "A command came twice with the same id."),
     "trust": EventCode("debug", "The gateway's knowledge about the motion has changed."),
     "flood": EventCode("warning", "More bytes arrive than any car sends."),
+    "no_frames": EventCode("warning", "Bytes arrive, and never a frame: the baud rate may be wrong."),
     "port_shared": EventCode("warning", "Another program reads the car's port, and bytes are missing."),
     "not_saved": EventCode("error", "The gateway could not save holds and e-stops to the disk."),
     "other_link": EventCode("warning", "A hold, loan or e-stop of another link is not taken over."),

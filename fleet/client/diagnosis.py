@@ -21,7 +21,8 @@ MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
 _PORT_SHARED: Final = "port_shared"
-_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, "flood_bytes", "raw_not_published"})
+_BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published"})
 """Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
@@ -143,12 +144,21 @@ def _fan_runs(e: CarEvidence) -> bool:
     return motion is not None and motion.fan
 
 
+def _baud(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.rx_frames > sum(e.rejected.values()):  # a reading came
+        return ""
+    if link.rejects.get("wrong_baud", 0):
+        return "Bytes arrive, and never a frame. They look like a wrong baud rate: the log has both rates."
+    return "Bytes arrive, and never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
+
+
 def _silent_fan(e: CarEvidence) -> str:
     return "It is silent, and its fan runs: some cars send nothing then." if _silent(e) and _fan_runs(e) else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
-    if not _silent(e) or _fan_runs(e):
+    if not _silent(e) or _fan_runs(e) or _baud(e):
         return ""
     link = e.of("state/link")
     since = f"for {link.last_rx_s:.0f} s" if link.HasField("last_rx_s") else "since its link opened"
@@ -165,7 +175,7 @@ def _shared(e: CarEvidence) -> str:
 def _damaged(e: CarEvidence) -> str:
     link, count = e.of("state/link"), sum(e.rejected.values())
     # The rejected frames are among those that came.
-    if count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
+    if _baud(e) or count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
     return f"{count} of {link.rx_frames} frames were no reading, most of them {worst}: a bad wire or radio."
@@ -280,6 +290,7 @@ CHECKS: Final = (
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
     DoctorCheck("not_shown", _unproven, "fleet stop {car}"),
+    DoctorCheck("no_frames", _baud, "fleet logs {car}"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
     DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
     DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
