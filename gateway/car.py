@@ -25,17 +25,18 @@ from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
-from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.estimate.link_health import LinkHealth, LinkState
 from gateway.control.events import Level
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
-from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
+from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
 
@@ -60,6 +61,9 @@ CANCEL_RETRY_S: Final = 0.5
 """Interval after which a task that still runs is cancelled again."""
 MAX_BYTES_AGE_S: Final = 0.25
 """Discard bytes older than this; newer data matters more."""
+MIN_DAMAGED: Final = 3
+LOOK_INTERVAL_S: Final = 10.0
+"""Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
 FLOOD_LOG_PAUSE_S: Final = 10.0
 """Minimum pause after a flood before the next one is logged."""
 
@@ -85,6 +89,8 @@ class Settings:
     longest_drive_s: float = requests.DEFAULT_MAX_DRIVE_S
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
+    holds_of: str = ""
+    """The car that holds and loans belong to; empty for the car at this link."""
 
 
 class CarGateway:
@@ -96,7 +102,8 @@ class CarGateway:
         self._service = service
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
-        state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car)
+        holds_of = settings.holds_of or car_link(settings.url)
+        state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car, holds_of)
         self._control = Controller(
             settings.car,
             settings.profile,
@@ -108,12 +115,19 @@ class CarGateway:
             now=now,
             now_ns=now_ns,
         )
+        self._state_damage, self._not_taken = state_file.damage, state_file.not_taken
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = self._new_decoder()
+        self._baud = BaudWatch(settings.url)
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
+        self._trouble = ""
+        """The trouble of an open link that was logged last."""
+        self._damaged = 0
+        """Frames that were rejected since the last search for the trouble of the link."""
+        self._look_at = now
         self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(settings.url))
         self._wake = asyncio.Event()
         self._commands = CommandHandler(
@@ -143,6 +157,10 @@ class CarGateway:
         now = self._loop.time()
         self._publish_health(now, 0.0)
         self._publisher.publish_states(self._control, self._health, now)
+        if self._state_damage:
+            self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
+        if self._not_taken:
+            self._commands.log(Level.WARNING, "other_link", self._not_taken)
         self._service.attach(
             self._loop,
             values=self._values_due,
@@ -232,6 +250,7 @@ class CarGateway:
             now = self._loop.time()
             self._link = link
             self._decoder = self._new_decoder()
+            self._baud = BaudWatch(self._settings.url)
             self._health.on_open(now)
             self._control.link_up(now)
             if self._attempts.on_open(now):
@@ -245,6 +264,20 @@ class CarGateway:
                     self._on_link_lost(str(error))
             await link.close()
             await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+
+    def _check_link(self) -> None:
+        """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
+        if self._link is None:
+            return
+        now, is_stale = self._loop.time(), self._health.state is LinkState.STALE
+        if now >= self._look_at and (is_stale or self._damaged >= MIN_DAMAGED):
+            self._damaged, self._look_at = 0, now + LOOK_INTERVAL_S
+            self._link.look_for_trouble()
+        trouble = self._link.trouble
+        if trouble and trouble != self._trouble:
+            self._trouble = trouble
+            self._health.on_rejected("port_shared")
+            self._commands.log(Level.WARNING, "port_shared", trouble)
 
     def _log_open(self) -> None:
         self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open. The gateway stops the car first.")
@@ -266,6 +299,9 @@ class CarGateway:
                     self._on_flood("flood_bytes", len(data) - start, now)
                     break
                 self._on_events(self._decoder.feed(data[start : start + SLICE_BYTES], now))
+            if (doubt := self._baud.on_bytes(data)) is not None:
+                self._health.on_rejected(doubt.cause, 1)
+                self._commands.log(Level.WARNING, "no_frames", doubt.words)
             if self._shown_state != before:
                 self._wake.set()
             self._wake_if_due(now)
@@ -295,9 +331,11 @@ class CarGateway:
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)
+                self._damaged += 1
                 continue
             if isinstance(event, TextLine):
                 continue  # it shows a program, but not that of a car
+            self._baud.on_frame()
             if not isinstance(event, Echo):
                 self._health.on_reading(event.at)
             if self._attempts.check_proven(event.at, has_reading=True):
@@ -425,6 +463,7 @@ class CarGateway:
             else:
                 self._publisher.on_bus_lost(now)
                 self._hub_lost.set()
+            self._check_link()
             before = self._shown_state
             self._control.tick(now)
             self._wake_if_due(now)

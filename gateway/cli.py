@@ -115,8 +115,8 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--link",
         required=True,
-        help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04 "
-        "(`fleet scan` shows them)",
+        help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04, both "
+        "also with ?adapter=hci1 or auto (`fleet scan` shows them)",
     )
     run.add_argument(
         "--platform",
@@ -131,6 +131,11 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         "--state-dir",
         metavar="DIR",
         help="directory for the e-stops and holds of each bus (default: FLEET_STATE_DIR, or the user's)",
+    )
+    run.add_argument(
+        "--holds-of",
+        metavar="TEXT",
+        help="the car that holds and loans belong to (default: the link; fleet up: the folder of a simulated car)",
     )
     run.add_argument(
         "--person",
@@ -231,6 +236,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 people=people,
                 longest_drive_s=longest_s,
                 parent=parent,
+                holds_of=arguments.holds_of or "",
             )
             stopped = asyncio.run(serve(settings, opened, service))
     except BadEndpoint as error:

@@ -1,57 +1,141 @@
-"""Persists the safety state of one car (its hold, e-stops, pauses and loan) in a small JSON file."""
+"""Persists the safety state of one car (its hold, e-stops, pauses and loan) in a small JSON file.
+
+A hold, a loan and an e-stop of one car belong to the car at one link: a simulated red is not the red on the table. The
+file keeps them for each link. Pauses and e-stops of the whole fleet belong to the fleet, whatever the link.
+"""
 
 import json
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from schemas.atomic_file import write_atomically
+from schemas.process.stdio import printable
+
+MAX_OTHER_LINKS: Final = 16
+"""Maximum links besides the present one whose holds, loans and e-stops the file keeps. The oldest is dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class _OfLink:
+    """What belongs to the car at one link."""
+
+    link: str
+    hold: Hold | None
+    estops: tuple[Estop, ...]
+    loan: Loan | None
+
+    @property
+    def is_empty(self) -> bool:
+        return self.hold is None and self.loan is None and not self.estops
 
 
 class SafetyStateFile:
-    """The state file of one car."""
+    """The state file of one car at one link. `link`: the text of `schemas.links.car_link`."""
 
-    def __init__(self, directory: Path, fleet: str, car: str) -> None:
+    def __init__(self, directory: Path, fleet: str, car: str, link: str) -> None:
         self.path = directory / f"{fleet}.{car}.json"
+        self.damage = ""
+        """Words for a person if the file that `load` found is unreadable."""
+        self.not_taken = ""
+        """Words for a person if `load` found a hold, a loan or an e-stop of another link."""
+        self._link = link
+        self._others: tuple[_OfLink, ...] = ()
 
     def load(self, now_ns: int) -> PersistedSafety:
         """Return the persisted state. A corrupted file counts as a hold, so that the car does not drive off."""
+        self.damage, self.not_taken, self._others = "", "", ()
         try:
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return PersistedSafety()
         except (OSError, UnicodeDecodeError) as error:
-            return PersistedSafety(Hold(f"unreadable {self.path.name}: {error}", now_ns))
+            return self._unreadable(f": {error}", now_ns)
         try:
-            return _parse(json.loads(text), now_ns)
+            content = json.loads(text)
+            state, others = _parse(content, now_ns), tuple(_parse_others(content, now_ns))
+            # Files of older versions name no link: they are of the only car of that name.
+            link = _text(content.get("link", self._link))
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-            return PersistedSafety(Hold(f"unreadable {self.path.name}", now_ns))
+            return self._unreadable("", now_ns)
+        if link != self._link:
+            others, state = _exchanged(others, state, was=link, now=self._link)
+        self._others = others
+        if others:
+            self.not_taken = self._words(others[-1], len(others) - 1)
+        return state
 
     def save(self, state: PersistedSafety) -> None:
         """Replace the file atomically; raise OSError."""
+        content = asdict(state) | {"link": self._link, "others": [asdict(each) for each in self._others]}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, json.dumps(asdict(state)).encode(), sync=True)
+        write_atomically(self.path, json.dumps(content).encode(), sync=True)
+
+    def _unreadable(self, why: str, now_ns: int) -> PersistedSafety:
+        words = f"the state file {self.path} is unreadable{why}: the car is on hold until somebody resumes it"
+        self.damage = " ".join(words.split())
+        return PersistedSafety(Hold(f"unreadable {self.path.name}{why}", now_ns))
+
+    def _words(self, other: _OfLink, more: int) -> str:
+        kept = [] if other.hold is None else [f"the hold of {other.hold.by}"]
+        kept += [f"the e-stop of {estop.by}" for estop in other.estops]
+        kept += [] if other.loan is None else [f"the loan to {other.loan.to}"]
+        verb = "belongs" if len(kept) == 1 else "belong"
+        words = f"{' and '.join(kept)} {verb} to the car at {other.link}, not to the one at {self._link}"
+        return printable(words + (f" (and those of {more} more links)" if more else ""), "?")
+
+
+def _exchanged(
+    others: tuple[_OfLink, ...], state: PersistedSafety, *, was: str, now: str
+) -> tuple[tuple[_OfLink, ...], PersistedSafety]:
+    """Return the other links and the state after the car's link has changed."""
+    of_car = tuple(each for each in state.estops if not each.fleet_wide)
+    of_fleet = tuple(each for each in state.estops if each.fleet_wide)
+    mine = next((each for each in others if each.link == now), _OfLink(now, None, (), None))
+    left = _OfLink(was, state.hold, of_car, state.loan)
+    kept = [each for each in others if each.link not in (was, now)]
+    kept += [] if left.is_empty else [left]
+    state = replace(state, hold=mine.hold, loan=mine.loan, estops=of_fleet + mine.estops)
+    return tuple(kept[-MAX_OTHER_LINKS:]), state
 
 
 def _parse(content: Any, now_ns: int) -> PersistedSafety:
     """Return the state in a file; raise ValueError, TypeError or KeyError. Older versions only have the hold."""
-    hold, loan = content["hold"], content.get("loan")
     return PersistedSafety(
-        None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns), _rank(hold)),
-        tuple(
-            Estop(*_who_and_why(each), _past(each["at_ns"], now_ns), each["fleet_wide"] is True, _rank(each))
-            for each in content.get("estops", ())
-        ),
+        _hold(content["hold"], now_ns),
+        _estops(content, now_ns),
         tuple(_text(each) for each in content.get("ended", ())),
         tuple(
             FleetPause(*_who_and_why(each), _past(each["at_ns"], now_ns), _rank(each))
             for each in content.get("pauses", ())
         ),
         tuple(_text(each) for each in content.get("ended_pauses", ())),
-        None if loan is None else _loan(loan, now_ns),
+        _loan(content.get("loan"), now_ns),
+    )
+
+
+def _parse_others(content: Any, now_ns: int) -> Iterator[_OfLink]:
+    """Yield what belongs to other links; raise as `_parse` does."""
+    for each in content.get("others", ()):
+        hold, loan = _hold(each["hold"], now_ns), _loan(each["loan"], now_ns)
+        if not (other := _OfLink(_text(each["link"]), hold, _estops(each, now_ns), loan)).is_empty:
+            yield other
+
+
+def _hold(content: Any, now_ns: int) -> Hold | None:
+    if content is None:
+        return None
+    return Hold(_text(content["by"]), _past(content["since_ns"], now_ns), _rank(content))
+
+
+def _estops(content: Any, now_ns: int) -> tuple[Estop, ...]:
+    return tuple(
+        Estop(*_who_and_why(each), _past(each["at_ns"], now_ns), each["fleet_wide"] is True, _rank(each))
+        for each in content.get("estops", ())
     )
 
 
@@ -60,7 +144,9 @@ def _who_and_why(content: Any) -> tuple[str, str, str]:
 
 
 def _loan(content: Any, now_ns: int) -> Loan | None:
-    """Return the loan; None if it is over."""
+    """Return the loan; None if there is none, or if it is over."""
+    if content is None:
+        return None
     to, by, since_ns = _text(content["to"]), _text(content["by"]), _past(content["since_ns"], now_ns)
     loan = Loan(to, by, _rank(content), since_ns, float(content["duration_s"]))
     return loan if 0 < loan.left_s(now_ns) < inf else None

@@ -1,7 +1,7 @@
 """Link URLs: the kinds of links and the only parser of their text. Pure; nothing is opened."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
@@ -16,6 +16,9 @@ WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
 _USB_FIELDS: Final = ("vid", "pid", "serial")
 _BLE_ADDRESS: Final = re.compile(r"[0-9A-F]{2}(:[0-9A-F]{2}){5}|[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}")
+_ADAPTER: Final = re.compile(r"auto|hci\d{1,3}")
+AUTO_ADAPTER: Final = "auto"
+"""The adapter of a Bluetooth link that takes any adapter with room."""
 # Core Specification, vol. 3, part C, 3.2.2
 _BLE_NAME_BYTES: Final = 248
 """Maximum length of the name of a Bluetooth device."""
@@ -73,16 +76,33 @@ class TcpUrl:
 
 @dataclass(frozen=True, slots=True)
 class BleUrl:
-    """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name."""
+    """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name.
+
+    adapter: the computer's adapter, such as hci1; `auto` for any with room; None for the first one.
+    """
 
     address: str | None = None
     name: str | None = None
+    adapter: str | None = None
 
     def __str__(self) -> str:
-        return f"ble://{self.address}" if self.name is None else f"ble://name={quote(self.name, safe='')}"
+        adapter = "" if self.adapter is None else f"?adapter={self.adapter}"
+        module = self.address if self.name is None else f"name={quote(self.name, safe='')}"
+        return f"ble://{module}{adapter}"
 
 
 LinkUrl = SerialUrl | UsbUrl | TcpUrl | BleUrl
+
+
+def car_link(url: LinkUrl) -> str:
+    """Return the text of a link without the options that do not tell cars apart: baud rate and adapter."""
+    match url:
+        case SerialUrl() | UsbUrl():
+            return str(replace(url, baud=BAUD))
+        case BleUrl():
+            return str(replace(url, adapter=None))
+        case TcpUrl():
+            return str(url)
 
 
 def parse_link(text: str) -> LinkUrl:
@@ -169,11 +189,21 @@ def _usb_id(name: str, options: dict[str, str]) -> int | None:
 
 
 def _ble(rest: str) -> BleUrl:
+    rest, option, adapter = _split_adapter(rest)
+    if option and _ADAPTER.fullmatch(adapter) is None:
+        raise BadLink(f"adapter={adapter[:20]} is no adapter. Write adapter=hci1, or adapter=auto")
+    chosen = adapter if option else None
     if rest.startswith("name="):
         name = unquote(rest[5:])
         if not name or not name.isprintable() or len(name.encode()) > _BLE_NAME_BYTES:
             raise BadLink(f"a name has 1 to {_BLE_NAME_BYTES} bytes, and can be printed")
-        return BleUrl(name=name)
+        return BleUrl(name=name, adapter=chosen)
     if _BLE_ADDRESS.fullmatch(rest.upper()) is None:
         raise BadLink("it names no Bluetooth address, and no name=")
-    return BleUrl(address=rest.upper())
+    return BleUrl(address=rest.upper(), adapter=chosen)
+
+
+def _split_adapter(rest: str) -> tuple[str, str, str]:
+    """Return the module, the option if there is one, and the adapter. A name may have a ? of its own."""
+    module, option, adapter = rest.rpartition("?adapter=")
+    return (module, option, adapter) if option else (rest, "", "")

@@ -20,6 +20,10 @@ _MIN_REJECTED: Final = 10
 MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
+_PORT_SHARED: Final = "port_shared"
+_BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published"})
+"""Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
 _NO_TROUBLE: Final = ("superseded", "duplicate")
@@ -63,7 +67,7 @@ class CarEvidence:
     def rejected(self) -> dict[str, int]:
         """The rejected frames by cause."""
         link = self.of("state/link")
-        return {} if link is None else {cause: count for cause, count in link.rejects.items() if cause != _NOT_OBEYED}
+        return {} if link is None else {each: count for each, count in link.rejects.items() if each not in _NO_FRAMES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,24 +144,41 @@ def _fan_runs(e: CarEvidence) -> bool:
     return motion is not None and motion.fan
 
 
+def _baud(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.rx_frames > sum(e.rejected.values()):  # a reading came
+        return ""
+    if link.rejects.get("wrong_baud", 0):
+        return "Bytes arrive, and never a frame. They look like a wrong baud rate: the log has both rates."
+    return "Bytes arrive, and never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
+
+
 def _silent_fan(e: CarEvidence) -> str:
     return "It is silent, and its fan runs: some cars send nothing then." if _silent(e) and _fan_runs(e) else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
-    if not _silent(e) or _fan_runs(e):
+    if not _silent(e) or _fan_runs(e) or _baud(e):
         return ""
     link = e.of("state/link")
     since = f"for {link.last_rx_s:.0f} s" if link.HasField("last_rx_s") else "since its link opened"
     return f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
 
 
+def _shared(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or not link.rejects.get(_PORT_SHARED, 0):
+        return ""
+    return "Another program has its port open, too, or had it: bytes may be missing. The log names it."
+
+
 def _damaged(e: CarEvidence) -> str:
     link, count = e.of("state/link"), sum(e.rejected.values())
-    if count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * (link.rx_frames + count):
+    # The rejected frames are among those that came.
+    if _baud(e) or count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
-    return f"{count} of {link.rx_frames + count} frames were no reading, most of them {worst}: a bad wire or radio."
+    return f"{count} of {link.rx_frames} frames were no reading, most of them {worst}: a bad wire or radio."
 
 
 def _estopped(e: CarEvidence) -> str:
@@ -269,8 +290,10 @@ CHECKS: Final = (
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
     DoctorCheck("not_shown", _unproven, "fleet stop {car}"),
+    DoctorCheck("no_frames", _baud, "fleet logs {car}"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
     DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
+    DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
     DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
     DoctorCheck("paused", _paused, "fleet unpause"),

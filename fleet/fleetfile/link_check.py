@@ -20,6 +20,7 @@ from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
 from gateway.protocol.platform_name import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 from schemas.process import port_lock
+from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.suggestion import how_to_install
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ def check_device(path: str) -> tuple[bool, str]:
     try:
         file_stat = Path(path).stat()
     except OSError as error:
+        if error.errno == errno.ENOENT and (missing := explain_missing_port()):
+            return False, f"there is no such device. {missing}"
         if error.errno == errno.ENOENT:
             return False, "there is no such device: plug the car in, switch it on, or bind it again (fleet bind)"
         return False, f"cannot be checked: {error.strerror}"
@@ -97,7 +100,9 @@ def check_device(path: str) -> tuple[bool, str]:
     if holder is not None:
         return False, f"in use by {holder}. Stop that first."
     free = "free" if port_lock.LOCKS.exists() else "whether it is free is not known here"
-    return True, f"there, permitted, {free}; not opened, which can reset a car"
+    users = ", ".join(port_lock.find_users(path))
+    shared = f", but {users} has it open and may take its bytes: stop that" if users else ""
+    return True, f"there, permitted, {free}{shared}; not opened, which can reset a car"
 
 
 def _group_name(number: int) -> str:
@@ -119,6 +124,8 @@ def _list_ports() -> "list[ListPortInfo]":
 
 def _check_usb(link: UsbUrl) -> tuple[bool, str]:
     matching = [str(port.device) for port in _list_ports() if link.fits(port.vid, port.pid, port.serial_number)]
+    if not matching and link.fits(*CH340, None) and (missing := explain_missing_port()):
+        return False, missing
     if not matching:
         return False, "no such USB device is plugged in: plug the car in, or bind it again (fleet bind)"
     if len(matching) > 1:

@@ -260,7 +260,10 @@ def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: s
     """Return the command of a car's gateway."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", *parent_option())
     options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
-    return module("gateway.cli", "run", *options, *where)
+    # The link of a simulated car is of this run only. The next run in this folder has the same car, another folder not.
+    folder = (Path.cwd() if spec.file is None else spec.file.parent).resolve()
+    same = ("--holds-of", f"{SIMULATED} in {folder}") if car.link == SIMULATED else ()
+    return module("gateway.cli", "run", *options, *same, *where)
 
 
 def simulator_command(spec: FleetSpec, directory: Path, endpoint: str) -> tuple[str, ...]:

@@ -1,14 +1,27 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.protocol` gives the bytes their meaning.
 
 `base` has the interface and its errors. `serial`, `tcp` and `ble` implement it, two of them with the buffer of
-`buffered_link`. `usb` finds the port of a USB device, `url` accepts a link from the command line.
+`buffered_link`. `usb` finds the port of a USB device, `url` accepts a link from the command line. `baud` doubts the
+baud rate of bytes without a frame.
 """
 
 from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
+from gateway.link.baud import BaudWatch
 from gateway.link.url import parse_url
 from schemas.links import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
 
-__all__ = ["BadUrl", "Busy", "CannotOpen", "Link", "LinkError", "LinkLost", "LinkUrl", "open_link", "parse_url"]
+__all__ = [
+    "BadUrl",
+    "BaudWatch",
+    "Busy",
+    "CannotOpen",
+    "Link",
+    "LinkError",
+    "LinkLost",
+    "LinkUrl",
+    "open_link",
+    "parse_url",
+]
 
 OPEN_TIMEOUT_S = 5.0
 # A module advertises about once a second, and a scan often misses the first one. The fourth car needs 4 s to connect.

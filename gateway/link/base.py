@@ -30,6 +30,15 @@ class LinkLost(LinkError):
 class Link(ABC):
     """Bytes to and from one car."""
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the open link, one line for a person: what, where, what to do. Empty if nothing is."""
+        return ""
+
+    def look_for_trouble(self) -> None:
+        """Find out in the background why bytes are damaged or missing; `trouble` says what was found."""
+        return
+
     @abstractmethod
     async def read(self) -> bytes:
         """Return the next bytes as they arrived, at least one; raise LinkLost at the end."""

@@ -10,7 +10,7 @@ import contextlib
 import errno
 import socket
 import sys
-from collections.abc import Coroutine, Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 from bleak import BleakAdapter, BleakClient, BleakScanner
@@ -47,13 +47,16 @@ def _uuid(short: int) -> str:
 
 
 _NORDIC: Final = "6e40000{}-b5a3-f393-e0a9-e50e24dcca9e"
+_FFE: Final = (_uuid(0xFFE1), _uuid(0xFFE2), _uuid(0xFFE4), _uuid(0xFFE9))
 _UARTS: Final = (
-    ((_uuid(0xFFE0), _uuid(0xFFE5)), (_uuid(0xFFE1), _uuid(0xFFE2), _uuid(0xFFE4), _uuid(0xFFE9))),
-    ((_NORDIC.format(1),), (_NORDIC.format(2), _NORDIC.format(3))),
+    ((_uuid(0xFFE0), _uuid(0xFFE5)), _FFE, _FFE),
+    # Some clones can write to FFF1, too, and pass on only what was written to FFF2.
+    ((_uuid(0xFFF0),), (_uuid(0xFFF1),), (_uuid(0xFFF2),)),
+    ((_NORDIC.format(1),), (_NORDIC.format(3),), (_NORDIC.format(2),)),
 )
 """docs/reference/protocol.md#framing: the services of a UART over BLE, and their characteristics in order of
-preference."""
-UART_SERVICES: Final = tuple(service for services, _ in _UARTS for service in services)
+preference, from the car and to it."""
+UART_SERVICES: Final = tuple(service for services, _, _ in _UARTS for service in services)
 
 
 class BleLink(BufferedLink):
@@ -154,7 +157,7 @@ class BleLink(BufferedLink):
         chosen = choose(client.services)
         if chosen is None:
             there = _listed(sorted(service.uuid for service in client.services)) or "none"
-            raise CannotOpen(f"{self._url}: no known UART service (FFE0, Nordic's). It has: {there}")
+            raise CannotOpen(f"{self._url}: no known UART service (FFE0, FFF0, Nordic's). It has: {there}")
         from_car, self._to_car = chosen
         self._stage = f"{address} is connected, but sends nothing. Switch it off and on again."
         await client.start_notify(from_car, self._on_notification)
@@ -243,14 +246,21 @@ def choose(
 ) -> tuple[BleakGATTCharacteristic, BleakGATTCharacteristic] | None:
     """Return the notifying and the writable characteristic of a UART, often the same. None if there is no UART."""
     available = list(services)
-    for uuids, preferred in _UARTS:
+    for uuids, notifying, writable in _UARTS:
         found = [each for service in available if service.uuid in uuids for each in service.characteristics]
-        found.sort(key=lambda each: preferred.index(each.uuid) if each.uuid in preferred else len(preferred))
-        from_car = [each for each in found if not _NOTIFY.isdisjoint(each.properties)]
-        to_car = [each for each in found if not _WRITE.isdisjoint(each.properties)]
+        from_car = _preferred(found, _NOTIFY, notifying)
+        to_car = _preferred(found, _WRITE, writable)
         if from_car and to_car:
-            return from_car[0], to_car[0]
+            return from_car, to_car
     return None
+
+
+def _preferred(
+    found: Iterable[BleakGATTCharacteristic], properties: frozenset[str], order: Sequence[str]
+) -> BleakGATTCharacteristic | None:
+    """Return the first in the order that has one of the properties. None if there is none."""
+    fit = [each for each in found if not properties.isdisjoint(each.properties)]
+    return min(fit, key=lambda each: order.index(each.uuid) if each.uuid in order else len(order), default=None)
 
 
 async def _connected() -> list[BLEDevice]:

@@ -21,6 +21,7 @@ from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
 from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process import port_lock
+from schemas.process.usb_bus import explain_missing_port
 
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
 """Timeout of pyserial's own write, used on Windows only."""
@@ -43,6 +44,15 @@ _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
 _BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
 _UNPLUGGED: Final = frozenset({errno.EIO, errno.ENXIO, errno.ENODEV})
 """Errors of an open port while it is being unplugged. Afterwards a read returns end of file."""
+_RFCOMM: Final = re.compile(r"rfcomm\d+")
+_RFCOMM_FAR: Final = frozenset(
+    {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ETIMEDOUT, errno.EIO, getattr(errno, "EHOSTDOWN", errno.EIO)}
+)
+"""Errors of opening the port of a Bluetooth Classic module that is off, out of range or not paired."""
+# A second reader causes an empty read for each byte at most, 500 of them. A port that fails in this way spins.
+_MAX_EMPTY_READS: Final = 2000
+_EMPTY_READS_S: Final = 0.5
+"""Maximum empty reads within this time. After more of them, the port counts as gone."""
 
 
 _opening: Final[set[str]] = set()
@@ -69,6 +79,11 @@ class SerialLink(Link):
         self._closing = threading.Event()
         self._lost: str | None = None
         self._stuck = False
+        self._trouble = ""
+        self._is_searching = False
+        self._empty_reads = 0
+        """Empty reads since `_empty_since`."""
+        self._empty_since = 0.0
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
         # A daemon thread: opening or closing a port can block (a Bluetooth tty does) and must not keep the process.
@@ -87,6 +102,17 @@ class SerialLink(Link):
             raise CannotOpen(
                 f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
             ) from None
+
+    @property
+    def trouble(self) -> str:
+        """Say that another program reads the port, and which one."""
+        return self._trouble
+
+    def look_for_trouble(self) -> None:
+        """Find out which other program has the port open, in a thread: it takes some 10 ms."""
+        if not self._trouble and not self._is_searching:
+            self._is_searching = True
+            threading.Thread(target=self._find_users, name=f"who reads {self._url}", daemon=True).start()
 
     async def read(self) -> bytes:
         """Return the next bytes as they arrived; raise LinkLost."""
@@ -160,19 +186,53 @@ class SerialLink(Link):
             with self._lock:
                 if self._port is None:
                     return
-                data = os.read(self._port.fileno(), READ_BYTES)
+                descriptor = self._port.fileno()
+                data = os.read(descriptor, READ_BYTES)
+                # An unplugged port has no settings. One that has, and had bytes a moment ago, was read by another.
+                is_there = bool(data) or bool(termios.tcgetattr(descriptor))
                 self._paused = len(self._chunks) >= MAX_BUFFERED_CHUNKS
                 if self._paused:
                     self._loop.remove_reader(self._port.fileno())
         except BlockingIOError:
+            self._on_empty_read()
             return
         except _GONE as error:
             self._lose(f"{self._url} is gone: {_why_gone(error)}")
             return
         if data:
             self._on_data(data)
+        elif is_there:
+            self._on_empty_read()
         else:
             self._lose(f"{self._url} is gone: unplugged")
+
+    def _on_empty_read(self) -> None:
+        """Find out who has read the bytes. The link stays: a stop still reaches the car."""
+        now = self._loop.time()
+        if now - self._empty_since > _EMPTY_READS_S:
+            self._empty_reads, self._empty_since = 0, now
+        self._empty_reads += 1
+        if self._empty_reads > _MAX_EMPTY_READS:
+            self._lose(f"{self._url} is gone: it has bytes and returns none")
+        else:
+            self.look_for_trouble()
+
+    def _find_users(self) -> None:
+        with self._lock:
+            path = "" if self._port is None else str(self._port.port)
+        users = port_lock.find_users(path) if path else []
+        self._call_on_loop(self._on_found, path, users)
+
+    def _on_found(self, path: str, users: list[str]) -> None:
+        self._is_searching = False
+        verb, missing = ("reads", "are") if self._empty_reads else ("has", "may be")
+        fact = f"another program {verb} {self._url}{'' if self._empty_reads else ' open'}, too, so bytes of the car"
+        if users:
+            stop = "Stop that program." if len(users) == 1 else "Stop those programs."
+            self._trouble = f"{fact} {missing} missing: {', '.join(users)}. {stop}"
+        elif path and self._empty_reads:
+            how = port_lock.how_to_find_users(path)
+            self._trouble = f"{fact} {missing} missing. `{how}` names it: stop that program."
 
     # ------------------------------------------------------------------ in the thread
 
@@ -233,7 +293,7 @@ class SerialLink(Link):
                 path, self._url.baud, timeout=None, write_timeout=SERIAL_WRITE_TIMEOUT_S, exclusive=exclusive
             )
         except _NOT_OPENED as error:
-            kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
+            kind = Busy if _code(error) in _BUSY else CannotOpen
             raise kind(why_not_open(self._url, path, error)) from None
         if found is not None:
             _first.setdefault(str(self._url), found)
@@ -290,8 +350,11 @@ def _write_now(port: serial.Serial, data: bytes) -> int:
 
 def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
     """Return one line for a person: the trouble with the port at this path, and what to do."""
-    code = getattr(error, "errno", None)
+    code = _code(error)
     which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
+    if code in _RFCOMM_FAR and _is_rfcomm(path):
+        what = "Switch it on and bring it near. If it was never paired here: `bluetoothctl pair ADDRESS`."
+        return f"{which}the car is off, out of range or not paired ({_cause(error)}). {what}"
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         windows = " (COM... is Windows)" if path.upper().startswith("COM") and os.name == "posix" else ""
         return f"{which}no such port on this computer{windows}. {_ports()}"
@@ -306,20 +369,35 @@ def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
     return f"{which}the port cannot be opened ({_cause(error)}). {_ports()}"
 
 
+def _is_rfcomm(path: str) -> bool:
+    """Return True for the port of a Bluetooth Classic module, also behind a symlink."""
+    return any(_RFCOMM.fullmatch(os.path.basename(each)) for each in (path, os.path.realpath(path)))  # noqa: PTH119
+
+
 def _holder(path: str) -> str:
     try:
-        return port_lock.find_holder(os.stat(path)) or "another program"  # noqa: PTH116 - a device path
+        holder = port_lock.find_holder(os.stat(path))  # noqa: PTH116 - a device path
     except (OSError, ValueError):
-        return "another program"
+        holder = None
+    # A terminal program locks a port in another way (TIOCEXCL), or with a file.
+    return holder or ", ".join(port_lock.find_users(path)) or "another program"
 
 
 def _why_gone(error: Exception) -> str:
-    return "unplugged" if getattr(error, "errno", None) in _UNPLUGGED else _cause(error)
+    return "unplugged" if _code(error) in _UNPLUGGED else _cause(error)
+
+
+def _code(error: Exception) -> int | None:
+    """Return the error number, which termios.error has in its first argument only. None if there is none."""
+    code = getattr(error, "errno", None)
+    if code is None and isinstance(error, _GONE) and error.args:
+        code = error.args[0]
+    return code if isinstance(code, int) else None
 
 
 def _cause(error: Exception) -> str:
-    code = getattr(error, "errno", None)
-    if isinstance(code, int):
+    code = _code(error)
+    if code is not None:
         return os.strerror(code).lower()
     if "readiness to read" in str(error):  # pyserial's message for an end of file, as after an unplug
         return "unplugged"
@@ -343,6 +421,8 @@ def _ports() -> str:
         found = sorted(port.device for port in list_usb_ports())
     except CannotOpen as error:
         return str(error)
+    if missing := explain_missing_port():
+        return missing
     return f"Found: {', '.join(found)}. `fleet scan` checks them." if found else "No serial port is plugged in."
 
 

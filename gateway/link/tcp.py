@@ -16,6 +16,9 @@ from schemas.links import TcpUrl
 # A vanished peer is noticed within about five seconds, where the system has these options.
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
+MAX_SAID_BYTES: Final = 120
+"""Maximum bytes of what the other end said before it closed that an error shows."""
+
 _Addresses = list[tuple[int, Any]]
 """(family, socket address), as from getaddrinfo."""
 _lookups: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
@@ -30,7 +33,8 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._url = url
         self._transport: asyncio.Transport | None = None
         self._ended = asyncio.Event()
-        self._has_received = False
+        self._first = b""
+        """The first received bytes. A bridge that is in use says so, and closes."""
         self._paused = False
 
     async def read(self) -> bytes:
@@ -91,7 +95,8 @@ class TcpLink(asyncio.Protocol, BufferedLink):
 
     def data_received(self, data: bytes) -> None:
         """Buffer bytes for `read`, and pause the socket if the buffer is full."""
-        self._has_received = True
+        if len(self._first) <= MAX_SAID_BYTES:
+            self._first += data[: MAX_SAID_BYTES + 1]
         self._data += data
         self._came.set()
         if len(self._data) > MAX_BUFFERED_BYTES and not self._paused and self._transport is not None:
@@ -101,12 +106,24 @@ class TcpLink(asyncio.Protocol, BufferedLink):
     def connection_lost(self, exc: Exception | None) -> None:
         """Store the reason."""
         why = "the car closed it" if exc is None else _cause(exc)
-        if not self._has_received and (exc is None or isinstance(exc, ConnectionResetError)):
-            # A car serves one client and rejects the next.
-            why += " before it sent anything. Perhaps another gateway or program is connected to it."
+        # A car serves one client and rejects the next. A bridge often says why before it closes (ser2net does).
+        said = _sentence(self._first)
+        if (said or not self._first) and (exc is None or isinstance(exc, ConnectionResetError)):
+            why += f', and said "{said}".' if said else " before it sent anything."
+            why += " Perhaps another gateway or program is connected to it."
         self._lost = self._lost or f"{self._url} is gone: {why}"
         self._came.set()
         self._ended.set()
+
+
+def _sentence(data: bytes) -> str:
+    """Return what a bridge said before it closed, with control characters escaped. Empty for a car's bytes."""
+    text = data.decode(errors="replace").strip()
+    printed = sum(each.isprintable() and each != "\ufffd" for each in text)
+    if b"$" in data or 2 * printed < len(text):
+        return ""
+    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+    return shown[:MAX_SAID_BYTES] + ("..." if len(shown) > MAX_SAID_BYTES else "")
 
 
 async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:

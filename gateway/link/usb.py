@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from gateway.link.base import CannotOpen
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process.stdio import printable
+from schemas.process.usb_bus import CH340, explain_missing_port
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -68,6 +69,8 @@ def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
         raise CannotOpen(
             f"{url}: {len(fit)} devices fit, {_named(fit)}: add a serial= that only one has, or give its device path"
         )
+    if url.fits(*CH340, None) and (missing := explain_missing_port()):
+        raise CannotOpen(f"{url}: no such serial port. {missing}")
     found = f"there are: {_named(available)}" if available else "no serial port is plugged in"
     raise CannotOpen(f"{url}: no such USB device is plugged in; {found}")
 

@@ -19,6 +19,7 @@ from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
 from gateway.tools.probe import LinkProbe, LinkVerdict
 from schemas.process.stdio import printable
+from schemas.process.usb_bus import explain_missing_port
 
 DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
 EPILOG: Final = """\
@@ -177,7 +178,7 @@ class _Scan:
     def lines(self, paint: cli_support.Paint) -> Iterator[str]:
         """Yield the result as text for a person."""
         if not self._probes:
-            yield "no serial port is plugged in"
+            yield explain_missing_port() or "no serial port is plugged in"
         for probe in self._probes:
             yield f"{paint('cyan', _name(probe))}"
             yield f"  {_words(probe)}"

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 
 from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
-from gateway.state_file import SafetyStateFile
+from gateway.state_file import MAX_OTHER_LINKS, SafetyStateFile
+from schemas.links import car_link, parse_link
 
+LINK, OTHER = "serial:///dev/ttyUSB0", "serial:///dev/pts/7"
 NOW = 1_800_000_000_000_000_000
 
 
@@ -25,29 +27,74 @@ def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
         ("p0",),
         Loan("bob", "mia", SenderKind.LEAD, NOW - 5, 60.0),
     )
-    SafetyStateFile(directory, "fleet", "red").save(kept)
-    assert SafetyStateFile(directory, "fleet", "red").load(NOW) == kept
-    assert SafetyStateFile(directory, "fleet", "blue").load(NOW) == PersistedSafety()
-    assert SafetyStateFile(directory, "other", "red").load(NOW) == PersistedSafety()
-    SafetyStateFile(directory, "fleet", "red").save(PersistedSafety())
-    assert SafetyStateFile(directory, "fleet", "red").load(NOW) == PersistedSafety()
+    SafetyStateFile(directory, "fleet", "red", LINK).save(kept)
+    assert SafetyStateFile(directory, "fleet", "red", LINK).load(NOW) == kept
+    assert SafetyStateFile(directory, "fleet", "blue", LINK).load(NOW) == PersistedSafety()
+    assert SafetyStateFile(directory, "other", "red", LINK).load(NOW) == PersistedSafety()
+    SafetyStateFile(directory, "fleet", "red", LINK).save(PersistedSafety())
+    assert SafetyStateFile(directory, "fleet", "red", LINK).load(NOW) == PersistedSafety()
     assert [path.name for path in directory.iterdir()] == ["fleet.red.json"]
 
 
+def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
+    """A simulated red, held in one folder, kept a red on the table out of its plan, and the other way round."""
+    own = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=False)
+    everybody = Estop("e2", "mia", "fire", NOW - 5, fleet_wide=True)
+    pause = FleetPause("p1", "mia", "listen", NOW - 5)
+    loan = Loan("bob", "mia", SenderKind.LEAD, NOW - 5, 60.0)
+    kept = PersistedSafety(Hold("mia", NOW - 5), (own, everybody), ("e0",), (pause,), ("p0",), loan)
+    SafetyStateFile(tmp_path, "fleet", "red", LINK).save(kept)
+    simulated = SafetyStateFile(tmp_path, "fleet", "red", OTHER)
+    of_fleet = PersistedSafety(None, (everybody,), ("e0",), (pause,), ("p0",))
+    assert simulated.load(NOW) == of_fleet
+    words = f"the hold of mia and the e-stop of mia and the loan to bob belong to the car at {LINK}, not to the one at"
+    assert simulated.not_taken == f"{words} {OTHER}"
+    simulated.save(PersistedSafety(Hold("bob", NOW)))
+    back = SafetyStateFile(tmp_path, "fleet", "red", LINK)
+    assert back.load(NOW) == PersistedSafety(Hold("mia", NOW - 5), (own,), loan=loan), "kept; the fleet's have ended"
+    assert back.not_taken == f"the hold of bob belongs to the car at {OTHER}, not to the one at {LINK}"
+    back.save(PersistedSafety())
+    assert SafetyStateFile(tmp_path, "fleet", "red", OTHER).load(NOW) == PersistedSafety(Hold("bob", NOW))
+
+
+def test_the_links_of_a_car_are_bounded_and_nothing_is_said_of_those_without_a_hold(tmp_path: Path) -> None:
+    for number in range(3 * MAX_OTHER_LINKS):
+        store = SafetyStateFile(tmp_path, "fleet", "red", f"tcp://127.0.0.1:{number}")
+        store.load(NOW)
+        store.save(PersistedSafety(Hold("mia", NOW)))
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
+    assert store.load(NOW) == PersistedSafety()
+    assert store.not_taken.endswith(f"(and those of {MAX_OTHER_LINKS - 1} more links)")
+    assert len(json.loads(store.path.read_text())["others"]) == MAX_OTHER_LINKS
+    SafetyStateFile(tmp_path / "new", "fleet", "red", LINK).save(PersistedSafety())
+    again = SafetyStateFile(tmp_path / "new", "fleet", "red", OTHER)
+    assert (again.load(NOW), again.not_taken) == (PersistedSafety(), "")
+
+
+def test_what_does_not_tell_cars_apart_is_not_part_of_the_link() -> None:
+    def links(*texts: str) -> set[str]:
+        return {car_link(parse_link(text)) for text in texts}
+
+    assert links("/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=115200") == {LINK}
+    assert len(links("ble://AA:BB:CC:DD:EE:FF", "ble://aa:bb:cc:dd:ee:ff?adapter=hci1")) == 1
+    assert len(links("ble://name=A?adapter=auto", "ble://name=A")) == 1
+    assert len(links("tcp://a:1", "tcp://a:2", "serial://?vid=1a86", "serial://?vid=1a87")) == 4
+
+
 def test_a_hold_from_the_future_began_now(tmp_path: Path) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.save(PersistedSafety(Hold("mia", NOW + 10**30)))
     assert store.load(NOW) == PersistedSafety(Hold("mia", NOW))
 
 
 def test_a_file_of_a_version_without_e_stops_is_read(tmp_path: Path) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.path.write_text('{"hold": {"by": "mia", "since_ns": 7}}')
     assert store.load(NOW) == PersistedSafety(Hold("mia", 7))
 
 
 def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     estop = {"id": "e1", "by": "mia", "why": "", "at_ns": 7, "fleet_wide": True}
     store.path.write_text(json.dumps({"hold": {"by": "mia", "since_ns": 7}, "estops": [estop], "ended": ["e0"]}))
     person = SenderKind.PERSON
@@ -57,7 +104,7 @@ def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
 
 
 def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     loan = Loan("bob", "mia", SenderKind.LEAD, NOW, 60.0)
     store.save(PersistedSafety(loan=loan))
     assert store.load(NOW + 59_000_000_000).loan == loan
@@ -70,9 +117,9 @@ def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
 def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        SafetyStateFile(tmp_path / "file", "fleet", "red").save(PersistedSafety())
-    assert SafetyStateFile(tmp_path / "file", "fleet", "red").load(NOW).hold is not None
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+        SafetyStateFile(tmp_path / "file", "fleet", "red", LINK).save(PersistedSafety())
+    assert SafetyStateFile(tmp_path / "file", "fleet", "red", LINK).load(NOW).hold is not None
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.save(PersistedSafety(Hold("mia", 1)))
     (tmp_path / ".fleet.red.json.new").mkdir()
     with pytest.raises(OSError, match="fleet"):
@@ -103,23 +150,28 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
         '{"hold": {"by": "mia", "since_ns": 3, "rank": "king"}}',
         '{"hold": null, "pauses": [{"id": "p"}]}',
         '{"hold": null, "loan": {"to": "bob"}}',
+        '{"hold": null, "others": 3}',
+        '{"hold": null, "others": [{"link": "a"}]}',
+        '{"hold": null, "link": "\\ud800"}',
         '{"hold": null, "loan": {"to": "b", "by": "a", "rank": "lead", "since_ns": 1, "duration_s": "long"}}',
         "[" * 100_000,
         '{"hold": {"by": "mia", "since_ns": ' + "9" * 5000 + "}}",
     ],
 )
 def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.path.write_text(text)
     held = store.load(NOW).hold
     assert held is not None
     assert (held.since_ns, held.by[:10]) == (NOW, "unreadable")
+    assert f"the state file {store.path} is unreadable" in store.damage
+    assert "\n" not in store.damage
     held.by.encode()
 
 
 @given(st.one_of(st.binary(), st.text().map(str.encode), st.integers(0, 80).map(lambda cut: SAVED[:cut])))
 def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: bytes) -> None:
-    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.path.write_bytes(content)
     held = store.load(NOW).hold
     if held is None:

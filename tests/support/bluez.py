@@ -55,6 +55,12 @@ NORDIC = (
         ),
     ),
 )
+FFF0 = (
+    (
+        uuid(0xFFF0),
+        ((uuid(0xFFF1), ("notify", "write-without-response")), (uuid(0xFFF2), ("write", "write-without-response"))),
+    ),
+)
 BATTERY = ((uuid(0x180F), ((uuid(0x2A19), ("read", "notify")),)),)
 
 
@@ -95,6 +101,8 @@ class Module:
     """Pending calls of Connect."""
     uart: int | None = None
     """Descriptor of a car's serial port, to which the module passes written bytes."""
+    written_to: set[str] = field(default_factory=set)
+    """The UUIDs of the characteristics that were written."""
 
     @property
     def path(self) -> str:
@@ -286,8 +294,9 @@ class FakeBluez:
         for module in self.modules:
             if module.known and message.path == module.path:
                 return await self._device_call(caller, message, module)
-            for path, _, flags, _, _ in module.characteristics():
+            for path, each, flags, _, _ in module.characteristics():
                 if module.connected and message.path == path:
+                    module.written_to |= {each} if message.member == "WriteValue" else set()
                     return await self._characteristic_call(caller, message, module, flags)
         raise Refused(f"{DBUS}.Error.UnknownObject", f"Method {message.member} with {message.path} doesn't exist")
 

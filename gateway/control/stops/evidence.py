@@ -21,19 +21,20 @@ stop do that on a car that reports every second. So two pauses are needed, each 
 them is longer than it should be (a slow link, or a report that the link held), three are.
 
 *Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
-`MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length tells.
-Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop at the same
-moment of an interval. It does not block, so the next report must come on time. If that one is missing too, the pauses
-were the link's.
+`MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length
+tells. Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop at the
+same moment of an interval. It does not block, so the next report must come on time. If that one is missing too, the
+pauses were the link's.
 
 *Why silence follows.* A link that holds reports makes gaps of any length. But the held report comes late, and the next
 one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
 such a report would have come.
 
 *Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. On a car that was
-seen to block, that needs one report only, but the report must begin after `MODE00` was obeyed, and come before a `MODE00` that lost its digits would
-let one through: without its digits the frame opens mode 0 with the motors on, which blocks longer. A silent mode shows
-nothing by its silence. If it was opened from a shown rest, the end of the silence shows that it was left.
+seen to block, that needs one report only, but the report must begin after `MODE00` was obeyed, and come before a
+`MODE00` that lost its digits would let one through: without its digits the frame opens mode 0 with the motors on, which
+blocks longer. A silent mode shows nothing by its silence. If it was opened from a shown rest, the end of the silence
+shows that it was left.
 
 *What a car can forge.* Its reports have no checksum. A damaged frame of another mode can look like mode 0, so a report
 counts only after a silence that no such mode has. The start of one frame and the end of another can join. The decoder
@@ -124,7 +125,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
         "full, out of a mode in which the car reported",
         "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
-        "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in mode 0",
+        "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in "
+        "mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(

@@ -43,8 +43,12 @@ ODD: dict[str, CarEvidence] = {
     "link_down": with_states(link=pb.Link(state="lost", reason="no such port", since_s=12)),
     "platform_contradicted": with_states(health=pb.Health(platform="stm32", platform_contradictions=["7.91 V"])),
     "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
+    "no_frames": with_states(
+        link=pb.Link(state="stale", last_rx_s=12, rx_frames=40, rejects={"no_start": 40, "wrong_baud": 1})
+    ),
     "fan_silence": with_states(link=STALE, motion=pb.Motion(fan=True)),
     "silent": with_states(link=STALE),
+    "port_shared": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"port_shared": 1})),
     "damaged_frames": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"truncated": 8, "noise": 3})),
     "estopped": with_states(safety=pb.Safety(motors="off", trust="stopped", estops=[pb.Estop(by="ann", why="smoke")])),
     "paused": with_states(safety=pb.Safety(motors="off", trust="stopped", pauses=[pb.Pause(by="ann", why="listen")])),
@@ -93,6 +97,26 @@ def test_the_likely_cause_comes_first_and_a_known_refusal_is_not_said_twice() ->
     assert [each.code for each in found] == ["link_down", "held"]
     other = diagnose(replace(lost, commands=[refused("wrong_mode")]))
     assert [each.code for each in other] == ["link_down", "held", "refused"]
+
+
+def test_bytes_without_a_frame_are_no_silence_and_no_bad_wire() -> None:
+    counts = {"no_start": 40, "no_frames": 1}
+    (found,) = diagnose(with_states(link=pb.Link(state="stale", last_rx_s=1, rx_frames=40, rejects=counts)))
+    assert found.cause == "Bytes arrive, and never a frame: a wrong baud rate?"
+    read = pb.Link(state="online", rx_frames=500, rejects={"wrong_baud": 1})
+    assert diagnose(with_states(link=read)) == [], "it was set right: readings come"
+
+
+def test_each_rejected_frame_counts_once() -> None:
+    """The frames that came include the rejected ones. Other counts of a link are no frames."""
+    (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
+    assert found.cause == "10 of 40 frames were no reading, most of them truncated: a bad wire or radio."
+    few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1}
+    assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
+    over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})
+    assert [each.code for each in diagnose(with_states(link=over))] == ["damaged_frames"]
+    within = pb.Link(state="online", rx_frames=20 * 12 + 1, rejects={"truncated": 12})
+    assert diagnose(with_states(link=within)) == []
 
 
 def test_a_command_that_somebody_replaced_is_no_refusal() -> None:

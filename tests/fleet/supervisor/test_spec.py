@@ -146,6 +146,18 @@ def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
         assert "--nonsense" in done.stderr, done.stderr
 
 
+def test_holds_of_a_simulated_car_belong_to_its_folder_and_those_of_a_real_one_to_its_link(tmp_path: Path) -> None:
+    def holds_of(folder: str, car: str) -> str | None:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        spec = build_spec(parse_fleet(FILE, tmp_path / folder / "fleet.yaml"), UpOptions(simulated=1))
+        command = gateway_command(spec, spec.cars[car], "serial:///run/of/today.tty", "tcp/127.0.0.1:1")
+        return command[command.index("--holds-of") + 1] if "--holds-of" in command else None
+
+    assert holds_of("a", "bob") is None
+    assert holds_of("a", "ann") == f"sim in {tmp_path / 'a'}"
+    assert holds_of("b", "ann") == f"sim in {tmp_path / 'b'}"
+
+
 CARS = {name: CarProcessSpec(name, f"/dev/{name}") for name in ("ann", "bob")}
 OLD = FleetSpec(cars=CARS | {"sim": CarProcessSpec("sim", SIMULATED, "arduino")})
 

@@ -18,12 +18,13 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux'
 
 KINDS = {}
 if sys.platform == "linux":
-    from tests.support.bluez import BATTERY, FFE0, NORDIC, SEPARATE, TWO_SERVICES, Module, free_address
+    from tests.support.bluez import BATTERY, FFE0, FFF0, NORDIC, SEPARATE, TWO_SERVICES, Module, free_address
 
     KINDS = {
         "FFE1": FFE0,
         "FFE1 and FFE2, written with response": SEPARATE,
         "FFE4, and FFE9 in another service": TWO_SERVICES,
+        "FFF1, and FFF2": FFF0,
         "Nordic": NORDIC,
         "behind another that notifies": BATTERY + FFE0,
     }
@@ -75,6 +76,15 @@ async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> N
     assert peer.module.pieces == [LED[:20], LED[20:]]
     peer.send(READING)
     assert await read(link, len(READING)) == READING
+    await link.close()
+
+
+async def test_a_clone_is_written_to_where_it_passes_bytes_on(peer: BlePeer) -> None:
+    """Ebyte's modules and their clones: FFF1 notifies, FFF2 is written, even if FFF1 takes bytes as well."""
+    peer.module.gatt = FFF0
+    link = await open_link(peer.url)
+    await link.write(LED)
+    assert peer.module.written_to == {FFF0[0][1][1][0]}
     await link.close()
 
 
@@ -174,7 +184,7 @@ async def test_a_module_whose_notifications_do_not_begin(peer: BlePeer) -> None:
 
 async def test_a_device_that_is_no_uart(peer: BlePeer) -> None:
     peer.module.gatt = BATTERY
-    assert f"no known UART service (FFE0, Nordic's). It has: {BATTERY[0][0]}" in await refused(peer)
+    assert f"no known UART service (FFE0, FFF0, Nordic's). It has: {BATTERY[0][0]}" in await refused(peer)
     assert not peer.module.connected
 
 

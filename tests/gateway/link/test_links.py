@@ -390,6 +390,34 @@ async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes
         await link.close()
 
 
+@pytest.mark.parametrize(
+    ("says", "shown"),
+    [
+        (b"Port already in use\r\n", "Port already in use"),
+        (b"  \x1b[2Jbusy\x00\r\ntry later\r\n", "\\x1b[2Jbusy\\x00\\r\\ntry later"),
+        ("bereits geöffnet\r\n".encode(), "bereits geöffnet"),
+        (b"x" * 5000, "x" * 120 + "..."),
+        (b"\r\n", ""),
+        (bytes.fromhex("0080E0F8FE") * 5, None),
+        (FRAME, None),
+    ],
+)
+async def test_what_a_bridge_says_before_it_closes_is_shown(says: bytes, shown: str | None) -> None:
+    """A bridge such as ser2net tells a second client why it closes. None: no sentence, so no client of another."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = TcpUrl("127.0.0.1", server.getsockname()[1])
+        link = await open_link(url)
+        peer, _ = server.accept()
+        for piece in (says[:7], says[7:]):
+            peer.sendall(piece)
+        assert await read(link, len(says)) == says
+        peer.close()
+        hint = "Perhaps another gateway or program is connected to it."
+        said = f', and said "{shown}". {hint}' if shown else ""
+        assert await lost(link) == f"{url} is gone: the car closed it{said}"
+        await link.close()
+
+
 async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
     """A delayed frame would go out in one segment with the next frame. A car obeys only the first of the two."""
     peer = TcpPeer()

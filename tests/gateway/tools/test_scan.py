@@ -272,11 +272,12 @@ def test_lasting_names_are_found_by_their_device(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's")
 def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    from tests.support.bluez import BATTERY, NORDIC, FakeBluez, Module, free_address
+    from tests.support.bluez import BATTERY, FFF0, NORDIC, FakeBluez, Module, free_address
 
     other = Module(free_address(), "Head\x1b[2Jset", BATTERY)
     car, nordic = Module(free_address(), "BT04"), Module(free_address(), "UART", NORDIC)
-    bluez = FakeBluez(other, car, nordic)
+    clone = Module(free_address(), "Ebyte", FFF0)
+    bluez = FakeBluez(other, car, nordic, clone)
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", bluez.address)
     try:
         shown = command("scan", "--for", "3")
@@ -293,8 +294,8 @@ def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.Monk
     assert f"{nordic.address}  UART, -50 dBm" in lines
     assert lines[-1] == "1 other Bluetooth device (--json lists them)"
     devices = [each for each in map(json.loads, told.stdout.splitlines()) if each["kind"] == "ble"]
-    assert [each["url"] for each in devices][2] == f"ble://{other.address}"
-    assert {each["uart"] for each in devices} == {"FFE0", "6e400001-b5a3-f393-e0a9-e50e24dcca9e", None}
+    assert [each["url"] for each in devices][3] == f"ble://{other.address}"
+    assert {each["uart"] for each in devices} == {"FFE0", "FFF0", "6e400001-b5a3-f393-e0a9-e50e24dcca9e", None}
 
 
 def test_without_bluetooth_the_ports_are_still_shown(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
