@@ -94,12 +94,10 @@ class Executor:
             return None
         if running is not None:
             stops.fail_late(running, now)
-            # A new command goes before the repeats of a stop, but never before its first frames.
-            write = self._next_command(now) if self.accepts_commands(now) else None
-            if write is not None:
-                return write
-            running = stops.running
-            return None if running is None else self._next_step(running, now)
+            # A new command goes before the repeats of a stop, but never before its first frames. While it waits for the
+            # car, no repeat may start: each would block the car again.
+            if not (self._has_new_command and self.accepts_commands(now)):
+                return self._next_step(running, now)
         return self._next_command(now)
 
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
@@ -141,6 +139,14 @@ class Executor:
             return None
         self.stops.give_way(now)
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+
+    @property
+    def _has_new_command(self) -> bool:
+        """Return True if a command waits that may go before the repeats of the running stop."""
+        held, change, one_shots = self.queue.held, self.queue.mode_change, self.queue.one_shots
+        waiting = [change, one_shots[0] if one_shots else None]
+        waiting += [held.pending] if held is not None and not held.pending.sent else []
+        return any(pending is not None and self._is_new(pending) for pending in waiting)
 
     def _is_new(self, pending: Pending) -> bool:
         """Return True if a command began after the running stop, or waits for that stop: only then it may go first."""
@@ -310,7 +316,8 @@ class Executor:
         times = self.queue.deadlines()
         running = self.stops.running
         if running is not None:
-            times.extend(self.stops.deadlines(running, now))
+            waits = self._has_new_command and self.accepts_commands(now)
+            times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
         times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))
 

@@ -5,7 +5,7 @@ It knows frames and times, no commands. `Executor` decides which frame is writte
 
 from typing import Final
 
-from gateway.control.estimate.learned import Learned
+from gateway.control.estimate.learned import Learned, blocking_kind
 from gateway.control.stops.sequences import NAMED_GAP_S, REPEAT_INTERVAL_S, Gate
 from gateway.protocol.enums import ServoAction
 from gateway.protocol.frames import ArmSet, Frame, General, Reset
@@ -52,8 +52,13 @@ class Pacing:
         self._written_at = now
         if not isinstance(frame, Reset):
             self._framed_at = now
-        self._block_s = self.profile.block_s(frame)
+        self._block_s = self._longest_block_s(frame)
         self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
+
+    def _longest_block_s(self, frame: Frame) -> float:
+        """Return the maximum block of a frame, as expected and as this car has shown."""
+        expected_s, kind = self.profile.block_s(frame), blocking_kind(frame)
+        return expected_s if kind is None else max(expected_s, self.learned.block_s(kind, expected_s))
 
     def _surely_blocks(self, frame: Frame) -> bool:
         """Return True if the block of this frame is certain on this platform. Other blocks are only possible.

@@ -359,7 +359,7 @@ class StopExecutor:
 
     def deadlines(self, running: StopInProgress, now: float) -> list[float]:
         """Return when the running stop needs attention."""
-        times = [pending.received_at + running.timeout_s for pending in running.commands]
+        times = self.timeouts(running)
         if self.model.evidence.settles_at is not None:
             times.append(self.model.evidence.settles_at)
         elif running.frames_sent:
@@ -368,6 +368,11 @@ class StopExecutor:
             times.append(running.obeyed_at)
         if not running.frames_sent:
             times.append(running.due_at(self.model.pacing))
+        return times
+
+    def timeouts(self, running: StopInProgress) -> list[float]:
+        """Return when the running stop, or a command that waits for it, fails."""
+        times = [pending.received_at + running.timeout_s for pending in running.commands]
         if not running.overdue:
             times.append(running.gives_up_at)
         if self.shutting_down:

@@ -1,10 +1,16 @@
 """Draws a car of the protocol: another rhythm, other blocks, another program. See docs/reference/protocol.md#programs."""
 
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from gateway.protocol.enums import Mode
+from gateway.control.commands import Action, Drive, OneShot, Phase, SetMode, Stop
+from gateway.control.estimate.mode import Verdict
+from gateway.protocol.enums import Light, Mode, Motion
+from gateway.protocol.frames import General, ModeOpen
 from gateway.sim.model.traits import CarTraits
+from tests.support.stops import WORLDS
+from tests.support.virtual import Pair
 
 USABLE_S = 15.0
 """Maximum time from the connect until a car takes commands."""
@@ -44,3 +50,175 @@ def draw_car(moments: random.Random, *, modes: bool) -> DrawnCar:
     if not readings:
         told = f"{told}+no_readings"
     return DrawnCar(platform, told, traits)
+
+
+# ---------------------------------------------------------------------- use of a car on a whole link
+
+WIRE_S = 0.3
+"""Maximum time from the moment at which control takes a command to its frame on the wire."""
+SHARP_S = 0.1
+"""Maximum error of the start and the stop of a drive on the wire."""
+FALSE_S = 0.3
+MODE_STAYS_S = 8.0
+LONGEST_FULL_STOP_S = 2.3 + 1.1 + 0.25
+"""Length of the longest full stop, the time until its last frame is read, and the wait for a report."""
+LONGEST_FIRST_FRAMES_S = 1.1 + 1.2 + 4.3
+"""Maximum time for which the first frames of a stop delay a command: their length, the block before and a turn."""
+
+
+@dataclass(slots=True)
+class Use:
+    """One car on a whole link, and what was wrong with its use."""
+
+    seed: int
+    violations: list[str]
+    car: DrawnCar
+    commands: list[str]
+
+
+class UseEpisode:
+    """Sends commands to a drawn car, one at a time, and judges by the car's own motors and mode."""
+
+    def __init__(self, seed: int) -> None:
+        self._moments = random.Random(f"use {seed}")
+        self.car = draw_car(self._moments, modes=self._moments.random() < 0.7)
+        world = self._moments.choices(["echo", "no-echo", "flickering"], [4, 1, 1])[0]
+        self._has_echo = world == "echo"
+        self.pair = Pair(
+            self.car.platform,
+            seed=seed,
+            world=WORLDS[world](),
+            told=self.car.told,
+            start_s=2.0,
+            traits=self.car.traits if self.car.platform == "arduino" else None,
+        )
+        self.use = Use(seed, [], self.car, [])
+        self._false_since: float | None = None
+
+    def play(self) -> Use:
+        """Connect, and send some commands at random moments."""
+        pair, moments = self.pair, self._moments
+        pair.connect()
+        began = pair.now
+        while not pair.control.is_free(pair.now) and pair.now < began + USABLE_S:
+            self._run(0.1)
+        if not pair.control.is_free(pair.now):
+            self._violate(f"(5) takes no command {USABLE_S:g} s after the connect")
+        for _ in range(5):
+            self._run(moments.choice([0.0, moments.uniform(0.0, 1.5), moments.uniform(0.0, 9.0)]))
+            moments.choice(self._acts)()
+        return self.use
+
+    @property
+    def _acts(self) -> list[Callable[[], None]]:
+        acts = [self._drive, self._drive, self._stop, self._light]
+        return [*acts, self._mode, self._mode] if "mode" in self.pair.control.model.profile.capabilities else acts
+
+    def _ask(self, what: Action, extra_s: float = 0.0) -> float | None:
+        """Send a command. Return when its first frame was written, None if it was refused."""
+        pair, control = self.pair, self.pair.control
+        asked_at, count = pair.now, len(pair.records)
+        free_at = max(asked_at, control.stops.free_at(asked_at))
+        if free_at - asked_at > LONGEST_FIRST_FRAMES_S + pair.control.model.profile.block_s(ModeOpen(Mode.FOLLOWING)):
+            self._violate(f"(5) {what} would wait for {free_at - asked_at:.1f} s")
+        self.use.commands.append(f"{asked_at:.2f} {what}")
+        answer = pair.ask(what)
+        if answer.status is Phase.REJECTED:
+            if not isinstance(what, Drive) or asked_at + what.duration_s > free_at:
+                self._violate(f"(5) {what} was refused: {answer.words}")
+            return None
+        bound = free_at + extra_s + WIRE_S
+        is_sent = lambda: any(  # noqa: E731 - the condition of one loop
+            record.phase is Phase.SENT and record.command.what is what for record in pair.records[count:]
+        )
+        while not is_sent() and pair.now < bound:
+            self._run(0.01)
+        if not is_sent():
+            self._violate(f"(5) {what} is not on the wire after {bound - asked_at:.2f} s")
+            return None
+        return pair.sent[-1][0]
+
+    def _drive(self) -> None:
+        pair, duration_s = self.pair, self._moments.uniform(0.5, 3.0)
+        asked_at = pair.now
+        began = self._ask(Drive(self._moments.choice([Motion.FORWARD, Motion.SPIN_LEFT]), duration_s))
+        if began is None:
+            return
+        self._run(asked_at + duration_s + SHARP_S - pair.now)
+        stops = [at for at, data in pair.sent if at > began and data == b"$0,0,0,0,0,0,0,0,0#"]
+        if not stops or abs(min(stops) - asked_at - duration_s) > SHARP_S:
+            self._violate(f"(6) the stop of a drive of {duration_s:.2f} s that began {began - asked_at:.2f} s late: {stops}")
+        self._run(2.5)
+        true_s = _driven_s(pair, began)
+        sent_s = asked_at + duration_s - began
+        if abs(true_s - sent_s) > self._block_s + SHARP_S:
+            self._violate(f"(6) a drive of {sent_s:.2f} s lasted {true_s:.2f} s")
+
+    @property
+    def _block_s(self) -> float:
+        """Return the longest block of this car that a drive can meet.
+
+        A ranging without an echo also makes the car read a stop together with the repeated motion before it, and lose it.
+        """
+        return max(0.1, self.car.traits.close_s - 1.0) if self._has_echo else 1.05 + 1.1
+
+    def _mode(self) -> None:
+        pair = self.pair
+        mode = self._moments.choice([Mode.TRACKING, Mode.COLOR_LED, Mode.LIGHT_SEEKING, Mode.REMOTE_CONTROL])
+        if self._ask(SetMode(mode), LONGEST_FULL_STOP_S) is None:
+            return
+        self._run(2.2 + MODE_STAYS_S * self._moments.random())
+        if pair.car.truth.mode is not mode:
+            self._violate(f"(5) mode {mode} was opened, {pair.car.truth.mode} is true")
+        if pair.control.model.mode.verdict is Verdict.CONTRADICTED:
+            self._violate(f"(3) mode {mode} is contradicted: {pair.control.model.mode.evidence}")
+        self._stop()
+
+    def _light(self) -> None:
+        self._ask(OneShot(General(Motion.STOP, light=Light.RED)))
+
+    def _stop(self) -> None:
+        pair = self.pair
+        answer = pair.ask(Stop(), verb="stop")
+        self.use.commands.append(f"{pair.now:.2f} stop")
+        self._run(answer.worst_case_s + SHARP_S)
+        is_right = self.car.platform == self.car.told.partition("+")[0]  # a wrong platform has wrong worst cases
+        if is_right and (pair.car.truth.driving or pair.car.truth.mode is not Mode.MANUAL):
+            self._violate(f"(2) drives {answer.worst_case_s + SHARP_S:.2f} s after a stop")
+
+    def _run(self, seconds: float) -> None:
+        """Let time pass, and judge the claims."""
+        pair = self.pair
+        end = pair.now + seconds
+        while pair.now < end - 1e-9:
+            pair.run(min(0.05, end - pair.now))
+            model = pair.control.model
+            false = pair.car.truth.driving and model.motors == "off" and model.basis == "shown"
+            self._false_since = (self._false_since or pair.now) if false else None
+            if self._false_since is not None and pair.now - self._false_since > FALSE_S:
+                self._violate("(1) off, shown, while the motors run")
+
+    def _violate(self, words: str) -> None:
+        self.use.violations.append(f"{self.pair.now:.2f} {words}")
+
+
+def _driven_s(pair: Pair, since: float) -> float:
+    """Return for how long the motors were on, s."""
+    total, on_at = 0.0, None
+    for at, left, right in pair.car.motor_log:
+        if at < since - 0.001:
+            continue
+        if (left or right) and on_at is None:
+            on_at = at
+        elif not (left or right) and on_at is not None:
+            total, on_at = total + at - on_at, None
+    return total if on_at is None else total + pair.now - on_at
+
+
+def play(seed: int) -> Use:
+    """Play the use of the car of a seed."""
+    try:
+        return UseEpisode(seed).play()
+    except Exception as error:
+        error.add_note(f"seed {seed}: {draw_car(random.Random(f'use {seed}'), modes=False)}")
+        raise

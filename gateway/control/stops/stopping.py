@@ -6,7 +6,7 @@ from typing import Final
 from gateway.control.command_log import Pending
 from gateway.control.estimate.learned import Blocking, Learned
 from gateway.control.events import FrameOrigin
-from gateway.control.pacing import Pacing
+from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import sequences
 from gateway.control.stops.evidence import StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
@@ -209,7 +209,7 @@ class StopInProgress:
         if self.sent_all:
             return max(self.gives_way_at, now)
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
-        return max(began + self.sequence.length_s, self.worst_at, now)
+        return max(began + self.sequence.length_s + FLIGHT_S, self.worst_at, now)
 
     def on_step_written(self, now: float) -> bool:
         """Go to the next step. Return True if the written frame was the first of the stop."""
