@@ -15,7 +15,7 @@ from gateway.control.pacing import FLIGHT_S
 from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
-from gateway.control.stops.sequences import StopSequence
+from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
@@ -25,8 +25,6 @@ SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
 DOUBTED_PROBES: Final = 2
 """Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
-RESETTING_STEPS: Final = 1
-"""Index of recovery's first `MODE00`. The frames up to it are written before a probe may replace the rest."""
 
 
 _PROBED: Final = {
@@ -305,7 +303,9 @@ class StopExecutor:
             running.reported_s = stopping.reported_s(self.model.profile, self.model.learned, slowest=True)
         if self.running is running and running.frames_sent:
             self._await(running, now)
-        if self.running is running and finding in _PROBED and self._may_probe(running):
+        # A probe counts only on a car that is awake, so directly after a report. If it must wait, let it wait for one.
+        is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
+        if self.running is running and finding in _PROBED and is_ready and self._may_probe(running):
             running.probes += 1
             running.begin_try(_PROBED[finding], now)
 
@@ -321,10 +321,8 @@ class StopExecutor:
         """Return True if the car could react to a `MODE00` now, and show it."""
         if running.case is StopCase.WRONG_PLATFORM:
             return running.frames_sent and running.probes < DOUBTED_PROBES
-        if running.case is not StopCase.MANUAL or not self.model.can_show:
-            return False
-        # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
-        return not running.sequence.is_recovery or running.index > RESETTING_STEPS
+        # The first frames of a stop always go out, unless the car is in mode 0 and reads.
+        return running.case is StopCase.MANUAL and self.model.can_show and running.sent_all
 
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""

@@ -158,9 +158,10 @@ class UseEpisode:
     def _block_s(self) -> float:
         """Return the longest block of this car that a drive can meet.
 
-        A ranging without an echo also makes the car read a stop together with the repeated motion before it, and lose it.
+        Until the gateway has learned it, a longer block than the expected one loses the first frame of a drive, which is
+        repeated after 1.1 s. A ranging without an echo also makes the car read a stop together with the repeated motion before it, and lose it.
         """
-        return max(0.1, self.car.traits.close_s - 1.0) if self._has_echo else 1.05 + 1.1
+        return max(0.1, 4 * (self.car.traits.close_s - 1.0)) if self._has_echo else 1.05 + 1.1
 
     def _mode(self) -> None:
         pair = self.pair
