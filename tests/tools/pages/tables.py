@@ -191,7 +191,7 @@ def report_table() -> str:
     """Return the table of a car's reports in each mode."""
     rows = ["| mode | number | what the car reports |", "|---|---|---|"]
     for mode in Mode:
-        measured = sorted(MODES[mode].measures)
+        measured = sorted(parse_platform("arduino").measurable(mode))
         told = ", ".join(f"`sensor/{each}`" for each in measured) or "nothing"
         rows.append(f"| `{mode}` | {MODES[mode].digit} | {told} |")
     return "\n".join(rows)
