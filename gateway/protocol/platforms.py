@@ -266,7 +266,7 @@ class Profile:
 
     def measurable(self, mode: Mode) -> frozenset[str]:
         """Return everything that a car of this kind can measure in this mode, without constants of the platform."""
-        if not self.has_readings or mode not in self.modes or mode in self.silent_modes:
+        if mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
             return MODES[mode].measures

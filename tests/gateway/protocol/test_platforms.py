@@ -245,6 +245,7 @@ def test_a_frame_is_spelled_as_the_car_reads_it(platform: str, frame: Frame, dat
 def test_a_frame_of_another_head_is_none() -> None:
     assert parse_platform("arduino+head=BALA").parse_sent(b"$4WD,MODE00#") is None
     assert parse_platform("arduino").parse_sent(b"$BALA,MODE00#") is None
+    assert parse_platform("arduino").parse_sent(b"$3WD,MODE00#") is None
     assert parse_platform("arduino").dialect == Dialect()
 
 

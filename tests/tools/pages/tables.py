@@ -208,6 +208,7 @@ def platform_table() -> str:
     ]
     for title, names in (
         ("modes", lambda each: each.modes),
+        ("silent modes", lambda each: each.silent_modes),
         ("lights", lambda each: each.lights),
         ("servo actions", lambda each: each.servos),
         ("constant readings", lambda each: [name for name, _ in each.constants]),
