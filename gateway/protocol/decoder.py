@@ -84,7 +84,7 @@ class Decoder:
                 raw = found[0]
                 events.append(Echo(raw, now) if raw in sent and self._is_echo(raw, now) else read_sensors(found, now))
                 pos = found.end()
-                self._late_end = False
+                self._late_end = self._is_mid_line = False
             elif buffer and buffer[0] == _START:
                 pos = self._inside(data, pos, now, events)
             else:

@@ -17,7 +17,8 @@ class ModeRow:
     """The facts of docs/reference/protocol.md#modes about one mode.
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
-    longest block of one turn of the mode's own loop. `rate_hz` is the maximum of sensors frames per second.
+    longest block of one turn of the mode's own loop. `rate_hz` is the maximum of sensors frames per second. `measures`:
+    what a frame of this mode measures, also if only other programs than the vendor's print it.
     """
 
     digit: int
@@ -32,7 +33,7 @@ class ModeRow:
 
     @property
     def is_silent(self) -> bool:
-        """True if the car sends no readings in this mode."""
+        """True if the vendor's program sends no readings in this mode."""
         return self.rate_hz == 0.0
 
 
@@ -49,6 +50,9 @@ def _signature(filler: Mapping[str, bytes]) -> re.Pattern[bytes]:
 _TRACKING: Final = {"range": b"0", "battery": b"8", "grayscale": b"0", "obstacle": b"00", "light": b"00"}
 _SEEKING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "obstacle": b"00"}
 _FOLLOWING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "light": b"00"}
+# The vendor's avoidance is silent, but some programs print a range with filler in it
+# (docs/reference/protocol.md#programs-that-people-have). With CSB120 this text is that of light seeking.
+_AVOIDING: Final = re.compile(rb"\$[0-9A-Za-z]+,CSB(?!120,)[0-9]+,PV8\.3,GS000,LF0000,HW00,GM00#?")
 
 # turn_s, rate_hz: docs/reference/protocol.md#blocking-times and docs/reference/protocol.md#rates
 MODES: Final[Mapping[Mode, ModeRow]] = {
@@ -58,7 +62,7 @@ MODES: Final[Mapping[Mode, ModeRow]] = {
     Mode.REMOTE_CONTROL: ModeRow(1, _open_s(1), 0.1),
     Mode.TRACKING: ModeRow(2, _open_s(2), 0.1, 27.0, frozenset({"line"}), _signature(_TRACKING)),
     # near an obstacle 4.3 s; with no echo at all for ever, with the motors braked
-    Mode.OBSTACLE_AVOIDANCE: ModeRow(3, _open_s(3), 4.3),
+    Mode.OBSTACLE_AVOIDANCE: ModeRow(3, _open_s(3), 4.3, measures=frozenset({"range"}), signature=_AVOIDING),
     Mode.COLOR_LED: ModeRow(4, _open_s(4), 0.75),
     Mode.LIGHT_SEEKING: ModeRow(5, _open_s(5), 0.1, 23.0, frozenset({"light"}), _signature(_SEEKING)),
     Mode.FOLLOWING: ModeRow(6, _open_s(6), 0.1, 24.0, frozenset({"obstacle"}), _signature(_FOLLOWING), has_end=False),

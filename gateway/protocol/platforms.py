@@ -98,10 +98,14 @@ _GRAY_10_BIT, _GRAY_12_BIT = 1023, 4095
 
 
 @cache
-def _common_measurements(candidates: tuple[Mode, ...]) -> frozenset[str]:
-    """Return the measurements that all these modes have in common. A silent mode excludes none."""
-    common = EVERY_MEASUREMENT.intersection(*(MODES[mode].measures for mode in candidates if mode not in SILENT_MODES))
-    if len(candidates) > 1 and Mode.FOLLOWING in candidates:
+def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> frozenset[str]:
+    """Return the measurements that all these modes have in common. A silent mode excludes none.
+
+    `shown`: the modes whose text the frame has. In one of them, a program prints that is silent elsewhere.
+    """
+    counted = (mode for mode in modes if mode not in SILENT_MODES or mode in shown)
+    common = EVERY_MEASUREMENT.intersection(*(MODES[mode].measures for mode in counted))
+    if len(modes) > 1 and Mode.FOLLOWING in modes:
         return common - {"obstacle"}  # following inverts it
     return common
 
@@ -274,7 +278,7 @@ class Profile:
         `mode` is the confirmed mode, or None (see `resolved`). A rejected field is not measured; a range without echo
         is.
         """
-        common = _common_measurements(self.resolved(event, mode))
+        common = _common_measurements(self.resolved(event, mode), candidate_modes(event))
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
         if self.constants and self._may_be_constant(event):
             names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
@@ -299,7 +303,7 @@ class Profile:
 
     def measurable(self, mode: Mode) -> frozenset[str]:
         """Return everything that a car of this kind can measure in this mode, without constants of the platform."""
-        if not self.has_readings or mode not in self.modes or mode in self.silent_modes:
+        if mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
             return MODES[mode].measures
@@ -321,7 +325,7 @@ class Profile:
         found: list[str] = []
         if self.modes.isdisjoint(candidates):
             found.append(f"a reading of mode {' or '.join(candidates)}, which {self._these} do not have")
-        elif self.silent_modes.issuperset(candidates):
+        elif (self.silent_modes - SILENT_MODES).issuperset(candidates):
             found.append(f"a reading of mode {' or '.join(candidates)}, in which {self._these} send none")
         if candidates != (Mode.MANUAL,):
             return tuple(found)

@@ -49,3 +49,37 @@ async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Pat
             await asyncio.gather(serving, return_exceptions=True)
             car.close()
             fleet.close()
+
+
+async def test_a_line_of_text_is_no_reading_and_no_damage(tmp_path: Path) -> None:
+    fleet, car = FleetProcesses(free_endpoint(), tmp_path), TcpCar()
+    verdicts: list[str] = []
+    links: list[Any] = []
+
+    def listen(sample: bus.Sample) -> None:
+        frame: Any = sample.message()
+        verdicts.append(frame.verdict)
+
+    fleet.bus.subscribe("fleet/red/frame/rx", listen)
+    fleet.bus.subscribe("fleet/red/state/link", lambda sample: links.append(sample.message()))
+    with bus.Bus.open(fleet.endpoint) as opened:
+        settings = Settings(
+            "red", parse_url(car.link), parse_platform("arduino+text"), auto=False, fleet="fleet", state_dir=tmp_path,
+            retry=True,
+        )  # fmt: skip
+        serving = asyncio.ensure_future(CarGateway(settings, opened, CarService(opened, "fleet", "red")).run())
+        try:
+            await asyncio.to_thread(wait_for, lambda: car.received.count(MODE00) >= 1, "it has connected")
+            for count in range(1, 4):
+                car.send(b"EXEC:F\r\n")
+                await asyncio.to_thread(wait_for, lambda count=count: len(verdicts) >= count, "the line has come")
+            links.clear()
+            await asyncio.to_thread(wait_for, lambda: links, "the state of the link")
+            assert verdicts == ["text"] * 3
+            assert dict(links[-1].rejects) == {}
+            assert links[-1].state != "online"
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            car.close()
+            fleet.close()

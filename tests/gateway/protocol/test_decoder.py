@@ -317,6 +317,16 @@ def test_the_rest_of_a_line_is_no_line() -> None:
     assert kinds(decoder.feed(b"EXEC:F\r\n", 5.0) + decoder.end()) == [("text", b"EXEC:F\r\n")]
 
 
+@pytest.mark.parametrize("size", [1, 7, 100])
+def test_a_line_after_a_frame_is_whole_whatever_came_before_the_frame(size: int) -> None:
+    decoder = Decoder()
+    decoder.feed(b"\xff\xfe", 1.0)
+    rest, events = GOOD + b"EXEC:F\r\n", []
+    for start in range(0, len(rest), size):
+        events += decoder.feed(rest[start : start + size], 2.0)
+    assert kinds(events + decoder.end()) == [("no_start", b"\xff\xfe"), ("sensors", GOOD), ("text", b"EXEC:F\r\n")]
+
+
 def test_the_rest_of_a_frame_is_no_line() -> None:
     decoder = Decoder()
     decoder.feed(b"$4WD,CSB1", 1.0)

@@ -91,6 +91,10 @@ def test_a_confirmed_mode_chooses_among_candidates_and_decides_nothing_else() ->
     assert profile.measured(either, Mode.LIGHT_SEEKING) == {"light"}
     assert profile.obstacle(either, Mode.LIGHT_SEEKING) is None
     assert profile.measured(either, Mode.MANUAL) == set()
+    avoiding = sensors(b"$4WD,CSB37,PV8.3,GS000,LF0000,HW00,GM00#", "#")
+    assert profile.measured(avoiding, Mode.MANUAL) == {"range"}, "its filler is not of mode 0"
+    report = sensors(b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#", "#")
+    assert profile.measured(report, Mode.OBSTACLE_AVOIDANCE) == EVERY_MEASUREMENT
     tracking = sensors(b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#", "#")
     assert profile.measured(tracking, Mode.MANUAL) == {"line"}, "the frame's text is the evidence"
 
@@ -241,6 +245,7 @@ def test_a_frame_is_spelled_as_the_car_reads_it(platform: str, frame: Frame, dat
 def test_a_frame_of_another_head_is_none() -> None:
     assert parse_platform("arduino+head=BALA").parse_sent(b"$4WD,MODE00#") is None
     assert parse_platform("arduino").parse_sent(b"$BALA,MODE00#") is None
+    assert parse_platform("arduino").parse_sent(b"$3WD,MODE00#") is None
     assert parse_platform("arduino").dialect == Dialect()
 
 

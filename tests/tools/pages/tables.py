@@ -191,7 +191,7 @@ def report_table() -> str:
     """Return the table of a car's reports in each mode."""
     rows = ["| mode | number | what the car reports |", "|---|---|---|"]
     for mode in Mode:
-        measured = sorted(MODES[mode].measures)
+        measured = sorted(parse_platform("arduino").measurable(mode))
         told = ", ".join(f"`sensor/{each}`" for each in measured) or "nothing"
         rows.append(f"| `{mode}` | {MODES[mode].digit} | {told} |")
     return "\n".join(rows)
@@ -208,6 +208,7 @@ def platform_table() -> str:
     ]
     for title, names in (
         ("modes", lambda each: each.modes),
+        ("silent modes", lambda each: each.silent_modes),
         ("lights", lambda each: each.lights),
         ("servo actions", lambda each: each.servos),
         ("constant readings", lambda each: [name for name, _ in each.constants]),
