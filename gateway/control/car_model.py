@@ -4,6 +4,7 @@
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from gateway.control.command_log import CommandLog
 from gateway.control.estimate.battery import Battery, BatteryPolicy
@@ -21,6 +22,8 @@ from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
 
+MOVED_CM: Final = 5.0
+"""Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
 """States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
 
@@ -47,6 +50,9 @@ class CarModel:
     left_at: float = float("-inf")
     left_until: float = float("-inf")
     """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""
+    range_cm: float | None = None
+    """The last distance that was measured, and when."""
+    range_at: float = float("-inf")
     cut_write: bool = False
     """True if a write has failed since the last recovery: the car may keep a string that only a color frame clears."""
     link_open: bool = False
@@ -137,6 +143,14 @@ class CarModel:
     def motion(self) -> Motion | None:
         """Return the last motion sent; None if the state is unknown or the car drives by itself."""
         return self.believed.motion if self.known and self.manual else None
+
+    def moved_since(self, range_cm: float | None, since: float) -> str:
+        """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
+        if range_cm is None or self.range_cm is None or self.range_at < since + FLIGHT_S:
+            return ""
+        if abs(self.range_cm - range_cm) < MOVED_CM:
+            return ""
+        return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
 
     def for_stop(self, now: float) -> stopping.StopContext:
         """Return the context for the choice of a stop."""

@@ -88,6 +88,7 @@ class CarMonitor:
             model.left_until = float("-inf")
         if event.range_cm is not None:
             model.pacing.on_report(event.at)
+            model.range_cm, model.range_at = event.range_cm or None, event.at
         if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
             self._update_battery(event.voltage_v, now)
         if now > model.believed.fan_at + FAN_SETTLED_S and model.profile.fan_silences:

@@ -27,6 +27,8 @@ class HeldMotion:
     expires_at: float
     began_at: float | None = None
     """When its frame was written; None if it waits."""
+    range_cm: float | None = None
+    """The distance before it was written, if one is known."""
 
     @property
     def sender(self) -> Sender:
@@ -72,7 +74,16 @@ class CommandQueue:
         while self.one_shots:
             self.log.record(self.one_shots.popleft(), phase, now, reason=reason, words=words)
 
-    def close_held(self, phase: Phase, reason: Reason | None, words: str, now: float, basis: str = "") -> None:
+    def close_held(
+        self,
+        phase: Phase,
+        reason: Reason | None,
+        words: str,
+        now: float,
+        *,
+        basis: str = "",
+        evidence: tuple[str, ...] = (),
+    ) -> None:
         """End the held motion. Release the lease too if its holder has disconnected."""
         held, self.held = self.held, None
         if held is None:
@@ -81,7 +92,7 @@ class CommandQueue:
             self.safety.release(held.sender)
         if phase is not Phase.SUPERSEDED:
             self.safety.shorten_lease(now)
-        self.log.record(held.pending, phase, now, reason=reason, words=words, basis=basis)
+        self.log.record(held.pending, phase, now, reason=reason, words=words, basis=basis, evidence=evidence)
 
     def close_mode_change(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
         """End the pending mode without opening it."""

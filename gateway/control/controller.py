@@ -518,7 +518,7 @@ class Controller:
 
     def _release(self, pending: Pending, now: float) -> Answer:
         sender = pending.command.sender.name
-        self._queue.close_held(Phase.COMPLETE, None, f"released by {sender}", now)
+        self._executor.end_drive(f"released by {sender}", now)
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
         if self.stops.running is None and self.model.at_rest:
             return self._done(pending, f"{self.car} is at rest", now)

@@ -198,7 +198,7 @@ class Executor:
             case StopInProgress():
                 self._step_written(source, now)
             case HeldMotion():
-                source.began_at = now
+                source.began_at, source.range_cm = now, model.range_cm
                 self._log.record_sent(source.pending, now)
             case Pending() if source is self.queue.mode_change:
                 self.queue.mode_change = None
@@ -280,12 +280,26 @@ class Executor:
         self.safety.shorten_lease(now)
         self.senders.halt(now, by)
 
+    def end_drive(self, words: str, now: float) -> None:
+        """End a held motion that went as requested: as shown if a reading shows that the car moved, else as sent."""
+        held, model = self.queue.held, self.model
+        if held is None or held.began_at is None:
+            self.queue.close_held(Phase.COMPLETE, None, words, now)
+            return
+        sent = f"sent for {now - held.began_at:.1f} s"
+        moved = model.moved_since(held.range_cm, held.began_at)
+        if moved:
+            words = "; ".join(filter(None, (words, sent, moved)))
+            self.queue.close_held(Phase.COMPLETE, None, words, now, basis=Basis.SHOWN, evidence=(moved,))
+            return
+        doubt = f"{model.name} may not have moved: it has not reacted to the last stop" if model.is_deaf else ""
+        words = "; ".join(filter(None, (words, sent, doubt)))
+        self.queue.close_held(Phase.SENT, None, words, now, basis=Basis.SENT)
+
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         """End the held motion with a soft stop, unless the car is at rest."""
-        if phase is Phase.COMPLETE and self.model.is_deaf:
-            doubt = f"{self.model.name} may not have moved: it has not reacted to the last stop"
-            words = f"{words}; {doubt}" if words else doubt
-            self.queue.close_held(Phase.SENT, reason, words, now, Basis.SENT)
+        if phase is Phase.COMPLETE:
+            self.end_drive(words, now)
         else:
             self.queue.close_held(phase, reason, words, now)
         if self.model.link_open and self.stops.running is None and not self.model.at_rest:
