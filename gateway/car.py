@@ -30,9 +30,11 @@ from gateway.control.events import Level
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
+from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
+from gateway.protocol.platform_name import AUTO
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
@@ -53,6 +55,8 @@ RIVAL_SHUTDOWN_S: Final = SHUTDOWN_S + 2.0
 """Maximum time that the remaining gateway waits for the port. The other one must notice the conflict, stop the car and
 close the port."""
 HEALTH_INTERVAL_S: Final = 1.0
+LEARNED_INTERVAL_S: Final = 10.0
+"""Minimum interval at which what was learned of the car is kept."""
 SLICE_BYTES: Final = 1024
 """Maximum bytes that are decoded before other tasks run, a stop above all. A car sends 960 a second."""
 ANSWER_PAUSE_S: Final = 0.005
@@ -104,11 +108,16 @@ class CarGateway:
         now = self._loop.time()
         holds_of = settings.holds_of or car_link(settings.url)
         state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car, holds_of)
+        platform = AUTO if settings.auto else settings.profile.name
+        self._learned_file = LearnedFile(
+            settings.state_dir, settings.fleet, settings.car, link=car_link(settings.url), platform=platform
+        )
         self._control = Controller(
             settings.car,
             settings.profile,
             auto=settings.auto,
             persisted=state_file.load(now_ns := time.time_ns()),
+            learned=self._learned_file.load(),
             battery_policy=settings.battery,
             speed_max=settings.speed_max,
             people=settings.people,
@@ -148,6 +157,7 @@ class CarGateway:
         self._ending = False
         self._stopped = asyncio.Event()
         self._began_at = self._alive_at = now
+        self._learned_due_at = now
 
     async def run(self) -> bool:
         """Serve the car until `stop`, then until the car has stopped. Return False if it could not be stopped.
@@ -161,6 +171,8 @@ class CarGateway:
             self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
         if self._not_taken:
             self._commands.log(Level.WARNING, "other_link", self._not_taken)
+        if self._learned_file.trouble:
+            self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
         self._service.attach(
             self._loop,
             values=self._values_due,
@@ -201,6 +213,7 @@ class CarGateway:
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
             if self._link is not None:
                 await self._link.close()
+            self._save_learned(self._loop.time(), at_once=True)
             self._flush()
             self._publisher.on_bus_connected(self._loop.time(), at_once=True)
             self._publisher.publish_states(self._control, self._health, self._loop.time(), force=True)
@@ -478,6 +491,7 @@ class CarGateway:
             if changed or self._shown_state != before or now >= next_health:
                 self._publisher.publish_states(self._control, self._health, now)
             if now >= next_health:
+                self._save_learned(now)
                 next_health = now + HEALTH_INTERVAL_S
                 self._publish_health(now, worst)
                 worst = 0.0
@@ -489,9 +503,19 @@ class CarGateway:
             self._publisher.on_bus_lost(now)
         self._control.on_stall(gap_s, now)
 
+    def _save_learned(self, now: float, *, at_once: bool = False) -> None:
+        """Keep what was learned of the car for the next gateway."""
+        if not at_once and now < self._learned_due_at:
+            return
+        self._learned_due_at = now + LEARNED_INTERVAL_S
+        try:
+            self._learned_file.save(self._control.model.learned)
+        except OSError as error:
+            log.debug("what was learned of %s is not kept: %s", self._settings.car, error)
+
     def _publish_health(self, now: float, lag_s: float) -> None:
         drops = self._service.dropped + self._publisher.dropped
-        self._publisher.publish_health(now, loop_lag_s=lag_s, bus_drops=drops, platform=self._control.model.platform)
+        self._publisher.publish_health(now, loop_lag_s=lag_s, bus_drops=drops, model=self._control.model)
 
     async def _keep_hub(self) -> None:
         """Restart a lost hub. Jitter keeps a hundred gateways from trying at once."""

@@ -14,11 +14,11 @@ import zenoh
 from gateway.bus.history import BadRange, HistoryBuffer
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
+from gateway.control.car_model import CarModel
 from gateway.control.commands import Phase
 from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
-from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.events import CommandRecord, Level, LogRecord, OutgoingFrame
 from gateway.control.people import PersonRole
 from gateway.control.rate_limit import TokenBucket
@@ -102,7 +102,9 @@ class CarPublisher:
                     setattr(message, field, value)
             if name == "sensor/battery":
                 voltage_v = message.voltage_v
-                message.charge, message.charge_error = battery.charge(voltage_v, loaded=loaded)
+                message.charge, message.charge_error = battery.charge(
+                    voltage_v, loaded=loaded, cells=self.profile.cells
+                )
                 message.level = self._battery.level or battery.BatteryLevel.OK
             self._put_reading(name, message, stamp_ns, published)
         if not self._raw.take(1, event.at):
@@ -200,6 +202,7 @@ class CarPublisher:
                 control.model.motors,
                 control.model.basis,
                 control.model.trust.state,
+                control.is_free(now),
             ),
         }
         for name, state in changes.items():
@@ -223,7 +226,7 @@ class CarPublisher:
                 _fill_safety(message, control, now)
         self._put_state(name, message, now)
 
-    def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform: PlatformDetector) -> None:
+    def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int, model: CarModel) -> None:
         """Publish the health of the process, and the profile in force."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
@@ -231,11 +234,12 @@ class CarPublisher:
         message.link = self._url
         message.version = VERSION
         message.platform = self.profile.name
-        message.platform_evidence.extend(platform.evidence)
-        message.platform_contradictions.extend(platform.contradictions)
+        message.platform_evidence.extend(model.platform.evidence)
+        message.platform_contradictions.extend(model.platform.contradictions)
         message.capabilities.extend(sorted(self.profile.capabilities))
         message.loop_lag_s = loop_lag_s
         message.bus_drops = bus_drops
+        _fill_learned(message, model)
         self._put_state("state/health", message, now)
 
     def _put_state(self, name: str, message: Any, now: float) -> None:
@@ -277,6 +281,19 @@ class CarPublisher:
                 bus.reply_value(query, publisher.key, value.payload, publisher.topic, express=alone)
                 if count % ANSWERS_PER_SLICE == 0:
                     yield
+
+
+def _fill_learned(message: pb.Health, model: CarModel) -> None:
+    learned = model.learned
+    message.shows_stops, message.shows_stops_words = model.shows_stops
+    message.doubted = learned.doubted
+    if learned.echo.is_known:
+        message.interval_s, message.interval_spread_s = learned.echo.median_s, learned.echo.spread_s
+    if learned.no_echo.is_known:
+        message.interval_no_echo_s = learned.no_echo.median_s
+    message.blocks_s.update({str(kind): block_s for kind, block_s in learned.blocks.items()})
+    message.reporting_modes.extend(sorted(learned.reporting))
+    message.out_of_range.extend(sorted(learned.always_rejected))
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:
@@ -356,6 +373,7 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     if trust.shown_at is not None:
         message.shown_age_s = max(0.0, now - trust.shown_at)
     message.worst_stop_s = control.stops.worst_s(now)
+    message.waits_for = control.waits_for(now)
 
 
 def _set_stamp(stamp: Any, at_ns: int) -> None:

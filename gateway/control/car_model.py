@@ -16,9 +16,10 @@ from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustSta
 from gateway.control.events import Level
 from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import stopping
-from gateway.control.stops.evidence import StopCase, StopEvidence
+from gateway.control.stops.evidence import EVIDENCE, StopCase, StopEvidence
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
 
@@ -62,7 +63,7 @@ class CarModel:
         self.platform = PlatformDetector(self.profile, auto=self.auto)
         self.mode = ModeEstimator(self.profile, self.learned)
         self.evidence = StopEvidence(self.profile, self.learned)
-        self.battery = Battery(self.battery_policy)
+        self.battery = Battery(self.battery_policy.of_cells(self.profile.cells), self.profile.cells)
         self.pacing = Pacing(self.profile, self.learned)
         self.believed = StateEstimate(self.profile)
 
@@ -151,6 +152,22 @@ class CarModel:
         if abs(self.range_cm - range_cm) < MOVED_CM:
             return ""
         return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
+
+    @property
+    def shows_stops(self) -> tuple[Shows, str]:
+        """Return whether the reports of this car show that a stop arrived, and why, in words."""
+        if not self.profile.has_readings:
+            return Shows.NO, EVIDENCE[StopCase.NO_READINGS].words.format(car=self.name)
+        if self.stop_style is StopStyle.GENERAL:
+            case = StopCase.RASPBERRY_PI if self.profile.kind is Platform.RASPBERRY_PI else StopCase.UNKNOWN_PLATFORM
+            return Shows.NO, EVIDENCE[case].words.format(car=self.name)
+        if self.learned.doubted:
+            return Shows.YES, f"{self.name} has shown its stops before, and did not show the last one"
+        if self.learned.shows is Shows.YES:
+            return Shows.YES, f"the reports of {self.name} show that a stop arrived"
+        if not self.can_show:
+            return Shows.NO, EVIDENCE[StopCase.NO_REACTION].words.format(car=self.name)
+        return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
 
     def for_stop(self, now: float) -> stopping.StopContext:
         """Return the context for the choice of a stop."""

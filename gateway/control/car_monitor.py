@@ -84,6 +84,7 @@ class CarMonitor:
     def _on_report(self, event: Sensors, now: float) -> None:
         """Update the model with a report of mode 0."""
         model = self.model
+        model.learned.on_fields(event)
         if event.at > model.left_at + FLIGHT_S:
             model.left_until = float("-inf")
         if event.range_cm is not None:

@@ -35,6 +35,7 @@ from gateway.control.commands import (
     Unpause,
 )
 from gateway.control.estimate.battery import BatteryPolicy
+from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import Executor
@@ -62,6 +63,7 @@ class Controller:
         *,
         auto: bool = False,
         persisted: PersistedSafety | None = None,
+        learned: Learned | None = None,
         battery_policy: BatteryPolicy | None = None,
         speed_max: float = 1.0,
         people: People = NO_PEOPLE,
@@ -73,7 +75,7 @@ class Controller:
         self.people = people
         self.safety = Safety.restore(persisted or PersistedSafety(), now, now_ns)
         self._log = CommandLog()
-        self.model = CarModel(car, profile, auto, self._log, battery_policy or BatteryPolicy())
+        self.model = CarModel(car, profile, auto, self._log, battery_policy or BatteryPolicy(), learned or Learned())
         self._executor = Executor(self.model, self._log, self.safety)
         self._monitor = CarMonitor(self.model, self._executor, self._log)
         self.stops = self._executor.stops
@@ -134,6 +136,17 @@ class Controller:
         """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
         self.model.cut_write = True
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
+
+    def waits_for(self, now: float) -> str:
+        """Return what a command would wait for now, in words; empty if the car is ready."""
+        model, running = self.model, self.stops.running
+        if not model.link_open:
+            return f"its link: {model.link_reason}"
+        if running is None or self._executor.accepts_commands(now):
+            return ""
+        left_s = max(0.0, self.stops.free_at(now) - now)
+        what = "its first stop" if not model.known else "a stop"
+        return f"{what}, for {left_s:.1f} s at most"
 
     def is_free(self, now: float) -> bool:
         """Return True if a command of somebody who may command the car would be sent now."""
@@ -227,6 +240,8 @@ class Controller:
                 return self._take_lease(pending, now, release=release)
             case Fan(bool() as on) if on == self.model.believed.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
+            case Fan(on) if self.model.profile.fan_is_level:
+                pending.frames.append(General(Motion.STOP, fan=not self.model.believed.fan if on is None else on))
             case FrameAction():
                 pending.frames.extend(what.frames)
             case Find():
@@ -340,7 +355,7 @@ class Controller:
         """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
         sender, safety = pending.command.sender, self.safety
         if not resume.ids and self.model.learned.doubted:  # a person says that the car is fine
-            self.model.learned.forget_reactions()
+            self.stops.end_doubt(now)
         named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
         mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self._context(now))]
         if ended := safety.end(each.id for each in mine if each.id in named):

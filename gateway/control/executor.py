@@ -8,7 +8,7 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
-from gateway.control.commands import Phase, Reason, SetMode
+from gateway.control.commands import Fan, Phase, Reason, SetMode
 from gateway.control.estimate.learned import blocking_kind
 from gateway.control.estimate.trust import Basis, TrustEvent
 from gateway.control.events import FrameOrigin, OutgoingFrame
@@ -178,7 +178,9 @@ class Executor:
         self, frame: Frame, why: FrameOrigin, source: StopInProgress | HeldMotion | Pending | None, by: Pending | None
     ) -> OutgoingFrame:
         self._source = source
-        return OutgoingFrame(frame, encode(frame), why, by.command.id if by is not None else "")
+        if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
+            frame = self.model.believed.with_fan(frame)
+        return OutgoingFrame(frame, encode(frame, self.model.profile.dialect), why, by.command.id if by is not None else "")
 
     # ------------------------------------------------------------------ frames written
 
@@ -246,7 +248,7 @@ class Executor:
                     self._end_rest(TrustEvent.MOTION_SENT, now)
                 else:
                     model.evidence.sent_other()
-                if shown and frame != STOP_FRAME and model.trust.shown:
+                if shown and frame != model.believed.with_fan(STOP_FRAME) and model.trust.shown:
                     self._doubt_rest(now)
         if model.stop_style is StopStyle.GENERAL and model.mode.asked is None:
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)

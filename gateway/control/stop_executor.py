@@ -259,7 +259,9 @@ class StopExecutor:
         running.commands[:] = waiting
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
-            if self.model.mode.heard_at > running.began_at:
+            if self.model.learned.shows is Shows.UNKNOWN and running.report_at > running.began_at:
+                self._finish_unknown(running, now)
+            elif self.model.mode.heard_at > running.began_at:
                 self.model.evidence.reacted_at = None
                 self.model.learned.doubted = self.model.learned.shows is Shows.YES
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
@@ -268,6 +270,17 @@ class StopExecutor:
                 words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it."
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
+
+    def _finish_unknown(self, running: StopInProgress, now: float) -> None:
+        """End a stop of a car that reports in mode 0, and that was never seen to react to a frame: as sent."""
+        words = EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.model.name)
+        self._finish(running, Basis.SENT, words, now, StopCase.NOT_KNOWN)
+
+    def end_doubt(self, now: float) -> None:
+        """End the doubt of a person about a car that has shown its stops before: a person says that it is fine."""
+        self.model.learned.forget_reactions()
+        if self.running is not None and self.running.overdue and self.model.trust.state is CarTrust.UNPROVEN:
+            self._finish_unknown(self.running, now)
 
     def give_way(self, now: float) -> None:
         """End a stop that the car has not shown yet: a new command takes the place of its repeats."""

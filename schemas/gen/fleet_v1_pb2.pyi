@@ -317,7 +317,7 @@ class Lease(_message.Message):
     def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Safety(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan", "people")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan", "people", "waits_for")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -336,6 +336,7 @@ class Safety(_message.Message):
     ENDED_PAUSES_FIELD_NUMBER: _ClassVar[int]
     LOAN_FIELD_NUMBER: _ClassVar[int]
     PEOPLE_FIELD_NUMBER: _ClassVar[int]
+    WAITS_FOR_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -354,10 +355,18 @@ class Safety(_message.Message):
     ended_pauses: _containers.RepeatedScalarFieldContainer[str]
     loan: Loan
     people: CarPeople
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ..., people: _Optional[_Union[CarPeople, _Mapping]] = ...) -> None: ...
+    waits_for: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ..., people: _Optional[_Union[CarPeople, _Mapping]] = ..., waits_for: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions", "shows_stops", "shows_stops_words", "doubted", "interval_s", "interval_spread_s", "interval_no_echo_s", "blocks_s", "reporting_modes", "out_of_range")
+    class BlocksSEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -375,6 +384,15 @@ class Health(_message.Message):
     RSS_MB_FIELD_NUMBER: _ClassVar[int]
     BUS_DROPS_FIELD_NUMBER: _ClassVar[int]
     PLATFORM_CONTRADICTIONS_FIELD_NUMBER: _ClassVar[int]
+    SHOWS_STOPS_FIELD_NUMBER: _ClassVar[int]
+    SHOWS_STOPS_WORDS_FIELD_NUMBER: _ClassVar[int]
+    DOUBTED_FIELD_NUMBER: _ClassVar[int]
+    INTERVAL_S_FIELD_NUMBER: _ClassVar[int]
+    INTERVAL_SPREAD_S_FIELD_NUMBER: _ClassVar[int]
+    INTERVAL_NO_ECHO_S_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_S_FIELD_NUMBER: _ClassVar[int]
+    REPORTING_MODES_FIELD_NUMBER: _ClassVar[int]
+    OUT_OF_RANGE_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -392,7 +410,16 @@ class Health(_message.Message):
     rss_mb: float
     bus_drops: int
     platform_contradictions: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., host: _Optional[str] = ..., link: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., platform: _Optional[str] = ..., platform_evidence: _Optional[_Iterable[str]] = ..., capabilities: _Optional[_Iterable[str]] = ..., uptime_s: _Optional[float] = ..., loop_lag_s: _Optional[float] = ..., cpu: _Optional[float] = ..., rss_mb: _Optional[float] = ..., bus_drops: _Optional[int] = ..., platform_contradictions: _Optional[_Iterable[str]] = ...) -> None: ...
+    shows_stops: str
+    shows_stops_words: str
+    doubted: bool
+    interval_s: float
+    interval_spread_s: float
+    interval_no_echo_s: float
+    blocks_s: _containers.ScalarMap[str, float]
+    reporting_modes: _containers.RepeatedScalarFieldContainer[str]
+    out_of_range: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., host: _Optional[str] = ..., link: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., platform: _Optional[str] = ..., platform_evidence: _Optional[_Iterable[str]] = ..., capabilities: _Optional[_Iterable[str]] = ..., uptime_s: _Optional[float] = ..., loop_lag_s: _Optional[float] = ..., cpu: _Optional[float] = ..., rss_mb: _Optional[float] = ..., bus_drops: _Optional[int] = ..., platform_contradictions: _Optional[_Iterable[str]] = ..., shows_stops: _Optional[str] = ..., shows_stops_words: _Optional[str] = ..., doubted: _Optional[bool] = ..., interval_s: _Optional[float] = ..., interval_spread_s: _Optional[float] = ..., interval_no_echo_s: _Optional[float] = ..., blocks_s: _Optional[_Mapping[str, float]] = ..., reporting_modes: _Optional[_Iterable[str]] = ..., out_of_range: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class RxFrame(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "data", "verdict", "published")

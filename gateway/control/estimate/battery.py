@@ -3,7 +3,7 @@
 A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.measured`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final
 
@@ -43,7 +43,7 @@ class BatteryReaction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BatteryPolicy:
-    """The threshold of each level, V at rest, and the reaction to it.
+    """The threshold of each level, V at rest of two cells, and the reaction to it.
 
     By default no level stops the car: a brownout resets the car, which stops it too.
     """
@@ -58,6 +58,10 @@ class BatteryPolicy:
         if voltage_v < self.critical_v:
             return BatteryLevel.CRITICAL
         return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK
+
+    def of_cells(self, cells: int) -> "BatteryPolicy":
+        """Return the policy for so many cells: thresholds are given for two."""
+        return replace(self, low_v=self.low_v * cells / 2, critical_v=self.critical_v * cells / 2)
 
     def action(self, level: BatteryLevel | None) -> BatteryReaction | None:
         """Return the reaction to a level; None if it is ok or unknown."""
@@ -75,6 +79,7 @@ class Battery:
     """The level of one car's battery. Times: s, monotonic."""
 
     policy: BatteryPolicy = field(default_factory=BatteryPolicy)
+    cells: int = 2
     level: BatteryLevel | None = None
     """None until a voltage was measured, then OK until another level has lasted `LEVEL_DEBOUNCE_S`."""
     voltage_v: float | None = None
@@ -132,7 +137,7 @@ class Battery:
         """Return the level in words; empty if no voltage was measured."""
         if self.level is None or self.voltage_v is None:
             return ""
-        share, error = charge(self.voltage_v, loaded=self.loaded)
+        share, error = charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
         return f"battery {self.level}: {self.voltage_v:.2f} V, charge {share:.0%} +- {error:.0%}"
 
     @property
@@ -150,12 +155,12 @@ def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
     return voltage_v, voltage_v + (SAG_V if loaded else 0.0)
 
 
-def charge(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
+def charge(voltage_v: float, *, loaded: bool, cells: int = 2) -> tuple[float, float]:
     """Return the charge and its error (half width), 0..1 each.
 
     The charge is linear between empty and full. Under a load it uses the middle of the possible voltages at rest.
     """
-    low_v, high_v = rest_v(voltage_v, loaded=loaded)
+    low_v, high_v = (each * 2 / cells for each in rest_v(voltage_v, loaded=loaded))
     share = ((low_v + high_v) / 2 - EMPTY_V) / (FULL_V - EMPTY_V)
     error = CHARGE_ERROR + (high_v - low_v) / 2 / (FULL_V - EMPTY_V)
     return min(1.0, max(0.0, share)), min(1.0, error)

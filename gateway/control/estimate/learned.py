@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.protocol.sensors import SENSOR_FIELDS, Sensors
 
 KEPT_INTERVALS: Final = 9
 """Number of intervals of a rhythm."""
@@ -39,6 +40,8 @@ CHANGED_INTERVALS: Final = 3
 """Number of consecutive intervals that are a new rhythm."""
 AGREEING_DELAYS: Final = 3
 """Number of consecutive delays that agree and so are the block of a frame."""
+ALWAYS: Final = 5
+"""Minimum number of values out of range that are a finding, if none was in range."""
 UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
 
@@ -152,7 +155,9 @@ class Learned:
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """The lowest and the highest value of each field with a number, as on the wire."""
+    """The lowest and the highest accepted value of each field with a number, as on the wire."""
+    rejected: dict[str, int] = field(default_factory=dict)
+    """How often the value of a field was out of its range, by the word of the field."""
     _delays: dict[Blocking, deque[float]] = field(default_factory=dict)
     _blocks: dict[Blocking, float] = field(default_factory=dict)
     _unreacted: int = 0
@@ -218,6 +223,25 @@ class Learned:
     def is_confusable(self, delay_s: float) -> bool:
         """Return True if reports that the link loses could look like this delay."""
         return self.echo.is_multiple(delay_s, 2 * self.echo.tolerance_s)
+
+    @property
+    def always_rejected(self) -> tuple[str, ...]:
+        """Return the fields whose values were often out of range, and never in it."""
+        return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
+
+    def on_fields(self, event: Sensors) -> None:
+        """Record the values of the fields of a report of mode 0."""
+        for reject in event.rejects:
+            self.rejected[reject.word] = self.rejected.get(reject.word, 0) + 1
+        for each in SENSOR_FIELDS:
+            value = getattr(event, each.attribute)
+            if value is None:
+                continue
+            word = each.word.decode()
+            if isinstance(value, tuple):
+                self.extremes.setdefault(word, (0.0, 1.0))
+            else:
+                self.on_number(word, value)
 
     def on_number(self, field_name: str, value: float) -> None:
         """Record the value of a field."""

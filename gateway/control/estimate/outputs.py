@@ -3,7 +3,7 @@
 The car confirms none of them. Readings give evidence of its mode only, see mode.py.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from gateway.protocol.enums import Motion
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
@@ -39,7 +39,10 @@ class StateEstimate:
                 self.motion = frame.motion
                 if frame.speed is not None:
                     self.speed = self.profile.speed.step(self.speed, frame.speed)
-                if frame.fan:
+                if self.profile.fan_is_level:
+                    self.fan_at = now if frame.fan is not self.fan else self.fan_at
+                    self.fan = frame.fan
+                elif frame.fan:
                     self.fan = None if self.fan is None else not self.fan
                     self.fan_at = now
             case ModeClose():
@@ -53,6 +56,10 @@ class StateEstimate:
 
     def with_motion(self, frame: Frame) -> Frame:
         """Return the frame with the current motion, which every general frame carries."""
-        if not isinstance(frame, General):
+        return replace(frame, motion=self.motion) if isinstance(frame, General) else frame
+
+    def with_fan(self, frame: Frame) -> Frame:
+        """Return the frame with the level of the fan, which every general frame of some cars carries."""
+        if not isinstance(frame, General) or not self.profile.fan_is_level:
             return frame
-        return General(self.motion, frame.whistle, frame.speed, frame.servo, frame.sing, frame.light, frame.fan)
+        return replace(frame, fan=bool(self.fan))

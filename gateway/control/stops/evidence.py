@@ -108,6 +108,7 @@ class StopCase(StrEnum):
     RASPBERRY_PI = "raspberry_pi"
     UNKNOWN_PLATFORM = "unknown_platform"
     WRONG_PLATFORM = "wrong_platform"
+    NOT_KNOWN = "not_known"
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +195,12 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
         "as in mode 0",
         "`sent` if it reports on in mode 0; then as without an echo",
         "the readings of {car} contradict its platform, and nothing in them shows the stop",
+    ),
+    StopCase.NOT_KNOWN: EvidenceRow(
+        "full or recovery, it is not known yet whether the reports of this car react to frames",
+        "as in mode 0",
+        "the stop goes on until it has taken too long; then `sent`, and a general stop every 6 s",
+        "it is not known yet whether {car}'s reports show that a stop arrived",
     ),
 }
 
