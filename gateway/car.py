@@ -239,7 +239,7 @@ class CarGateway:
         may_fail = self._settings.retry
         while True:
             try:
-                link = await open_link(self._settings.url)
+                link = await open_link(self._settings.url, first=self._may_move)
             except LinkError as error:
                 if not may_fail and not await self._is_port_in_use():
                     raise
@@ -264,6 +264,11 @@ class CarGateway:
                     self._on_link_lost(str(error))
             await link.close()
             await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+
+    @property
+    def _may_move(self) -> bool:
+        """True if the car may be moving while its link is down."""
+        return self._control.was_open and self._control.model.motors != "off"
 
     def _check_link(self) -> None:
         """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
