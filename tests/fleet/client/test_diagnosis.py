@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, diagnose
+from schemas.bluetooth import describe_full
 from schemas.gen import fleet_v1_pb2 as pb
 
 WELL: dict[str, Any] = {
@@ -40,6 +41,7 @@ ODD: dict[str, CarEvidence] = {
     "gateway_ended": evidence(present=False, states={}, process=process(state="waiting", words="exit code 1")),
     "no_gateway": evidence(present=False, states={}),
     "gateway_hung": evidence(states={}),
+    "adapter_full": with_states(link=pb.Link(state="lost", reason=f"ble://x: {describe_full('hci0', 5)}", since_s=12)),
     "link_down": with_states(link=pb.Link(state="lost", reason="no such port", since_s=12)),
     "platform_contradicted": with_states(health=pb.Health(platform="stm32", platform_contradictions=["7.91 V"])),
     "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
