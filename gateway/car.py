@@ -31,6 +31,7 @@ from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link.baud import is_text
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected
 from gateway.protocol.platforms import Profile
@@ -330,6 +331,9 @@ class CarGateway:
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
             self._publisher.profile = self._control.model.profile
+            if isinstance(event, Rejected) and is_text(event.raw):
+                self._health.on_rejected("text")
+                continue
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)

@@ -23,7 +23,7 @@ MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
 _PORT_SHARED: Final = "port_shared"
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
-_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published"})
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
