@@ -15,6 +15,7 @@ from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 from bleak import BleakAdapter, BleakClient, BleakScanner
+from bleak.args.bluez import BlueZScannerArgs
 from bleak.backends.characteristic import BleakGATTCharacteristic
 from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
@@ -383,6 +384,14 @@ async def _connected(adapter: str | None) -> list[BLEDevice]:
         return await found.get_connected_devices(list(UART_SERVICES))
     except NotImplementedError:
         return []
+
+
+async def discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
+    """Return the devices that advertise within this time to any adapter, by address; raise whatever bleak raises."""
+    # With several adapters bleak chooses any of them, and a car may be in the range of one only.
+    options: list[BlueZScannerArgs] = [{"adapter": name} for name in await ble_adapters.list_connections()]
+    scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
+    return {address: each for scan in await asyncio.gather(*scans) for address, each in scan.items()}
 
 
 def _scanner(
