@@ -32,6 +32,7 @@ from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link.baud import is_text
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platform_name import AUTO
@@ -252,7 +253,7 @@ class CarGateway:
         may_fail = self._settings.retry
         while True:
             try:
-                link = await open_link(self._settings.url)
+                link = await open_link(self._settings.url, first=self._may_move)
             except LinkError as error:
                 if not may_fail and not await self._is_port_in_use():
                     raise
@@ -277,6 +278,11 @@ class CarGateway:
                     self._on_link_lost(str(error))
             await link.close()
             await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+
+    @property
+    def _may_move(self) -> bool:
+        """True if the car may be moving while its link is down."""
+        return self._control.was_open and self._control.model.motors != "off"
 
     def _check_link(self) -> None:
         """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
@@ -341,6 +347,9 @@ class CarGateway:
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
             self._publisher.profile = self._control.model.profile
+            if isinstance(event, Rejected) and is_text(event.raw):
+                self._health.on_rejected("text")
+                continue
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Final
 
+from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import person_of
 
 RECENT_COMMAND_S: Final = 600.0
@@ -22,7 +23,7 @@ MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
 _PORT_SHARED: Final = "port_shared"
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
-_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published"})
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
@@ -111,9 +112,16 @@ def _hung(e: CarEvidence) -> str:
     return "" if answers or not e.present else "Its gateway is on the bus and does not answer. It may hang."
 
 
+def _adapter_full(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.state != "lost" or ADAPTER_FULL not in link.reason:
+        return ""
+    return f"Adapter full: {link.reason}."
+
+
 def _lost(e: CarEvidence) -> str:
     link = e.of("state/link")
-    if link is None or link.state != "lost":
+    if link is None or link.state != "lost" or _adapter_full(e):
         return ""
     return f"The link has been lost for {link.since_s:.0f} s: {link.reason or 'no reason is known'}."
 
@@ -287,6 +295,7 @@ CHECKS: Final = (
     DoctorCheck("gateway_ended", _ended, "fleet logs {car}"),
     DoctorCheck("no_gateway", _absent, "fleet up"),
     DoctorCheck("gateway_hung", _hung, "fleet logs {car}"),
+    DoctorCheck("adapter_full", _adapter_full, "fleet check"),
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
     DoctorCheck("not_shown", _unproven, "fleet stop {car}"),

@@ -17,10 +17,11 @@ import yaml
 from fleet.commands.fleet_file import DEFAULT_FILE, print_errors
 from fleet.commands.options import cli_errors, json_option
 from fleet.coordinator.observer import listed_cars
+from fleet.fleetfile.adapter_check import check_adapters, list_adapters
 from fleet.fleetfile.fleet_file import FleetFile, read_fleet
 from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import FileEntry
-from fleet.links import LINK_SIM
+from fleet.links import LINK_SIM, parse_fleet_link
 from fleet.policy.plan.lint import Severity
 from fleet.policy.plan.lint import check as find_findings
 from fleet.policy.plan.models import PlanEntry
@@ -67,7 +68,8 @@ Exit codes: 0 no mistakes, 1 a car's port is missing or a part of a plan can nev
 def check(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
 
-    Does not touch the cars. With a fleet file, its plan and world are checked too, for the cars of that file.
+    Does not touch the cars. With a fleet file, its plan and world are checked too, for the cars of that file. Warns if
+    a Bluetooth adapter has more cars than it holds.
     """
     checks = _Checks(as_json=as_json)
     kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}
@@ -129,6 +131,10 @@ class _Checks:
             state = "ok" if each.ok else "error"
             self._print(asdict(each), f"{each.car:{widest}}  {state:5}  {each.link}: {each.words}")
             self._worse(_Result.GOOD if each.ok else _Result.FAILED)
+        links = {name: parse_fleet_link(car.link) for name, car in fleet.cars.items()}
+        for sums in check_adapters(links, list_adapters()):
+            if sums.is_crowded:
+                self._print(asdict(sums), f"{sums.adapter:{widest}}  warn   {sums.words}")
         for kind, path in ((FileKind.PLAN, fleet.plan), (FileKind.WORLD, fleet.world)):
             if path is not None:
                 self.check(kind, path)

@@ -1,8 +1,8 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.protocol` gives the bytes their meaning.
 
 `base` has the interface and its errors. `serial`, `tcp` and `ble` implement it, two of them with the buffer of
-`buffered_link`. `usb` finds the port of a USB device, `url` accepts a link from the command line. `baud` doubts the
-baud rate of bytes without a frame.
+`buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a USB device,
+`url` accepts a link from the command line. `baud` doubts the baud rate of bytes without a frame.
 """
 
 from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
@@ -28,8 +28,11 @@ OPEN_TIMEOUT_S = 5.0
 BLE_TIMEOUT_S = 20.0
 
 
-async def open_link(url: LinkUrl, *, timeout_s: float | None = None) -> Link:
-    """Open the link within this time; raise CannotOpen, whose message says what is wrong and what to do."""
+async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
+    """Open the link within this time; raise CannotOpen, whose message says what is wrong and what to do.
+
+    The connects through one Bluetooth adapter take turns. `first`: the car may be moving, so it goes first.
+    """
     match url:
         case SerialUrl() | UsbUrl():
             from gateway.link.serial import open_serial
@@ -42,4 +45,4 @@ async def open_link(url: LinkUrl, *, timeout_s: float | None = None) -> Link:
         case BleUrl():
             from gateway.link.ble import open_ble
 
-            return await open_ble(url, BLE_TIMEOUT_S if timeout_s is None else timeout_s)
+            return await open_ble(url, BLE_TIMEOUT_S if timeout_s is None else timeout_s, first=first)

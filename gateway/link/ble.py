@@ -10,21 +10,28 @@ import contextlib
 import errno
 import socket
 import sys
+import time
 from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 from bleak import BleakAdapter, BleakClient, BleakScanner
+from bleak.args.bluez import BlueZScannerArgs
 from bleak.backends.characteristic import BleakGATTCharacteristic
 from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 from bleak.backends.service import BleakGATTService
 
+from gateway.link import ble_adapters
 from gateway.link.base import Busy, CannotOpen, Link, LinkLost
+from gateway.link.ble_adapters import ConnectionNote, Turn
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
-from schemas.links import BleUrl
+from schemas.bluetooth import ADAPTER_CONNECTIONS, SMALL_ADAPTER_CONNECTIONS, describe_full
+from schemas.links import AUTO_ADAPTER, BleUrl
 from schemas.process.stdio import printable
 
 T = TypeVar("T")
+_Devices = dict[str | None, BLEDevice]
+"""One device as each adapter knows it. None stands for the system's choice of an adapter."""
 
 # A piece takes 11 ms (90 writes/s, measured). A frame that takes longer than this is too old to be a command.
 BLE_WRITE_TIMEOUT_S: Final = 1.0
@@ -34,6 +41,12 @@ DISCONNECT_TIMEOUT_S: Final = 4.0
 # All modules leave the factory with the same name.
 NAMESAKE_SCAN_S: Final = 2.0
 """Time to scan for another device of the same name."""
+OTHER_ADAPTERS_S: Final = 1.0
+"""Time to scan on for the other adapters that see the device, too."""
+# Connecting takes 1.1 s, and 4 s for the fourth car. A module that does not answer keeps the others waiting.
+CONNECT_TIMEOUT_S: Final = 10.0
+TURN_TIMEOUT_S: Final = 60.0
+"""Timeout for a turn and the connect, with eight cars before this one."""
 _CANCEL_RETRY_S: Final = 0.5
 _MIN_PIECE: Final = 20  # at the minimum MTU of 23
 _MAX_LISTED: Final = 5
@@ -62,12 +75,14 @@ UART_SERVICES: Final = tuple(service for services, _, _ in _UARTS for service in
 class BleLink(BufferedLink):
     """One connection, created by `open_ble`."""
 
-    def __init__(self, url: BleUrl) -> None:
+    def __init__(self, url: BleUrl, *, first: bool = False) -> None:
         super().__init__()
         self._url = url
+        self._first = first
         self._client: BleakClient | None = None
         self._to_car: BleakGATTCharacteristic | None = None
         self._claim: socket.socket | None = None
+        self._note: ConnectionNote | None = None
         self._writing = asyncio.Lock()
         self._pieces: asyncio.Task[None] | None = None
         self._closing: asyncio.Task[None] | None = None
@@ -76,13 +91,17 @@ class BleLink(BufferedLink):
     # ------------------------------------------------------------------ opening
 
     async def open(self, timeout_s: float) -> None:
-        """Find the device, connect and subscribe; raise CannotOpen."""
+        """Find the device within this time, connect when it is this gateway's turn, and subscribe; raise CannotOpen."""
+        began = time.monotonic()
         try:
-            await _within(timeout_s, self._open())
+            found = await _within(timeout_s, self._search())
+            if found:
+                self._claim = self._claim or _claim(self._url, next(iter(found.values())).address)
+                await self._connect(found, min(timeout_s, CONNECT_TIMEOUT_S))
         except BaseException as error:
             await self.close()
             if isinstance(error, TimeoutError):
-                raise CannotOpen(f"{self._url}: {self._stage} (waited {timeout_s:g} s)") from None
+                raise CannotOpen(f"{self._url}: {self._stage} (waited {time.monotonic() - began:.0f} s)") from None
             if isinstance(error, CannotOpen) or not isinstance(error, Exception):
                 raise
             raise CannotOpen(
@@ -90,43 +109,73 @@ class BleLink(BufferedLink):
                 "the system's Bluetooth service run?"
             ) from None
 
-    async def _open(self) -> None:
-        # A killed gateway leaves its module connected, and a scan does not find connected modules.
-        known = {
-            device.address: device for device in await _connected() if self._is_wanted(device.address, device.name)
-        }
+    async def _search(self) -> _Devices:
+        """Return the device as each adapter knows it; an empty result if the link is open already."""
+        connections = await ble_adapters.list_connections()
+        adapters = self._allowed(list(connections))
+        # A killed gateway leaves its module connected, and a scan does not find connected modules. It may be connected
+        # to another adapter than it is now allowed to.
+        connected = [(name, each) for name in connections or adapters for each in await _connected(name)]
+        known = {each.address: {name: each} for name, each in connected if self._is_wanted(each.address, each.name)}
         if known and self._url.name is None:
-            try:
-                await self._use(*known.values())
-            except Busy:
-                raise
-            except CannotOpen:  # the Bluetooth service was restarted and has lost that connection
-                await self._disconnect()
-            else:
-                return
-        await self._use(await self._find(known))
+            if await self._take_over(known[next(iter(known))]):
+                return {}
+            known = {}
+        found = await self._find(known, adapters)
+        address = next(iter(found.values())).address
+        return {} if address in known and await self._take_over(known[address]) else found
+
+    async def _take_over(self, devices: _Devices) -> bool:
+        """Use the connection that a killed gateway has left. Return False if there is none any more."""
+        ((adapter, device),) = devices.items()
+        try:
+            await self._use(device, adapter)
+        except Busy:
+            raise
+        except CannotOpen:  # the Bluetooth service was restarted and has lost that connection
+            await self._disconnect()
+            return False
+        return True
+
+    def _allowed(self, adapters: list[str]) -> list[str | None]:
+        """Return the adapters that may be used, by name. None stands for the system's choice; raise CannotOpen."""
+        wanted = self._url.adapter
+        if sys.platform != "linux" and wanted not in (None, AUTO_ADAPTER):
+            raise CannotOpen(f"{self._url}: this system has one Bluetooth adapter: leave adapter= out")
+        if wanted not in (None, AUTO_ADAPTER) and adapters and wanted not in adapters:
+            there = ", ".join(adapters)
+            raise CannotOpen(f"{self._url}: no Bluetooth adapter {wanted} that is on. There are: {there}")
+        if not adapters:  # unknown: bleak will say why
+            return [None if wanted == AUTO_ADAPTER else wanted]
+        if wanted == AUTO_ADAPTER:
+            return [*adapters]
+        return [wanted or adapters[0]]
 
     def _is_wanted(self, address: str, *names: str | None) -> bool:
         return address.upper() == self._url.address if self._url.name is None else self._url.name in names
 
-    async def _find(self, known: Mapping[str, BLEDevice]) -> BLEDevice:
+    async def _find(self, known: Mapping[str, _Devices], adapters: Sequence[str | None]) -> _Devices:
         """Scan until the device advertises; by name, until it is likely the only one. No timeout of its own."""
         loop = asyncio.get_running_loop()
-        found, others = dict(known), dict[str, str]()
+        found, others = {address: dict(devices) for address, devices in known.items()}, dict[str, str]()
         self._stage = _not_found(self._url, others)
+        more_s = NAMESAKE_SCAN_S if self._url.name is not None else OTHER_ADAPTERS_S
         # Not `advertisement_data()`: it misses advertisements before the first call, which may be the only ones.
-        queue = asyncio.Queue[tuple[BLEDevice, AdvertisementData]]()
-        async with BleakScanner(lambda device, advert: queue.put_nowait((device, advert))):
+        queue = asyncio.Queue[tuple[str | None, BLEDevice, AdvertisementData]]()
+        async with contextlib.AsyncExitStack() as scanners:
+            for name in adapters:
+                await scanners.enter_async_context(_scanner(name, queue))
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(NAMESAKE_SCAN_S if found else None) as timeout:
+                async with asyncio.timeout(more_s if found else None) as timeout:
                     while True:
-                        device, advert = await queue.get()
+                        adapter, device, advert = await queue.get()
                         if self._is_wanted(device.address, device.name, advert.local_name):
-                            if self._url.name is None:
-                                return device
                             if not found:
-                                timeout.reschedule(loop.time() + NAMESAKE_SCAN_S)
-                            found[device.address] = device
+                                timeout.reschedule(loop.time() + more_s)
+                            seen = found.setdefault(device.address, {})
+                            seen[adapter] = device
+                            if self._url.name is None and len(seen) == len(adapters):
+                                return seen
                         elif any(service.lower() in UART_SERVICES for service in advert.service_uuids):
                             others[device.address] = advert.local_name or device.name or "no name"
                             self._stage = _not_found(self._url, others)
@@ -137,7 +186,53 @@ class BleLink(BufferedLink):
             )
         return next(iter(found.values()))
 
-    async def _use(self, device: BLEDevice) -> None:
+    async def _connect(self, devices: _Devices, timeout_s: float) -> None:
+        """Connect through the first adapter that has room, when it is this gateway's turn; raise CannotOpen."""
+        turns = {adapter: Turn(adapter or "default", first=self._first) for adapter in devices}
+        try:
+            async with asyncio.timeout(TURN_TIMEOUT_S):
+                while True:
+                    adapter = await self._take_turn(turns)
+                    try:
+                        return await _within(timeout_s, self._use(devices[adapter], adapter))
+                    except (CannotOpen, TimeoutError) as error:
+                        connections = (await ble_adapters.list_connections()).get(adapter or "", 0)
+                        if isinstance(error, Busy) or adapter is None or connections < SMALL_ADAPTER_CONNECTIONS:
+                            raise
+                        if await self._free(adapter):
+                            continue
+                        full = describe_full(adapter, connections)
+                        turns[adapter].release()
+                        del turns[adapter]
+                        if not turns:
+                            raise CannotOpen(f"{self._url}: {full}") from None
+                    finally:
+                        if adapter in turns:
+                            turns[adapter].release()
+        finally:
+            for turn in turns.values():
+                turn.release()
+
+    async def _take_turn(self, turns: dict[str | None, Turn]) -> str | None:
+        """Wait for the turn at one of the adapters; without room at all but one, take that one. Return its name."""
+        self._stage = "other gateways connect through this adapter, and it was not this one's turn"
+        connections = await ble_adapters.list_connections()
+        while True:
+            for adapter in sorted(turns, key=lambda each: connections.get(each or "", 0)):
+                if not turns[adapter].try_take():
+                    continue
+                # Nobody else connects now, so the number does not grow. The last adapter may hold more than most do.
+                connections = await ble_adapters.list_connections()
+                if connections.get(adapter or "", 0) >= ADAPTER_CONNECTIONS and await self._free(adapter):
+                    connections = await ble_adapters.list_connections()
+                if len(turns) == 1 or connections.get(adapter or "", 0) < ADAPTER_CONNECTIONS:
+                    return adapter
+                turns.pop(adapter).release()
+                break
+            else:
+                await asyncio.sleep(ble_adapters.TURN_POLL_S)
+
+    async def _use(self, device: BLEDevice, adapter: str | None) -> None:
         """Connect to the device and subscribe; raise CannotOpen."""
         self._claim = self._claim or _claim(self._url, device.address)
         client = BleakClient(device, self._on_disconnected)
@@ -152,6 +247,23 @@ class BleLink(BufferedLink):
             raise
         except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, it is not open
             raise CannotOpen(f"{self._url}: no connection, {_cause(error)}") from None
+        if adapter is not None:
+            self._note = ConnectionNote(adapter, device.address)
+            self._note.write()
+
+    async def _free(self, adapter: str | None) -> bool:
+        """End the connections of killed gateways, which the system keeps. Return True if there were any."""
+        freed = False
+        for note in () if adapter is None else ConnectionNote.all_of(adapter):
+            try:
+                claim = _claim(self._url, note.address)
+            except CannotOpen:  # its gateway runs
+                continue
+            if claim is not None:
+                await note.disconnect()
+                claim.close()
+                freed = True
+        return freed
 
     async def _subscribe(self, client: BleakClient, address: str) -> None:
         chosen = choose(client.services)
@@ -203,6 +315,8 @@ class BleLink(BufferedLink):
 
     async def _close(self) -> None:
         await self._disconnect()
+        if self._note is not None:
+            self._note.remove()
         if self._claim is not None:
             self._claim.close()
 
@@ -234,9 +348,9 @@ class BleLink(BufferedLink):
             self._lose(f"{self._url} is gone: the Bluetooth connection ended")
 
 
-async def open_ble(url: BleUrl, timeout_s: float) -> Link:
-    """Find a module and connect to it; raise CannotOpen."""
-    link = BleLink(url)
+async def open_ble(url: BleUrl, timeout_s: float, *, first: bool = False) -> Link:
+    """Find a module and connect to it; raise CannotOpen. `first`: do so before other gateways."""
+    link = BleLink(url, first=first)
     await link.open(timeout_s)
     return link
 
@@ -263,13 +377,34 @@ def _preferred(
     return min(fit, key=lambda each: order.index(each.uuid) if each.uuid in order else len(order), default=None)
 
 
-async def _connected() -> list[BLEDevice]:
-    """Return the UART modules to which any program on this computer is connected."""
+async def _connected(adapter: str | None) -> list[BLEDevice]:
+    """Return the UART modules to which any program on this computer is connected through an adapter."""
     try:
-        adapter = await BleakAdapter.get()
-        return await adapter.get_connected_devices(list(UART_SERVICES))
+        found = await (BleakAdapter.get() if adapter is None else BleakAdapter.get(bluez={"adapter": adapter}))
+        return await found.get_connected_devices(list(UART_SERVICES))
     except NotImplementedError:
         return []
+
+
+async def discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
+    """Return the devices that advertise within this time to any adapter, by address; raise whatever bleak raises."""
+    # With several adapters bleak chooses any of them, and a car may be in the range of one only.
+    options: list[BlueZScannerArgs] = [{"adapter": name} for name in await ble_adapters.list_connections()]
+    scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
+    return {address: each for scan in await asyncio.gather(*scans) for address, each in scan.items()}
+
+
+def _scanner(
+    adapter: str | None, queue: "asyncio.Queue[tuple[str | None, BLEDevice, AdvertisementData]]"
+) -> BleakScanner:
+    def on_advertisement(device: BLEDevice, advert: AdvertisementData) -> None:
+        queue.put_nowait((adapter, device, advert))
+
+    return (
+        BleakScanner(on_advertisement)
+        if adapter is None
+        else BleakScanner(on_advertisement, bluez={"adapter": adapter})
+    )
 
 
 async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:

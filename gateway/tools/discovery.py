@@ -91,14 +91,12 @@ def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> li
 async def ble_devices(seconds: float) -> list[BleDevice]:
     """Return the devices that advertise within this time, likely cars first; raise NoBluetooth."""
     try:
-        from bleak import BleakScanner
-
-        from gateway.link.ble import UART_SERVICES
+        from gateway.link.ble import UART_SERVICES, discover
     except ImportError:
         raise NoBluetooth(f"Bluetooth was not searched. Type: {how_to_install('ble')}") from None
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
-            found = await BleakScanner.discover(timeout=seconds, return_adv=True)
+            found = await discover(seconds)
     except TimeoutError:
         raise NoBluetooth("Bluetooth was not searched: its service does not answer. Is it running?") from None
     except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, `scan` still lists the ports

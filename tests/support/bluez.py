@@ -3,7 +3,8 @@
 Its users set DBUS_SYSTEM_BUS_ADDRESS to `address`. This program is also the bus: it answers Hello, takes match rules,
 passes calls to org.bluez, and passes signals to their subscribers. No dbus-daemon need be installed. The fake has
 the calls of bleak's backend, and the limits measured on the real BlueZ. BlueZ refuses a piece longer than the MTU
-allows. A connected module does not advertise. A connection outlives the program that made it.
+allows. A connected module does not advertise. A connection outlives the program that made it. An adapter makes one
+connection at a time, refuses another meanwhile (InProgress), and has a number of slots.
 """
 
 import asyncio
@@ -14,7 +15,7 @@ import os
 import struct
 import threading
 import tty
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -29,7 +30,7 @@ OBJECTS = f"{DBUS}.ObjectManager"
 BLUEZ = "org.bluez"
 ADAPTER, DEVICE = f"{BLUEZ}.Adapter1", f"{BLUEZ}.Device1"
 SERVICE, CHARACTERISTIC = f"{BLUEZ}.GattService1", f"{BLUEZ}.GattCharacteristic1"
-HCI = "/org/bluez/hci0"
+ROOT = "/org/bluez"
 PATIENCE_S = 20.0
 
 _names = itertools.count()
@@ -75,6 +76,28 @@ class Refused(Exception):
 
 
 @dataclass(eq=False)
+class Adapter:
+    """A Bluetooth adapter of the computer."""
+
+    name: str = "hci0"
+    slots: int = 5
+    """Maximum of connections."""
+    connect_s: float = 0.0
+    """How long a connect takes."""
+    busy: bool = False
+    """True while a connect goes on."""
+    refused: list[str] = field(default_factory=list)
+    """The addresses whose connect was refused, because another one was going on."""
+    accepted: list[str] = field(default_factory=list)
+    """The addresses whose connect was tried, in order."""
+    scanners: set["_Caller"] = field(default_factory=set)
+
+    @property
+    def path(self) -> str:
+        return f"{ROOT}/{self.name}"
+
+
+@dataclass(eq=False)
 class Module:
     """A Bluetooth LE module and its faults."""
 
@@ -91,8 +114,12 @@ class Module:
     """Number of pieces that the module still takes (None: all). BlueZ never answers a later write."""
     refuses: int | None = None
     """Number of pieces that the module still takes (None: all). BlueZ refuses a later write."""
-    known: bool = False
-    connected: bool = False
+    known: set[str] = field(default_factory=set)
+    """The adapters that have seen it."""
+    adapter: Adapter | None = None
+    """The adapter that is connected to it."""
+    seen_by: frozenset[str] | None = None
+    """The adapters in whose range it is; None for all."""
     notified: set[tuple["_Caller", str]] = field(default_factory=set)
     """The subscribers of notifications, each with its characteristic."""
     pieces: list[bytes] = field(default_factory=list)
@@ -105,11 +132,22 @@ class Module:
     """The UUIDs of the characteristics that were written."""
 
     @property
+    def connected(self) -> bool:
+        return self.adapter is not None
+
+    @property
     def path(self) -> str:
-        return f"{HCI}/dev_{self.address.replace(':', '_')}"
+        """The path of the connected device."""
+        assert self.adapter is not None
+        return self.path_at(self.adapter.name)
+
+    def path_at(self, adapter: str) -> str:
+        return f"{ROOT}/{adapter}/dev_{self.address.replace(':', '_')}"
 
     def characteristics(self) -> Iterator[tuple[str, str, tuple[str, ...], str, str]]:
-        """Yield each characteristic: path, UUID, flags, and path and UUID of the service."""
+        """Yield each characteristic of a connected module: path, UUID, flags, and path and UUID of the service."""
+        if not self.connected:
+            return
         number = 0x000C
         for service, inside in self.gatt:
             above = f"{self.path}/service{number:04x}"
@@ -122,10 +160,11 @@ class Module:
 class FakeBluez:
     """The bus and BlueZ, in a thread of their own. Any other thread may call the methods that change them."""
 
-    def __init__(self, *modules: Module) -> None:
+    def __init__(self, *modules: Module, adapters: Sequence[Adapter] = ()) -> None:
         name = f"car-fleet-bluez-{os.getpid()}-{next(_names)}"
         self.address = f"unix:abstract={name}"
         self.modules = list(modules)
+        self.adapters = list(adapters) or [Adapter()]
         self.powered = True
         self.alive = True
         """True while bluetoothd runs."""
@@ -195,9 +234,11 @@ class FakeBluez:
         async def work() -> None:
             self.alive = True
             for module in self.modules:
-                module.known = module.connected = False
+                module.known.clear()
+                module.adapter = None
                 module.notified.clear()
-            await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [HCI, self._adapter()])
+            for each in self.adapters:
+                await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [each.path, self._adapter(each)])
 
         self._do(work())
 
@@ -239,6 +280,9 @@ class FakeBluez:
             for module in self.modules:
                 module.notified = {asked for asked in module.notified if asked[0] is not caller}
                 # the module stays connected
+                module.waiting = [each for each in module.waiting if each[0] is not caller]
+            for adapter in self.adapters:
+                adapter.scanners.discard(caller)
             writer.close()
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
@@ -289,33 +333,49 @@ class FakeBluez:
     async def _bluez_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]] | None:
         if message.member == "GetManagedObjects":
             return "a{oa{sa{sv}}}", [self._managed()]
-        if message.path == HCI:
-            return await self._adapter_call(caller, message)
+        for adapter in self.adapters:
+            if message.path == adapter.path:
+                return await self._adapter_call(caller, message, adapter)
+            for module in self.modules:
+                if adapter.name in module.known and message.path == module.path_at(adapter.name):
+                    return await self._device_call(caller, message, module, adapter)
         for module in self.modules:
-            if module.known and message.path == module.path:
-                return await self._device_call(caller, message, module)
             for path, each, flags, _, _ in module.characteristics():
-                if module.connected and message.path == path:
+                if message.path == path:
                     module.written_to |= {each} if message.member == "WriteValue" else set()
                     return await self._characteristic_call(caller, message, module, flags)
         raise Refused(f"{DBUS}.Error.UnknownObject", f"Method {message.member} with {message.path} doesn't exist")
 
-    async def _adapter_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]]:
+    async def _adapter_call(self, caller: "_Caller", message: Message, adapter: Adapter) -> tuple[str, list[Any]]:
         if message.member == "StartDiscovery":
-            caller.scans = True
+            adapter.scanners.add(caller)
             await self._advertise()
         elif message.member == "StopDiscovery":
-            caller.scans = False
+            adapter.scanners.discard(caller)
         elif message.member != "SetDiscoveryFilter":
             raise Refused(f"{DBUS}.Error.UnknownMethod", str(message.member))
         return "", []
 
-    async def _device_call(self, caller: "_Caller", message: Message, module: Module) -> tuple[str, list[Any]] | None:
+    async def _device_call(
+        self, caller: "_Caller", message: Message, module: Module, adapter: Adapter
+    ) -> tuple[str, list[Any]] | None:
         if message.member == "Connect":
+            pending = [str(what.path) for each in self.modules for _, what in each.waiting]
+            if adapter.busy or any(path.startswith(f"{adapter.path}/") for path in pending):
+                adapter.refused.append(module.address)
+                raise Refused(f"{BLUEZ}.Error.InProgress", "Operation already in progress")
+            if sum(each.adapter is adapter for each in self.modules) >= adapter.slots:
+                raise Refused(f"{BLUEZ}.Error.Failed", "le-connection-concurrent-connection-limit")
             if not (module.on and module.connects):
                 module.waiting.append((caller, message))  # BlueZ tries for a very long time
                 return None
-            module.connected = True
+            adapter.accepted.append(module.address)
+            adapter.busy = True
+            try:
+                await asyncio.sleep(adapter.connect_s)
+            finally:
+                adapter.busy = False
+            module.adapter = adapter
             await self._change(module.path, DEVICE, {"Connected": Variant("b", True)})
             for path, interfaces in self._gatt(module).items():
                 await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [path, interfaces])
@@ -373,24 +433,25 @@ class FakeBluez:
                 await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
 
     async def _advertise(self) -> None:
-        """Report each module that is on and not connected, if any caller scans."""
-        if not any(caller.scans for caller in self._callers):
-            return
-        for module in self.modules:
-            if module.on and not module.connected:
-                if not module.known:
-                    module.known = True
-                    body = [module.path, self._device(module)]
+        """Report each module that is on and not connected to the callers that scan."""
+        for adapter in self.adapters:
+            for module in self.modules if adapter.scanners else ():
+                if not module.on or module.connected or adapter.name not in (module.seen_by or {adapter.name}):
+                    continue
+                path = module.path_at(adapter.name)
+                if adapter.name not in module.known:
+                    module.known.add(adapter.name)
+                    body = [path, self._device(module, adapter)]
                     await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", body)
                 else:
-                    await self._change(module.path, DEVICE, {"RSSI": Variant("n", -50)})
+                    await self._change(path, DEVICE, {"RSSI": Variant("n", -50)})
 
     async def _hung_up(self, module: Module) -> None:
-        module.connected = False
+        path, gone = module.path, list(self._gatt(module))
+        module.adapter = None
         module.notified.clear()
-        gone = list(self._gatt(module))
         off = {"ServicesResolved": Variant("b", False), "Connected": Variant("b", False)}
-        await self._change(module.path, DEVICE, off)
+        await self._change(path, DEVICE, off)
         for path in reversed(gone):
             await self._signal("/", OBJECTS, "InterfacesRemoved", "oas", [path, [SERVICE, CHARACTERISTIC]])
 
@@ -398,33 +459,38 @@ class FakeBluez:
         await self._signal(path, PROPERTIES, "PropertiesChanged", "sa{sv}as", [interface, changed, []])
 
     def _managed(self) -> dict[str, Any]:
-        found: dict[str, Any] = {HCI: self._adapter()}
+        found: dict[str, Any] = {}
+        for number, adapter in enumerate(self.adapters):
+            found[adapter.path] = self._adapter(adapter, number)
+            for module in self.modules:
+                if adapter.name in module.known:
+                    found[module.path_at(adapter.name)] = self._device(module, adapter)
         for module in self.modules:
-            if module.known:
-                found[module.path] = self._device(module)
             if module.connected:
                 found |= self._gatt(module)
         return found
 
-    def _adapter(self) -> dict[str, Any]:
+    def _adapter(self, adapter: Adapter, number: int = 0) -> dict[str, Any]:
         return {
             ADAPTER: {
-                "Address": Variant("s", "00:00:00:00:00:01"),
+                "Address": Variant("s", f"00:00:00:00:00:{number + 1:02X}"),
+                "Name": Variant("s", adapter.name),
                 "Roles": Variant("as", ["central"]),
                 "Powered": Variant("b", self.powered),
             }
         }
 
-    def _device(self, module: Module) -> dict[str, Any]:
+    def _device(self, module: Module, adapter: Adapter) -> dict[str, Any]:
+        connected = module.adapter is adapter
         return {
             DEVICE: {
                 "Address": Variant("s", module.address),
                 "Name": Variant("s", module.name),
                 "Alias": Variant("s", module.name),
-                "Adapter": Variant("o", HCI),
+                "Adapter": Variant("o", adapter.path),
                 "Paired": Variant("b", False),
-                "Connected": Variant("b", module.connected),
-                "ServicesResolved": Variant("b", module.connected),
+                "Connected": Variant("b", connected),
+                "ServicesResolved": Variant("b", connected),
                 "UUIDs": Variant("as", [service for service, _ in module.gatt]),
                 "RSSI": Variant("n", -50),
             }
@@ -460,7 +526,6 @@ class _Caller:
     writer: asyncio.StreamWriter
     task: asyncio.Task[None]
     rules: list[dict[str, str]] = field(default_factory=list)
-    scans: bool = False
     serials: Callable[[], int] = field(default_factory=lambda: itertools.count(1).__next__)
 
     def wants(self, path: str, interface: str, member: str, body: list[Any]) -> bool:

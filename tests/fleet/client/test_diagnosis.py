@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, diagnose
+from schemas.bluetooth import describe_full
 from schemas.gen import fleet_v1_pb2 as pb
 
 WELL: dict[str, Any] = {
@@ -40,6 +41,7 @@ ODD: dict[str, CarEvidence] = {
     "gateway_ended": evidence(present=False, states={}, process=process(state="waiting", words="exit code 1")),
     "no_gateway": evidence(present=False, states={}),
     "gateway_hung": evidence(states={}),
+    "adapter_full": with_states(link=pb.Link(state="lost", reason=f"ble://x: {describe_full('hci0', 5)}", since_s=12)),
     "link_down": with_states(link=pb.Link(state="lost", reason="no such port", since_s=12)),
     "platform_contradicted": with_states(health=pb.Health(platform="stm32", platform_contradictions=["7.91 V"])),
     "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
@@ -111,7 +113,7 @@ def test_each_rejected_frame_counts_once() -> None:
     """The frames that came include the rejected ones. Other counts of a link are no frames."""
     (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
     assert found.cause == "10 of 40 frames were no reading, most of them truncated: a bad wire or radio."
-    few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1}
+    few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1, "text": 90}
     assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
     over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})
     assert [each.code for each in diagnose(with_states(link=over))] == ["damaged_frames"]

@@ -9,13 +9,19 @@ import os
 import pty
 import socket
 import struct
+import tempfile
 import threading
 import tty
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway.link import LinkUrl, ble
 from schemas.links import BleUrl, SerialUrl, TcpUrl
+from schemas.state_dir import STATE_VARIABLE
+
+if TYPE_CHECKING:
+    from tests.support.bluez import Adapter
 
 SYSTEM_BUS = "DBUS_SYSTEM_BUS_ADDRESS"
 PATIENCE_S = 20.0
@@ -142,14 +148,17 @@ class TcpPeer(Peer):
 class BlePeer(Peer):
     """A module of a private BlueZ."""
 
-    def __init__(self) -> None:
+    def __init__(self, *adapters: "Adapter") -> None:
         from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as dbus_fast
 
         self.module = Module(free_address(), "BT04")
-        self.bluez = FakeBluez(self.module)
+        self.bluez = FakeBluez(self.module, adapters=adapters)
         self.url = BleUrl(self.module.address)
-        self._before = os.environ.get(SYSTEM_BUS)
-        os.environ[SYSTEM_BUS] = self.bluez.address
+        self._state = tempfile.TemporaryDirectory()
+        # The adapter of another test must not keep this one waiting.
+        changed = {SYSTEM_BUS: self.bluez.address, STATE_VARIABLE: self._state.name}
+        self._before = {name: os.environ.get(name) for name in changed}
+        os.environ.update(changed)
         self._write_s = ble.BLE_WRITE_TIMEOUT_S
         # on a busy machine, both ends may stall for longer than the timeout of a command
         ble.BLE_WRITE_TIMEOUT_S = PATIENCE_S  # type: ignore[misc]
@@ -177,10 +186,12 @@ class BlePeer(Peer):
     def close(self) -> None:
         self.bluez.close()
         ble.BLE_WRITE_TIMEOUT_S = self._write_s  # type: ignore[misc]
-        if self._before is None:
-            del os.environ[SYSTEM_BUS]
-        else:
-            os.environ[SYSTEM_BUS] = self._before
+        for name, value in self._before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        self._state.cleanup()
 
 
 async def settled() -> None:

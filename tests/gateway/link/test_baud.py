@@ -89,6 +89,22 @@ def test_text_few_bytes_and_a_link_with_frames_are_not_doubted() -> None:
     assert watch.on_bytes(bytes(10 * MIN_BYTES)) is None, "noise on a line that works"
 
 
+def test_a_line_of_text_between_frames_is_no_damage(tmp_path: Path) -> None:
+    """Some programs print a line after each general frame."""
+    peer = PtyPeer(tmp_path)
+    started = FleetProcesses(free_endpoint(), tmp_path)
+    try:
+        gateway = started.gateway(str(peer.url))
+        wait_for(lambda: "[link_open]" in gateway.stderr, "the port is open")
+        lines = REPORT + b"EXEC:F\r\n" + REPORT + b"speed 120\r\nok\r\n"
+        peer.send(lines + REPORT + REPORT[1:] + lines + REPORT + bytes.fromhex("0180FF") + REPORT)
+        wait_for(lambda: (link := started.state("link")) and link.rx_frames == 9, "all have come")
+        assert dict(started.state("link").rejects) == {"text": 4, "no_start": 2}, "a frame without its $ is damage"
+    finally:
+        started.close()
+        peer.close()
+
+
 def test_a_gateway_says_it(tmp_path: Path) -> None:
     peer = PtyPeer(tmp_path)
     started = FleetProcesses(free_endpoint(), tmp_path)

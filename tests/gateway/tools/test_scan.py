@@ -272,12 +272,12 @@ def test_lasting_names_are_found_by_their_device(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's")
 def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    from tests.support.bluez import BATTERY, FFF0, NORDIC, FakeBluez, Module, free_address
+    from tests.support.bluez import BATTERY, FFF0, NORDIC, Adapter, FakeBluez, Module, free_address
 
     other = Module(free_address(), "Head\x1b[2Jset", BATTERY)
     car, nordic = Module(free_address(), "BT04"), Module(free_address(), "UART", NORDIC)
-    clone = Module(free_address(), "Ebyte", FFF0)
-    bluez = FakeBluez(other, car, nordic, clone)
+    clone = Module(free_address(), "Ebyte", FFF0, seen_by=frozenset({"hci1"}))
+    bluez = FakeBluez(other, car, nordic, clone, adapters=[Adapter("hci0"), Adapter("hci1")])
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", bluez.address)
     try:
         shown = command("scan", "--for", "3")

@@ -1,0 +1,61 @@
+"""A lock between the processes of one user that ends with its holder, however that ends: a locked file."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Final
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+_MODE: Final = 0o600
+
+
+class FileLock:
+    """A lock on one file, which is made if it is missing. Nobody waits here: the caller tries again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor: int | None = None
+
+    @property
+    def is_held(self) -> bool:
+        """True if this object holds the lock."""
+        return self._descriptor is not None
+
+    def try_take(self) -> bool:
+        """Take the lock if it is free, and return True if this object holds it now; raise OSError."""
+        if self._descriptor is not None:
+            return True
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, _MODE)
+        try:
+            taken = _lock(descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        if not taken:
+            os.close(descriptor)
+            return False
+        self._descriptor = descriptor
+        return True
+
+    def release(self) -> None:
+        """Release the lock. The file stays, as another process may have it open already."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file until it is closed. Return False if another has locked it; raise OSError."""
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):  # Windows raises the second one
+        return False
+    return True
