@@ -57,7 +57,11 @@ class CarMonitor:
         """Update the model with an event of the decoder."""
         model = self.model
         settled = not isinstance(event, Sensors) or model.evidence.is_settled(event)
-        for words in model.platform.on_event(event) if settled else ():
+        was_open = model.platform.open_mode
+        contradictions = model.platform.on_event(event) if settled else ()
+        if model.platform.open_mode and not was_open and model.profile.stop_style is StopStyle.GENERAL:
+            self._stops.leave_open_mode(now)
+        for words in contradictions:
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
             # The last stop may have been of the wrong kind, unless the car has shown it.
             is_stopped = model.trust.state in STOP_GOES_ON or model.trust.basis is Basis.SENT

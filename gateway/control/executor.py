@@ -180,7 +180,9 @@ class Executor:
         self._source = source
         if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
             frame = self.model.believed.with_fan(frame)
-        return OutgoingFrame(frame, encode(frame, self.model.profile.dialect), why, by.command.id if by is not None else "")
+        return OutgoingFrame(
+            frame, encode(frame, self.model.profile.dialect), why, by.command.id if by is not None else ""
+        )
 
     # ------------------------------------------------------------------ frames written
 

@@ -19,8 +19,8 @@ AWAKE_S: Final = 0.6
 """Maximum time after a report in which the car reads a frame at once: it ranges again an interval later."""
 LINK_DELAY_S: Final = 0.3
 """Maximum delay of a report by the link, which shortens that time."""
-AWAKE_WAIT_S: Final = 0.25
-"""Maximum wait for a report before a mode is opened."""
+AWAKE_WAIT_S: Final = 1.25
+"""Maximum wait for a report before a mode is opened: the ranging that the car may be in, and a margin."""
 
 
 class Pacing:

@@ -17,6 +17,7 @@ from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
+from gateway.protocol.frames import ModeClose
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
@@ -86,6 +87,17 @@ class StopExecutor:
         self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
         self.running.at_rest = True
+
+    def leave_open_mode(self, now: float) -> None:
+        """Send `MODE00` to a car whose readings show an open mode, and that got only general stops until now."""
+        running = self.running
+        got_mode_frame = running is not None and any(
+            isinstance(step.frame, ModeClose) for step in running.sequence.steps
+        )
+        if not got_mode_frame and not self.shutting_down:
+            self.recover(
+                now, f"{self.model.name} sends readings of a mode other than 0, which general stops do not end"
+            )
 
     def recover(self, now: float, words: str) -> None:
         """Bring the car to a known state. Commands that wait for a running stop wait for this one."""
@@ -217,7 +229,8 @@ class StopExecutor:
                 return running.case if is_time_up else None
             case StopCase.RASPBERRY_PI | StopCase.UNKNOWN_PLATFORM:
                 has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
-                return running.case if is_time_up and has_report else None
+                if is_time_up and has_report:
+                    return running.case
             case StopCase.WRONG_PLATFORM if reported and running.probes >= DOUBTED_PROBES:
                 return StopCase.WRONG_PLATFORM
             case _:
@@ -226,8 +239,8 @@ class StopExecutor:
             return StopCase.FAN
         if running.no_echo_at > running.closed_at:
             return StopCase.NO_ECHO
-        if not model.can_show and running.report_at > running.try_at and model.stop_style is not StopStyle.BOTH:
-            return StopCase.NO_REACTION
+        if running.case is StopCase.MANUAL or running.case is StopCase.NO_REACTION:
+            return StopCase.NO_REACTION if not model.can_show and running.report_at > running.try_at else None
         return None
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:

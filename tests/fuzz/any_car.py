@@ -128,8 +128,10 @@ class UseEpisode:
                 self._violate(f"(5) {what} was refused: {answer.words}")
             return None
         bound = free_at + extra_s + WIRE_S
-        is_sent = lambda: any(  # noqa: E731 - the condition of one loop
-            record.phase is Phase.SENT and record.command.what is what for record in pair.records[count:]
+        is_sent = (
+            lambda: any(
+                record.phase is Phase.SENT and record.command.what is what for record in pair.records[count:]
+            )
         )
         while not is_sent() and pair.now < bound:
             self._run(0.01)
@@ -147,7 +149,9 @@ class UseEpisode:
         self._run(asked_at + duration_s + SHARP_S - pair.now)
         stops = [at for at, data in pair.sent if at > began and data == b"$0,0,0,0,0,0,0,0,0#"]
         if not stops or abs(min(stops) - asked_at - duration_s) > SHARP_S:
-            self._violate(f"(6) the stop of a drive of {duration_s:.2f} s that began {began - asked_at:.2f} s late: {stops}")
+            self._violate(
+                f"(6) the stop of a drive of {duration_s:.2f} s that began {began - asked_at:.2f} s late: {stops}"
+            )
         self._run(2.5)
         true_s = _driven_s(pair, began)
         sent_s = asked_at + duration_s - began

@@ -479,6 +479,7 @@ class StopEvidence:
                 self._controlled = self._rhythm.fits(gap_s)
                 if not self._controlled:
                     self._drop_pauses()  # the link loses reports when it is written to
+                    return self._report
             self._learn_interval(gap_s)
         elif len(blocking) == 1 and (kind := blocking[0].kind) is not None and self._rhythm.is_known:
             expected_s = blocking[0].block_s

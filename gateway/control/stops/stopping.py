@@ -13,6 +13,7 @@ from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.protocol.modes import MODES
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
 
@@ -292,6 +293,9 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
         # Even if the first frames merge with a partial frame and open a mode, the second half of the sequence closes
         # it.
         return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
+    if sequence is sequences.GENERAL and not context.known and context.profile.kind is not Platform.RASPBERRY_PI:
+        lost_s = sequences.REPEAT_INTERVAL_S  # behind half a frame the first two are lost
+        return flight_s + FRAME_S + lost_s + ranging_s + WIRE_S
     one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
     twice_s = 0.0 if one else FRAME_S  # the car may read only the second
     if context.clear:

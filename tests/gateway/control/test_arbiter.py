@@ -71,12 +71,7 @@ LEASES = [
     *(LeaseState(Sender("bob", kind), NOW + 1.0) for kind in KINDS),
     LeaseState(Sender("bob", SenderKind.PERSON), NOW - 1.0),
 ]
-MODES = [
-    (None, False),
-    *((mode, contradicted) for mode in (Mode.MANUAL, Mode.TRACKING) for contradicted in (False, True)),
-    (Mode.COLOR_LED, False),
-]
-"""The commanded mode, and whether readings contradict it."""
+MODES = [None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED]
 RANK = list(reversed(KINDS))
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
@@ -88,14 +83,13 @@ def situations() -> tuple[CommandContext, ...]:
 
 
 def _situations() -> Iterator[CommandContext]:
-    """Yield 15,360 states: link, answering, closing, hold, e-stop, lease, battery, queue, mode, verdict, platform."""
+    """Yield 5,120 states: link, closing, hold, e-stop, lease, battery, queue, mode, platform."""
     for (
-        (link, answering, closing, held, estopped, lease, battery, queued),
-        (asked, contradicted),
+        (link, closing, held, estopped, lease, battery, queued),
+        asked,
         platform,
     ) in itertools.product(
         itertools.product(
-            (True, False),
             (True, False),
             (True, False),
             (None, Hold("mia", 1)),
@@ -113,10 +107,8 @@ def _situations() -> Iterator[CommandContext]:
             now=NOW,
             link_open=link,
             link_reason="gone",
-            answering=answering,
             closing=closing,
             asked=asked,
-            contradicted=contradicted,
             hold=held,
             estops=estopped,
             ended=("over",),
@@ -170,7 +162,6 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     assert not (at.hold and kind is SenderKind.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
-        assert at.answering or isinstance(what, Fan), "a fan that runs silences a car"
         assert not at.closing
     moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
     if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
@@ -182,7 +173,6 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     releases = isinstance(what, Drive) and what.motion is Motion.STOP
     if not isinstance(what, SetMode | TakeLease) and not releases:
         assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
-        assert not at.contradicted, "the car may ignore it"
     if isinstance(what, OneShot | ChangeSpeed | Fan | Find):
         assert at.queued < MAX_QUEUED_COMMANDS
 

@@ -24,7 +24,7 @@ RUNNING = {
     Mode.LIGHT_SEEKING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM11#",
     Mode.FOLLOWING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW10,GM00#",
 }
-REPORT_S = 1.0
+REPORT_S = 1.25
 RUNNING_S = 0.1
 TICK_S = 0.2
 """Intervals of reports in mode 0, of readings in a mode that reports, and of the controller's ticks."""
@@ -33,8 +33,9 @@ STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 BACK = b"$2,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
-SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
-"""Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a pause, and two pauses are needed."""
+SHOWN_STOP = [MODE00, STOP, MODE00]
+"""Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a pause. Two pauses are needed, and
+no frame may follow the last one."""
 
 PERSON = Sender("mia", SenderKind.PERSON)
 SCRIPT = Sender("script", SenderKind.SCRIPT)

@@ -11,13 +11,14 @@ from itertools import product
 import pytest
 
 from gateway.control.commands import Drive, Phase, SetMode, Stop
+from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.trust import Basis
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platform_name import Platform
-from gateway.protocol.platforms import StopStyle, parse_platform
+from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
@@ -28,14 +29,13 @@ MOMENTS = 4
 
 def judge(seen: Seen) -> None:
     """Require that the motors are off for good within the announced worst case, and that the state says so."""
-    assert seen.motors_off_s <= seen.announced_s, seen
-    assert seen.settled_s <= seen.announced_s + 0.002, seen  # the test looks every millisecond
-    if "fan" in seen.case and "told-unknown" in seen.case and seen.phase is Phase.FAILED:
-        return  # without a reading a car of an unknown platform never shows that it obeyed
+    # General stops do not end a mode. The mode is left when its readings have shown it, or when the platform is named.
+    is_found = "found" in seen.case and "told-unknown" in seen.case
+    limit_s = FOUND_S if is_found else seen.announced_s
+    assert seen.motors_off_s <= limit_s, seen
+    assert seen.settled_s <= limit_s + 0.002, seen  # the test looks every millisecond
     if "flickering" in seen.case and seen.phase is Phase.FAILED:
         return  # every second ranging has no echo: two pauses, or two reports without one, may never follow each other
-    if "lossy" in seen.case and "told-unknown" in seen.case and seen.phase is Phase.FAILED:
-        return  # the link is mute for 2 s, and the recipe for an unknown platform takes 4.8 s, so time runs out
     assert (seen.motors, seen.basis) == ("off", seen.phase_basis), seen
     assert seen.motors_off_s <= seen.complete_s < ENDS_S, seen
     if can_show(seen):
@@ -48,14 +48,14 @@ def judge(seen: Seen) -> None:
 
 ENDINGS = ((Phase.COMPLETE, Basis.SHOWN), (Phase.SENT, Basis.SENT))
 WHY_SENT = [EVIDENCE[case].words.format(car="red") for case in StopCase if not EVIDENCE[case].shown_by]
-WHY_SENT.append(EVIDENCE[StopCase.UNKNOWN_PLATFORM].words.format(car="red"))
+WHY_SENT += [EVIDENCE[case].words.format(car="red") for case in (StopCase.WRONG_PLATFORM, StopCase.NOT_KNOWN)]
+FOUND_S = 7.0
+"""Maximum time until a car of an unknown platform is in mode 0 that was found in a mode that it reports."""
 
 
 def can_show(seen: Seen) -> bool:
     """Return True for a car that shows each stop: its platform does, it has an echo, and its fan is off."""
-    without = ("raspberry_pi", "no-echo", "flickering", "fan-on")
-    if "told-unknown" in seen.case and ("restored" in seen.case or "lossy" in seen.case):
-        return False  # the car looks like a Raspberry Pi that keeps reporting, see EVIDENCE
+    without = ("raspberry_pi", "stm32", "told-unknown", "no-echo", "flickering", "fan-on", "black")
     return not any(words in seen.case for words in without) and not seen.case.startswith("arduino-fan")
 
 
@@ -86,12 +86,12 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
         assert pair.control.model.motors == "unknown", "it is not heard"
 
 
-@pytest.mark.xfail(reason="docs/reference/protocol.md#hazards: no frame of recovery clears this string")
 def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
     """The car has half a frame, and its ranging ends when only the `$` of recovery's `MODE00` has come.
 
     The `$` goes with the string of the half frame, and `4WD,MODE00#` stays. The car knows it neither as a MODE frame
-    nor as any other frame, never clears it, and appends all later bytes. Its reports go on, so nobody notices.
+    nor as any other frame, never clears it, and appends all later bytes. Its reports go on, so nobody notices. After a
+    cut write, recovery sends the last color too, which clears the string.
     """
     pair = Pair(world=World.open_field(), start_s=2.0).ready()
     pair.until(lambda: not pair.car.truth.blocked, 3.0)
@@ -139,7 +139,7 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
         pair.until(lambda pair=pair: Phase.SENT in pair.phases("mode"), OPENS_S)
         assert pair.sent[-1][1] == b"$4WD,MODE41#"
         opened_at = pair.sent[-1][0]
-        pair.until(lambda pair=pair: pair.car.truth.mode is Mode.COLOR_LED, 0.06)  # the car is awake and reads at once
+        pair.until(lambda pair=pair: pair.car.truth.mode is Mode.COLOR_LED, 1.1)  # it may range once before
         pair.run(10.0)
         assert pair.off_for_good_at() < opened_at, f"seed {seed}: {pair.sent}"
 
@@ -147,12 +147,17 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 # ---------------------------------------------------------------------- the choice, as a table
 
 
+FLAGS = (True, False)
+
+
 def situations() -> list[stopping.StopContext]:
     """Return all combinations of the inputs of the choice."""
     return [
-        stopping.StopContext(parse_platform(platform), known, mode, *flags)
-        for platform, known, mode, *flags in product(
-            Platform, (True, False), (None, *Mode), (True, False), (True, False), (True, False), (True, False)
+        stopping.StopContext(
+            parse_platform(platform), known, mode, contradicted, clear, blocked, doubted=doubted, open_mode=open_mode
+        )
+        for platform, known, mode, contradicted, clear, blocked, doubted, open_mode in product(
+            Platform, FLAGS, (None, *Mode), FLAGS, FLAGS, FLAGS, FLAGS, FLAGS
         )
     ]
 
@@ -162,35 +167,47 @@ def certain(situation: stopping.StopContext) -> bool:
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
+def knows_modes(situation: stopping.StopContext) -> bool:
+    """Return True if the car may get a named frame: its platform knows it, or its readings show an open mode."""
+    return situation.open_mode or situation.profile.kind in (Platform.ARDUINO, Platform.STM32)
+
+
+def is_doubtful(situation: stopping.StopContext) -> bool:
+    """Return True if the car gets both kinds of stops."""
+    return situation.doubted or situation.profile.kind in (Platform.RASPBERRY_PI, Platform.UNKNOWN)
+
+
 # The first matching row counts (docs/reference/protocol.md#stops).
 FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence], ...] = (
-    (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), sequences.UNKNOWN_MANUAL),
-    (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, sequences.UNKNOWN),
-    (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, sequences.PI),
+    (lambda it: not knows_modes(it), sequences.GENERAL),
+    (lambda it: is_doubtful(it) and not it.known, sequences.BOTH),
+    (lambda it: is_doubtful(it) and certain(it), sequences.BOTH_MANUAL),
+    (is_doubtful, sequences.BOTH),
     (lambda it: not it.known, sequences.RECOVERY),
-    (lambda it: certain(it) and not it.clear, sequences.FULL_BEHIND),
+    (lambda it: not certain(it), sequences.FULL_MODE),
+    (lambda it: it.profile.kind is Platform.STM32, sequences.GENERAL),
+    (lambda it: not it.clear, sequences.FULL_BEHIND),
     (lambda it: True, sequences.FULL),
 )
 
 
 def test_the_choice_of_a_stop_over_the_whole_product_of_its_inputs() -> None:
     everything = situations()
-    assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2
+    assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2 * 2
     for situation in everything:
         full = next(recipe for fits, recipe in FULL if fits(situation))
         assert stopping.full(situation) is full, situation
-        style = StopStyle.UNKNOWN if situation.doubted else situation.profile.stop_style
-        if style is StopStyle.RASPBERRY_PI:
-            soft = sequences.PI_SOFT
+        if not knows_modes(situation):
+            soft = sequences.GENERAL_SOFT
         else:
-            soft = sequences.SOFT if certain(situation) and style is StopStyle.MODE_FRAME else full
+            soft = sequences.SOFT if certain(situation) and not is_doubtful(situation) else full
         assert stopping.soft(situation) is soft, situation
         assert stopping.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
 
 
 def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
     for situation in situations():
-        profile = parse_platform("unknown") if situation.doubted else situation.profile
+        profile = parse_platform("arduino") if situation.open_mode else situation.profile
         for recipe in (stopping.full(situation), stopping.soft(situation), stopping.recovery(situation)):
             for step in recipe.steps:
                 assert profile.refusal(step.frame) is None, (situation, recipe)
@@ -207,7 +224,7 @@ def test_every_recipe_ends_alone_in_the_buffer() -> None:
 def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
     for each in situations():
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
-            pacing = Pacing(each.profile)
+            pacing = Pacing(each.profile, Learned())
             pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
             situation = replace(each, clear=pacing.clear_at(100.0), blocked=False)
             for recipe in (stopping.full(situation), stopping.soft(situation)):
