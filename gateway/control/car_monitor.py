@@ -10,7 +10,7 @@ from gateway.control.estimate.learned import Shows
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
-from gateway.control.events import Level
+from gateway.control.events import FrameOrigin, Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
@@ -75,7 +75,8 @@ class CarMonitor:
         model.mode.on_reading(event, counts=settled)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
-        if model.trust.state is CarTrust.UNHEARD:
+        if self._silent_since is not None:  # somebody may have commanded it since
+            self._silent_since = None
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
         if model.evidence.found_out:
@@ -138,7 +139,11 @@ class CarMonitor:
         words = f"{model.name} is a {model.profile.name} car: {model.platform.evidence[0]}"
         self._log.log(Level.INFO, "platform_settled", words, now)
         if model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
-            self._stops.recover(now, words)  # it can show its stop, and half a named frame may lie in its buffer
+            # It can show its stop, and half a named frame may lie in its buffer.
+            if model.known:
+                self._stops.begin(self._stops.full(now), FrameOrigin.RECOVERY, now)
+            else:
+                self._stops.recover(now, words)
 
     @property
     def _is_idle(self) -> bool:

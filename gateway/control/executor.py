@@ -113,11 +113,13 @@ class Executor:
         if held is not None and not held.pending.sent and self._is_new(held.pending):
             self.stops.give_way(now)
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
-        change = queue.mode_change
-        if change is not None and not (queue.one_shots and model.at_rest) and self._is_new(change):
+        change, running = queue.mode_change, self.stops.running
+        # A command that was queued before the mode goes first: in the mode the car would ignore it.
+        stands = model.at_rest or (running is not None and running.sequence.rank > SOFT.rank)
+        if change is not None and not (queue.one_shots and stands) and self._is_new(change):
             return self._open_mode(change, now)
         if queue.one_shots and now >= model.pacing.act_at(queue.one_shots[0].frames[0]):
-            pending = queue.one_shots[0]  # queued before the mode, in which the car would ignore it
+            pending = queue.one_shots[0]
             if self._is_new(pending):
                 frame = model.believed.with_motion(pending.frames[0])
                 return self._write(frame, FrameOrigin.COMMAND, pending, pending)

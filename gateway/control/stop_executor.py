@@ -237,6 +237,8 @@ class StopExecutor:
                 pass
         if is_time_up and model.believed.fan and model.profile.fan_silences:
             return StopCase.FAN
+        if running.case in (StopCase.RASPBERRY_PI, StopCase.UNKNOWN_PLATFORM):
+            return None
         if running.no_echo_at > running.closed_at:
             return StopCase.NO_ECHO
         if running.case is StopCase.MANUAL or running.case is StopCase.NO_REACTION:
@@ -298,9 +300,10 @@ class StopExecutor:
     def give_way(self, now: float) -> None:
         """End a stop that the car has not shown yet: a new command takes the place of its repeats."""
         running, self.running = self.running, None
-        words = f"NOT CONFIRMED: {self.model.name} was commanded again before it reacted to the stop"
+        words = f"{self.model.name} was commanded again before its readings could show the stop, which was sent"
         for pending in running.commands if running is not None else ():
-            self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
 
     # ------------------------------------------------------------------ evidence
 
@@ -338,9 +341,9 @@ class StopExecutor:
     def on_contact(self, now: float, words: str) -> None:
         """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""
         running = self.running
-        if running is not None and running.at_rest:
+        if running is None or running.at_rest:
             self.recover(now, words)
-        elif running is not None:
+        else:
             self._try_again(running, now)
 
     def _may_probe(self, running: StopInProgress) -> bool:

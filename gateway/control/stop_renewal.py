@@ -74,4 +74,7 @@ class StopRenewal:
         A general stop does nothing to a car that keeps half a named frame (docs/reference/protocol.md#hazards).
         `MODE00` clears it.
         """
-        return self._model.rest in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS
+        model = self._model
+        if model.profile.refusal(ModeClose()) is not None:
+            return False  # some programs end at a named frame
+        return model.rest in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS

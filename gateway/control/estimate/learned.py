@@ -165,11 +165,12 @@ class Learned:
     # ------------------------------------------------------------------ rhythm and delays
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
-        """Add an undisturbed interval. Return True if the car has another rhythm now: what it showed is forgotten."""
-        changed = (self.echo if echo else self.no_echo).add(interval_s)
-        if changed and echo:
+        """Add an undisturbed interval. Return True if the car has another rhythm now, and what it showed is forgotten."""
+        changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
+        was_known = self.shows is not Shows.UNKNOWN
+        if changed:
             self.forget_reactions()
-        return changed
+        return changed and was_known
 
     def forget_reactions(self) -> None:
         """Forget what the car can show: it is not known whether it is the same car."""

@@ -443,6 +443,8 @@ class StopEvidence:
         if not event.range_cm:
             if before_no_echo is not None and pending is None and not blocking:
                 self.learned.add_interval(at - before_no_echo, echo=False)
+            if pending is not None and at > pending + self.close_s + self.profile.ranging_s:
+                self._pending = None  # it blocked this report or none
             return Finding.NO_ECHO
         if pending is None:
             return self._without_mode_00(before, at, blocking, general=general)

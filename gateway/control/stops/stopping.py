@@ -226,9 +226,8 @@ class StopInProgress:
         return first
 
     def on_other_written(self, now: float) -> None:
-        """Move the rest of a soft stop: its last frame must be alone in the car's buffer."""
-        if self.sequence.rank == sequences.SOFT.rank:
-            self.last_at = now
+        """Move the rest of the stop: its frames keep their distance from the command that went before them."""
+        self.last_at = now
 
     def begin_try(self, sequence: StopSequence, now: float) -> None:
         """Begin the next try."""

@@ -8,7 +8,7 @@ from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
 from gateway.protocol.enums import Light, Mode, Motion
 from gateway.protocol.frames import General
 from gateway.protocol.platforms import parse_platform
-from tests.gateway.control.workbench import MODE00, RUN, STOP, Workbench
+from tests.gateway.control.workbench import MODE00, REPORT_S, RUN, STOP, Workbench
 
 FORWARD = Drive(Motion.FORWARD, 9.0)
 
@@ -19,7 +19,7 @@ def reading(voltage: float) -> bytes:
 
 def drained(desk: Workbench, voltage: float) -> None:
     for _ in range(12):
-        desk.run(1.0, reports=False)
+        desk.run(REPORT_S, reports=False)
         desk.hear(reading(voltage))
 
 
@@ -64,7 +64,7 @@ def test_a_constant_is_no_battery(platform: str) -> None:
     desk = Workbench(platform)
     desk.control.link_up(desk.now)
     for _ in range(20):
-        desk.run(1.0, reports=False)
+        desk.run(REPORT_S, reports=False)
         desk.hear(b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#")
     assert desk.control.model.battery.level is None
     assert not [log for log in desk.logs if log.code.startswith("battery")]

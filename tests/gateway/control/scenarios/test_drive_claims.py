@@ -10,12 +10,14 @@ from tests.support.virtual import Pair
 
 
 def driven(*, deaf: bool) -> Pair:
-    """Drive a car for a second. A deaf car receives no frame."""
+    """Drive a car for a second. A deaf car has shown a stop before, and receives no frame any more."""
     pair = Pair(start_s=2.0)
+    pair.connect()
+    pair.until(lambda: pair.control.model.trust.shown, 20.0)
     if deaf:
         pair.lose_frames()
-    pair.connect()
-    pair.run(20.0)
+        pair.ask(Stop())
+        pair.run(20.0)
     assert pair.control.model.trust.state is (CarTrust.UNPROVEN if deaf else CarTrust.STOPPED)
     pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     pair.run(4.0)
@@ -29,9 +31,19 @@ def test_a_drive_of_a_deaf_car_was_sent_and_nothing_shows_that_it_moved() -> Non
     assert "red may not have moved" in last.words
 
 
-def test_a_drive_of_a_car_that_hears_is_complete() -> None:
+def test_a_drive_whose_distance_has_changed_is_complete() -> None:
     last = [record for record in driven(deaf=False).records if record.command.id == "drive"][-1]
-    assert (last.phase, last.basis) == (Phase.COMPLETE, "")
+    assert (last.phase, last.basis) == (Phase.COMPLETE, "shown")
+    assert last.evidence[0].startswith("its distance changed from ")
+
+
+def test_a_drive_without_a_report_in_it_was_sent_for_its_time() -> None:
+    pair = Pair(start_s=2.0).ready()
+    pair.ask(Drive(Motion.FORWARD, 0.3), identity="drive")
+    pair.run(1.0)
+    last = pair.last_of("drive")
+    assert last is not None
+    assert (last.phase, last.basis, last.words) == (Phase.SENT, "sent", "sent for 0.3 s")
 
 
 def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:

@@ -22,7 +22,7 @@ from tests.support.virtual import Pair
 
 RECOVERED_S = 7.3
 """Maximum time of recovery outside avoidance, in theory (docs/reference/protocol.md#stops)."""
-SETTLED_S = 9.0
+SETTLED_S = 12.0
 """Time in which every stop ends, and in which a car that drives on shows it."""
 
 Ours = Callable[[Pair], None]
