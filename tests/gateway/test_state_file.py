@@ -1,6 +1,7 @@
 """The state file survives a restart. The gateway writes it whole, and an unreadable file counts as a hold."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from gateway.state_file import MAX_OTHER_LINKS, SafetyStateFile
 from schemas.links import car_link, parse_link
+from schemas.state_dir import directory_of
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses, wait_for
 
 LINK, OTHER = "serial:///dev/ttyUSB0", "serial:///dev/pts/7"
 NOW = 1_800_000_000_000_000_000
@@ -178,6 +182,33 @@ def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: by
         assert json.loads(content)["hold"] is None
     else:
         assert 0 <= held.since_ns <= NOW
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the car is on a pseudo terminal")
+def test_a_gateway_says_what_it_does_not_take_over_and_a_damaged_file_holds_the_car(tmp_path: Path) -> None:
+    from tests.gateway.link.peers import PtyPeer
+
+    peer, started = PtyPeer(tmp_path), FleetProcesses(free_endpoint(), tmp_path)
+    directory = directory_of(started.endpoint, Path(started.environment["FLEET_STATE_DIR"]))
+    try:
+        SafetyStateFile(directory, "fleet", "red", OTHER).save(PersistedSafety(Hold("mia", 7)))
+        gateway = started.gateway(str(peer.url))
+        words = f"the hold of mia belongs to the car at {OTHER}, not to the one at {peer.url} [other_link]"
+        wait_for(lambda: words in gateway.stderr, "it is said")
+        wait_for(lambda: started.state("safety") is not None, "it is on the bus")
+        assert not started.state("safety").HasField("hold")
+        gateway.kill()
+        gateway.wait()
+        (directory / "fleet.red.json").write_text("{")
+        gateway = started.gateway(str(peer.url))
+        words = (
+            f"the state file {directory / 'fleet.red.json'} is unreadable: the car is on hold until somebody resumes"
+        )
+        wait_for(lambda: words in gateway.stderr, "it is said")
+        wait_for(lambda: (safety := started.state("safety")) and safety.HasField("hold"), "it is on hold")
+    finally:
+        started.close()
+        peer.close()
 
 
 SAVED: bytes = json.dumps({"hold": {"by": "mia", "since_ns": NOW}}).encode()
