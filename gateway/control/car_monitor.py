@@ -75,7 +75,8 @@ class CarMonitor:
         model.mode.on_reading(event, counts=settled)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
-        if self._silent_since is not None:  # somebody may have commanded it since
+        # Somebody may have commanded it in the silence.
+        if self._silent_since is not None or model.trust.state is CarTrust.UNHEARD:
             self._silent_since = None
             self._on_contact(now)
         finding = model.evidence.on_reading(event)

@@ -155,7 +155,9 @@ class Executor:
         running = self.stops.running
         if running is None or running.sequence.rank == SOFT.rank:
             return True
-        return pending.received_at >= running.began_at or running.before is pending
+        # A stop that precedes a mode is there for that mode, and for what was queued before it.
+        before = running.before is not None and pending.received_at <= running.before.received_at
+        return pending.received_at >= running.began_at or before
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
         """Repeat the stop of a car at rest that has not shown it: its frames may have been lost."""

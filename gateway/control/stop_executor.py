@@ -274,7 +274,8 @@ class StopExecutor:
         running.commands[:] = waiting
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
-            if self.model.learned.shows is Shows.UNKNOWN and running.report_at > running.began_at:
+            is_new = self.model.learned.shows is Shows.UNKNOWN and running.report_at > running.began_at
+            if is_new and self.model.is_heard:
                 self._finish_unknown(running, now)
             elif self.model.mode.heard_at > running.began_at:
                 self.model.evidence.reacted_at = None

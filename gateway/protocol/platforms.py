@@ -94,7 +94,7 @@ _STM32_SILENT: Final = frozenset({Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOW
 _STM32_CONSTANTS: Final = frozenset({"grayscale", "line", "obstacle", "light"})
 # docs/reference/protocol.md#ranges
 _PV_MAX: Final = {2: 12.0, 3: 13.0}
-_GRAY_10_BIT, _GRAY_12_BIT = 1023, 4095
+GRAY_10_BIT, _GRAY_12_BIT = 1023, 4095
 
 
 @cache
@@ -174,7 +174,7 @@ class Profile:
     @property
     def grayscale_max(self) -> int:
         """The maximum of GS. A greater value is no measurement."""
-        return _GRAY_12_BIT if self.kind in {Platform.STM32, Platform.UNKNOWN} else _GRAY_10_BIT
+        return _GRAY_12_BIT if self.kind in {Platform.STM32, Platform.UNKNOWN} else GRAY_10_BIT
 
     @property
     def close_s(self) -> float:

@@ -133,7 +133,7 @@ class _Scan:
         frames = ", ".join(encode(step.frame).decode() for step in GENERAL.steps)
         where = ", ".join(str(probe.url) for probe in probed)
         seconds = f"{GENERAL.length_s:g} s"
-        cli_support.print_note(f"sending {frames} within {seconds} to {where}: a car there stops, and goes to mode 0")
+        cli_support.print_note(f"sending {frames} within {seconds} to {where}: a car there stops if it is in mode 0")
         probing = asyncio.gather(*(probe.probe() for probe in probed))
         await self._with_progress(_all(probing), "probing", GENERAL.length_s + STOP_REPORT_TIMEOUT_S)
 

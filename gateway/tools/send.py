@@ -24,6 +24,7 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.modes import MODES
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.tools import cli_support
@@ -193,6 +194,6 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
             )
     if frame is None or (isinstance(frame, General) and moves(frame)):
         lines.append(f"stop it: {again} '{_STOP}'")
-        if "mode" in profile.capabilities:
+        if profile.kind is not Platform.RASPBERRY_PI:
             lines.append(f"     or: {again} '{_MANUAL}', which works in every mode, but not on a Raspberry Pi car")
     return lines

@@ -1,4 +1,4 @@
-"""Draws a car of the protocol: another rhythm, other blocks, another program. See docs/reference/protocol.md#programs."""
+"""Draws a car of the protocol: another rhythm, other blocks, another program (docs/reference/protocol.md#programs-that-people-have)."""
 
 import random
 from collections.abc import Callable
@@ -128,10 +128,8 @@ class UseEpisode:
                 self._violate(f"(5) {what} was refused: {answer.words}")
             return None
         bound = free_at + extra_s + WIRE_S
-        is_sent = (
-            lambda: any(
-                record.phase is Phase.SENT and record.command.what is what for record in pair.records[count:]
-            )
+        is_sent = lambda: any(
+            record.phase is Phase.SENT and record.command.what is what for record in pair.records[count:]
         )
         while not is_sent() and pair.now < bound:
             self._run(0.01)

@@ -30,7 +30,7 @@ from gateway.control.commands import (
     Unpause,
 )
 from gateway.control.controller import Controller
-from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.estimate.trust import Basis
 from gateway.control.events import CommandRecord, FrameOrigin, OutgoingFrame
 from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause
@@ -277,7 +277,7 @@ class Wild:
     def _check_write(self, write: OutgoingFrame) -> None:
         frame, control = write.frame, self.control
         assert self.linked, "nothing is written without a link"
-        self.doubted = self.doubted or control.model.platform.doubted
+        self.doubted = self.doubted or control.model.platform.doubted or control.model.platform.open_mode
         known = control.model.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
@@ -294,8 +294,9 @@ class Wild:
             assert self.control.safety.hold is None
             assert not self.ending
             self._check_mover(write)
-            # A person who sees the car may drive it if it reports but shows no stop. An unknown state forbids driving.
-            assert self.control.model.known or self.control.model.trust.state is CarTrust.UNPROVEN
+            # What the car has not shown forbids nothing. But the first frames of a stop always go out before.
+            running = self.control.stops.running
+            assert running is None or running.sent_all
 
     def _check_mover(self, write: OutgoingFrame) -> None:
         """Require that only a lead starts a paused car, and only the borrower or a lead starts a lent car."""
@@ -320,7 +321,8 @@ class Wild:
                 "servo": frame.servo is not None,
             }
         elif not isinstance(frame, ModeOpen | ModeClose | Reset):
-            acts = {"named": True}
+            clears = why is not FrameOrigin.COMMAND and frame == self.control.model.believed.led
+            acts = {"named": not clears}  # a stop may send the color that the car has
         for name, done in acts.items():
             if done:
                 assert why is FrameOrigin.COMMAND
@@ -367,7 +369,9 @@ def until_off(control: Controller, now: float) -> CommandRecord | None:
     while now < end and (last is None or control.model.motors != "off"):
         while (write := control.poll(now)) is not None:
             frame = write.frame
-            assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP), frame
+            # The color clears a string that begins with `4WD,`. It is the one that the car has.
+            clears = frame == control.model.believed.led
+            assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP) or clears, frame
             control.on_written(write, now)
             report_at += 1.0 if isinstance(frame, ModeClose) and not pi else 0.0
         for record in control.take_records():

@@ -123,7 +123,7 @@ class EpisodePlan:
     faults: tuple[LinkFault, ...]
     opening: bool = False
     """True if `load_s` counts from the frame that opens the mode. If not, it counts from the open mode."""
-    traits: CarTraits = CarTraits()
+    traits: CarTraits = field(default_factory=CarTraits)
     again_s: float = 0.0
     """Time from the first stop to a second stop. 0 for none."""
     drive_again_s: float = 0.0
@@ -410,7 +410,8 @@ class SearchedDirection:
         out = bytearray()
         due = end
         twice = False
-        for number, byte in enumerate(data):
+        for number, sent in enumerate(data):
+            byte = sent
             now = at + each_s * (number + 1)
             lost = False
             for fault in self._faults:

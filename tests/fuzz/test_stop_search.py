@@ -47,7 +47,7 @@ FOUND = (
 def test_no_stop_is_claimed_and_false(part: int) -> None:
     total = search(range(part * EPISODES, (part + 1) * EPISODES))
     assert not total.failures, explain(total)
-    assert total.ends["complete"] > EPISODES // 4
+    assert total.ends["complete"] > EPISODES // 10
     assert total.ends["sent"] > 0
     assert total.ends["failed"] > 0
 

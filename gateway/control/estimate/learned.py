@@ -1,8 +1,8 @@
 """Learns one car's habits from its readings: its rhythm, its delays, and whether it can show that a stop arrived. Pure.
 
-Cars of one protocol run different programs (docs/reference/protocol.md#programs). One reports every 1.25 s by its loop,
-another every second by a timer; for one `MODE00` blocks a second, for another it does not block at all. So no number
-of one program judges another. A car is compared with itself.
+Cars of one protocol run different programs (docs/reference/protocol.md#programs-that-people-have). One reports by its
+loop, another every second by a timer; for one `MODE00` blocks a second, for another it does not block at all. So no
+number of one program judges another. A car is compared with itself.
 
 A *rhythm* is the interval of undisturbed reports: the last few of them, their median and their spread. A report that
 the link lost or held makes a wrong interval, so an interval enters the rhythm only if it fits the others. Three in a
@@ -165,7 +165,7 @@ class Learned:
     # ------------------------------------------------------------------ rhythm and delays
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
-        """Add an undisturbed interval. Return True if the car has another rhythm now, and what it showed is forgotten."""
+        """Add an undisturbed interval. Return True if that is another rhythm, so that what the car showed is forgotten."""
         changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
         was_known = self.shows is not Shows.UNKNOWN
         if changed:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import ArmReading, Event, ImuReading
+from gateway.protocol.events import ArmReading, Event, ImuReading, TextLine
 from gateway.protocol.modes import candidate_modes, only_candidate
 from gateway.protocol.platform_name import Platform
-from gateway.protocol.platforms import Profile, parse_platform
+from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform
 from gateway.protocol.sensors import Sensors
 
 EVIDENCE_FRAMES: Final = 3
@@ -22,7 +22,10 @@ _MEASURED_READINGS: Final = (
     "mode-0 readings with decimals in CSB, or without the constants PV8.4 and GS0 of a raspberry_pi car"
 )
 _CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
-_WITH_MODES: Final = "arduino (or stm32: their bytes are the same)"
+_WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
+_WITH_MODES: Final = "arduino (or stm32: their bytes are mostly the same)"
+TWO_CELLS_V: Final = 9.0
+"""Voltage over which a battery has more than two cells: they have 8.4 V when full."""
 
 
 @dataclass(slots=True)
@@ -60,10 +63,13 @@ class PlatformDetector:
     _options: frozenset[str] = frozenset()
     _seen: dict[str, _PlatformEvidence] = field(
         default_factory=lambda: {
-            word: _PlatformEvidence() for word in (_MODE_READINGS, _MEASURED_READINGS, _CONSTANT_READINGS)
+            word: _PlatformEvidence()
+            for word in (_MODE_READINGS, _MEASURED_READINGS, _CONSTANT_READINGS, _WIDE_READINGS)
         }
     )
-    _frames: dict[str, int] = field(default_factory=lambda: {"arm": 0, "imu": 0})
+    _is_wide: bool = False
+    """True if the grayscale readings are those of an stm32 car."""
+    _frames: dict[str, int] = field(default_factory=dict)
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
@@ -103,11 +109,23 @@ class PlatformDetector:
                 new = self._check_profile(event)
                 if self.auto:
                     self._detect(event)
+                if event.voltage_v is not None and event.voltage_v > TWO_CELLS_V:
+                    self._count_variant("3s")
             case ArmReading() | ImuReading():
                 new = self._count_option("arm" if isinstance(event, ArmReading) else "imu")
+            case TextLine():
+                self._count_variant("text")
+                return ()
             case _:
                 return ()
         return new
+
+    def _count_variant(self, option: str) -> None:
+        """Count one sign of a variant of the program. Only a car whose platform is detected gets it by itself."""
+        self._frames[option] = self._frames.get(option, 0) + 1
+        if self.auto and self._frames[option] == EVIDENCE_FRAMES and option not in self.profile.options:
+            self._options |= {option}
+            self._apply_evidence()
 
     def _check_profile(self, event: Sensors) -> tuple[str, ...]:
         """Update the contradictions of the profile. Only a mode-0 frame can end those of mode 0."""
@@ -125,7 +143,7 @@ class PlatformDetector:
         return new
 
     def _count_option(self, option: str) -> tuple[str, ...]:
-        self._frames[option] += 1
+        self._frames[option] = self._frames.get(option, 0) + 1
         if self._frames[option] != EVIDENCE_FRAMES or option in self.profile.options:
             return ()
         if self.auto:
@@ -147,11 +165,14 @@ class PlatformDetector:
             _MODE_READINGS: not in_manual,
             _MEASURED_READINGS: in_manual and not constants,
             _CONSTANT_READINGS: in_manual and constants,
+            _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
         }
         for words, seen in self._seen.items():
             if seen.update(shown=shown[words]):
                 if words is _CONSTANT_READINGS:
                     self._raspberry_pi = words
+                elif words is _WIDE_READINGS:
+                    self._is_wide = True
                 else:
                     self._with_modes = self._with_modes or words
                 self._apply_evidence()
@@ -160,7 +181,8 @@ class PlatformDetector:
         if bool(self._with_modes) is bool(self._raspberry_pi):
             kind = self.configured.kind
         else:
-            kind = Platform.ARDUINO if self._with_modes else Platform.RASPBERRY_PI
+            modes = Platform.STM32 if self._is_wide else Platform.ARDUINO
+            kind = modes if self._with_modes else Platform.RASPBERRY_PI
         profile = parse_platform("+".join((kind, *sorted(self._options | self.configured.options))))
         if profile.name != self.profile.name:
             self.profile = profile
@@ -171,6 +193,8 @@ class PlatformDetector:
             return ()
         if self._with_modes and self._raspberry_pi:
             return (f"both {self._with_modes} and {self._raspberry_pi}: none of the platforms that are known",)
+        if self._with_modes and self._is_wide:
+            return (f"stm32: {EVIDENCE_FRAMES} {_WIDE_READINGS}",)
         if self._with_modes:
             return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._with_modes}",)
         if self._raspberry_pi:

@@ -10,10 +10,10 @@ alone, and why no other frame of ours may follow it: a general stop written afte
 motion by the link, and nobody would look again. The frame that is judged is the last one.
 
 *Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
-(docs/reference/protocol.md#programs). Reports come every 0.7 s from one car and every 2.2 s from another. So nothing
-here compares a car with a constant: `Learned` has its own rhythm and its own blocks, and a pause is an interval that is
-longer than the rhythm by just the block. A car whose reports come by a timer never pauses. For it nothing is ever shown
-here, which costs it nothing else: stops end as `sent`, and the words say why.
+(docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
+another. So nothing here compares a car with a constant: `Learned` has its own rhythm and its own blocks, and a pause
+is an interval that is longer than the rhythm by just the block. A car whose reports come by a timer never pauses. For
+it nothing is ever shown here, which costs it nothing else: stops end as `sent`, and the words say why.
 
 *Why not one pause.* A link that swallows both `MODE00` and the report after it leaves a gap, too: two intervals instead
 of one. If the interval is about as long as the block, that gap equals a pause. Half of all outages of 0.6 s around a

@@ -44,7 +44,7 @@ def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
 
     `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame goes only
     to a car whose platform knows it, or whose readings show that it does: others may die of it
-    (docs/reference/protocol.md#programs).
+    (docs/reference/protocol.md#programs-that-people-have).
     """
     if profile.stop_style is StopStyle.GENERAL:
         return StopStyle.BOTH if open_mode else StopStyle.GENERAL

@@ -81,8 +81,10 @@ class Published:
         return self._before
 
     def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
-        """Publish the health. Return its fields, as in JSON."""
-        self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
+        """Publish the health of a car of this platform. Return its fields, as in JSON."""
+        model = self.desk.control.model
+        model.platform = platform
+        self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0, model=model)
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before["state/health"]
 

@@ -396,7 +396,7 @@ def test_a_lent_car_is_the_borrowers_until_the_end_which_stops_it(desk: Workbenc
     desk.run(50.0)
     desk.ask(FORWARD, CID)
     desk.run(8.0)
-    assert desk.frames[-5:] == [RUN, *SHOWN_STOP]
+    assert desk.frames[-4:] == [RUN, *SHOWN_STOP]
     assert desk.control.safety.lease is None
     assert desk.control.safety.loan is None
     assert desk.ask(FORWARD, CID).reason is Reason.NOT_ALLOWED

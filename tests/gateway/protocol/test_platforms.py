@@ -125,15 +125,15 @@ def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
     ("platform", "modes", "stop", "observed", "capabilities"),
     [
         ("arduino", 7, StopStyle.MODE_FRAME, True, "drive whistle speed servo fan light servo_deg led mode"),
-        ("stm32", 7, StopStyle.MODE_FRAME, False, "drive whistle speed servo fan light servo_deg mode"),
+        ("stm32", 7, StopStyle.TIMER, False, "drive whistle speed servo fan light servo_deg mode"),
         (
             "raspberry_pi",
             1,
-            StopStyle.RASPBERRY_PI,
+            StopStyle.GENERAL,
             False,
             "drive whistle speed servo fan light servo_deg led servo_vertical servo_horizontal",
         ),
-        ("unknown", 1, StopStyle.UNKNOWN, False, "drive whistle speed servo fan light"),
+        ("unknown", 1, StopStyle.GENERAL, False, "drive whistle speed servo fan light"),
     ],
 )
 def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, observed: bool, capabilities: str) -> None:

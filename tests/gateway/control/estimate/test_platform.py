@@ -122,7 +122,7 @@ def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platfo
                 for event in decoder.feed(data, at):
                     assert not told.on_event(event)
                     auto.on_event(event)
-        silent = mode in (Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED) and platform != "raspberry_pi"
+        silent = platform != "raspberry_pi" and mode in parse_platform(platform).silent_modes
         running = mode is not Mode.MANUAL and platform != "raspberry_pi"
         kind = "unknown" if silent else "raspberry_pi" if platform == "raspberry_pi" else "arduino"
         assert auto.profile.name == kind + ("" if running else "+arm")
