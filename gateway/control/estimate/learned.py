@@ -165,7 +165,7 @@ class Learned:
     # ------------------------------------------------------------------ rhythm and delays
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
-        """Add an undisturbed interval. Return True if that is another rhythm, so that what the car showed is forgotten."""
+        """Add an undisturbed interval. Return True if that is another rhythm, which ends what the car has shown."""
         changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
         was_known = self.shows is not Shows.UNKNOWN
         if changed:

@@ -13,7 +13,8 @@ REPEAT_INTERVAL_S: Final = 1.1
 STOP_REPORT_TIMEOUT_S: Final = 4.5
 """Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
 # On the STM32 a named frame that arrives while a report is sent lies over a general frame that was not read yet, and
-# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one report of 48 ms.
+# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one
+# report of 48 ms.
 NAMED_GAP_S: Final = 0.13
 """Minimum time from any frame to a named one."""
 # While the car may still show that it left its mode, a general stop would follow the evidence unjudged. A `MODE00`

@@ -1,0 +1,15 @@
+"""The use of cars that differ, on a whole link, in 200 episodes that never change. `make soak` plays 10,000."""
+
+import pytest
+
+from tests.fuzz.any_car import play
+
+PARTS = 2
+EPISODES = 100
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_whatever_a_car_can_show_it_is_usable(part: int) -> None:
+    uses = [play(seed) for seed in range(part * EPISODES, (part + 1) * EPISODES)]
+    assert not [use for use in uses if use.violations]
+    assert sum(len(use.commands) for use in uses) > 4 * EPISODES
