@@ -16,7 +16,7 @@ export const verdicts = {
 
 export const motors = {
   "off shown": ["■", "off, shown by its readings"],
-  "off sent": ["□", "off as sent; this car cannot show it"],
+  "off sent": ["□", "off as sent; nothing shows it"],
   off: ["□", "off"],
   on: ["▶", "on"],
   stopping: ["…", "stopping, not shown yet"],
@@ -51,8 +51,8 @@ export const stopStates = {
   asked: ["…", "asked"],
   stopping: ["…", "stopping"],
   shown: ["✓", "stands, shown"],
-  sent: ["□", "stop sent; this car cannot show it"],
-  failed: ["✕", "not stopped"],
+  sent: ["□", "stop sent; nothing shows it"],
+  failed: ["✕", "NOT CONFIRMED"],
 };
 
 export const pad = [
