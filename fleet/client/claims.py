@@ -28,6 +28,8 @@ NO_GATEWAY: Final = "no gateway"
 OFF: Final = "off"
 _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
+LATE_MESSAGE_NS: Final = 2_000_000_000
+"""Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
 _STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
@@ -144,22 +146,25 @@ class GatewayStarts:
     """Recognizes which messages are from the running gateway of a car.
 
     Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
-    reader. It must not bring back what that gateway claimed.
+    reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
+    them ends. So a message that is stamped clearly later than all others counts, whatever its start.
     """
 
     def __init__(self) -> None:
         self.current = ""
-        """The boot_id of the running gateway. Empty if it is not known yet."""
+        """The boot_id of the running gateway. Empty if it is not known."""
+        self._newest_ns = 0
         self._ended: dict[str, None] = {}
 
-    def take(self, boot_id: str) -> bool:
+    def take(self, boot_id: str, stamp_ns: int = 0) -> bool:
         """Return True if a message of this start counts. A new start ends the one before."""
-        if not boot_id or boot_id == self.current:
-            return True
-        if boot_id in self._ended:
+        if boot_id in self._ended and stamp_ns <= self._newest_ns + LATE_MESSAGE_NS:
             return False
-        self.end()
-        self.current = boot_id
+        if boot_id and boot_id != self.current:
+            self.end()
+            self._ended.pop(boot_id, None)
+            self.current = boot_id
+        self._newest_ns = max(self._newest_ns, stamp_ns)
         return True
 
     def end(self) -> None:
