@@ -30,6 +30,7 @@ _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
 """Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
+_OPEN: Final = ("online", "quiet", "stale")
 _STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
@@ -51,6 +52,11 @@ class Claim:
     """The last claim of a gateway that is gone."""
     is_stale: bool = False
     """True if the gateway should have published it again meanwhile."""
+
+    @property
+    def basic(self) -> str:
+        """The claim with its basis."""
+        return f"{self.what} ({self.basis})" if self.basis else self.what
 
     @property
     def short(self) -> str:
@@ -176,14 +182,40 @@ class GatewayStarts:
         self.current = ""
 
 
+@dataclass(frozen=True, slots=True)
+class CarClaims:
+    """The claims about one car."""
+
+    motors: Claim
+    mode: Claim
+    link: Claim
+
+    @property
+    def by_name(self) -> dict[str, Claim]:
+        """The claims by what they are about."""
+        return {"motors": self.motors, "mode": self.mode, "link": self.link}
+
+
 def claims_of(
     states: Mapping[str, Any], ages_s: Mapping[str, float] | None = None, *, present: bool = True
-) -> tuple[Claim, Claim, Claim]:
-    """Return the claims of motors, mode and link. states: the newest messages by topic, with their ages."""
+) -> CarClaims:
+    """Return the claims about a car. states: the newest messages by topic, with their ages."""
     ages = ages_s or {}
     safety, mode, link = ((states.get(topic), ages.get(topic, 0.0)) for topic in _STATES)
-    return (
+    return CarClaims(
         motors_claim(*safety, present=present),
         mode_claim(*mode, present=present),
         link_claim(*link, present=present),
+    )
+
+
+def is_ready(claims: CarClaims, safety: Any) -> bool:
+    """Return True if a command to this car would wait for nothing now. What it has not shown delays none."""
+    return safety is not None and claims.link.what in _OPEN and not safety.waits_for
+
+
+def describe_end_of_doubt(car: str) -> str:
+    """Return how the doubt about a car ends: no plan uses it until then."""
+    return (
+        f"`fleet stop {car}` ends the doubt if it shows that stop, `fleet resume {car}` if a person has looked at it."
     )
