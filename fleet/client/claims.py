@@ -35,7 +35,7 @@ _STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class CarClaim:
     """One statement about a car."""
 
     what: str
@@ -48,7 +48,7 @@ class Claim:
     """Time since the gateway published it. None if it never did."""
     why: str = ""
     """The evidence or the cause, for a person."""
-    past: "Claim | None" = None
+    past: "CarClaim | None" = None
     """The last claim of a gateway that is gone."""
     is_stale: bool = False
     """True if the gateway should have published it again meanwhile."""
@@ -84,12 +84,12 @@ class Claim:
         }
 
 
-def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> Claim:
+def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
     """Return what is claimed of the motors. safety: the newest fleet.v1.Safety; None: there is none."""
     if safety is None or not safety.motors:
-        return Claim(UNKNOWN)
+        return CarClaim(UNKNOWN)
     since_s = safety.trust_since_s + age_s if safety.HasField("trust_since_s") else None
-    claim = Claim(
+    claim = CarClaim(
         safety.motors,
         safety.motors_basis,
         since_s,
@@ -97,28 +97,28 @@ def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> Cl
         safety.trust_evidence,
         is_stale=_is_stale("state/safety", age_s),
     )
-    return claim if present else Claim(UNKNOWN, past=claim)
+    return claim if present else CarClaim(UNKNOWN, past=claim)
 
 
-def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> Claim:
+def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
     """Return what is claimed of the mode. mode: the newest fleet.v1.Mode; None: there is none."""
     if mode is None or not mode.asked:
-        return Claim(UNKNOWN)
+        return CarClaim(UNKNOWN)
     since_s = mode.evidence_age_s + age_s if mode.HasField("evidence_age_s") else None
     is_stale = _is_stale("state/mode", age_s)
-    claim = Claim(mode.asked, mode.verdict, since_s, age_s, mode.evidence, is_stale=is_stale)
-    return claim if present else Claim(UNKNOWN, past=claim)
+    claim = CarClaim(mode.asked, mode.verdict, since_s, age_s, mode.evidence, is_stale=is_stale)
+    return claim if present else CarClaim(UNKNOWN, past=claim)
 
 
-def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> Claim:
+def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
     """Return what is claimed of the link. link: the newest fleet.v1.Link; None: there is none."""
     if link is None or not link.state:
-        return Claim(UNKNOWN if present else NO_GATEWAY)
-    claim = Claim(link.state, "", link.since_s + age_s, age_s, link.reason, is_stale=_is_stale("state/link", age_s))
-    return claim if present else Claim(NO_GATEWAY, past=claim)
+        return CarClaim(UNKNOWN if present else NO_GATEWAY)
+    claim = CarClaim(link.state, "", link.since_s + age_s, age_s, link.reason, is_stale=_is_stale("state/link", age_s))
+    return claim if present else CarClaim(NO_GATEWAY, past=claim)
 
 
-def rest_words(motors: Claim, car: str) -> str:
+def rest_words(motors: CarClaim, car: str) -> str:
     """Return what a gateway's last claim says of its stop: stopped, stop sent, or not confirmed."""
     if motors.what != OFF:
         return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
@@ -186,12 +186,12 @@ class GatewayStarts:
 class CarClaims:
     """The claims about one car."""
 
-    motors: Claim
-    mode: Claim
-    link: Claim
+    motors: CarClaim
+    mode: CarClaim
+    link: CarClaim
 
     @property
-    def by_name(self) -> dict[str, Claim]:
+    def by_name(self) -> dict[str, CarClaim]:
         """The claims by what they are about."""
         return {"motors": self.motors, "mode": self.mode, "link": self.link}
 

@@ -5,12 +5,12 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from typing import Any, Final
 
 from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import person_of
+from schemas.local_time import clock
 
 RECENT_COMMAND_S: Final = 600.0
 """Maximum age of a command that `fleet doctor` looks at."""
@@ -421,7 +421,7 @@ def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
 def _who(deed: Any, stamp: Any) -> str:
     """Return the person of an e-stop, a pause, a hold or a loan, with rank, time and reason."""
     rank = f" ({deed.rank})" if deed.rank else ""
-    since = f" since {datetime.fromtimestamp(stamp.seconds).astimezone():%H:%M:%S}" if stamp.seconds else ""
+    since = f" since {clock(stamp.seconds)}" if stamp.seconds else ""
     why = f": {deed.why}" if getattr(deed, "why", "") else ""
     return f"{person_of(deed.by) or deed.by}{rank}{since}{why}"
 

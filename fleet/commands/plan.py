@@ -5,7 +5,7 @@ import json
 import re
 import time
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Final
 
@@ -17,10 +17,11 @@ from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import WrongFile, bus_options, json_option, open_client, with_client
-from fleet.commands.params import complete_car
+from fleet.commands.params import SessionPath, complete_car
 from fleet.policy.requests import PlanRequest
 from schemas import keys
 from schemas.bus import Failure
+from schemas.local_time import clock
 from schemas.suggestion import did_you_mean
 
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
@@ -32,16 +33,36 @@ _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.comma
 examples:
   fleet why red
   fleet why              # every car, role and phase
-  fleet why patrol --json"""
+  fleet why patrol --json
+  fleet why red --session latest --at 14:05   # why did red not stop then"""
 )
 @click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...", shell_complete=complete_car)
+@click.option("--session", type=SessionPath(), help="Explain a car in this recording, at the time of --at.")
+@click.option("--at", "at", metavar="TIME", help="Local time of day (14:05, 14:05:12), or a time in the session.")
 @json_option
-@with_client
-def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
+@bus_options
+def why(
+    subjects: tuple[str, ...], session: Path | None, at: str | None, connect: str | None, fleet: str, *, as_json: bool
+) -> None:
     """Explain why a car does what it does: what the plan decided, from which readings, and what would change it.
 
-    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that.
+    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at:
+    what happened to one car around that time of a recording, and why a stop was not shown.
     """
+    if session is not None or at is not None:
+        from fleet.commands.why_session import explain_session
+
+        if session is None or at is None or len(subjects) != 1:
+            raise click.UsageError(
+                "of a recording, give one car, --session and --at: fleet why red --session latest --at 14:05"
+            )
+        explain_session(subjects[0], session, at, as_json=as_json)
+        return
+    with open_client(connect, fleet) as client:
+        _explain_now(client, subjects, as_json=as_json)
+
+
+def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
     people = _people(client, subjects)
@@ -83,7 +104,7 @@ def _people(client: Fleet, cars: Sequence[str]) -> dict[str, list[str]]:
 def _describe(reading: Reading, people: Sequence[str]) -> str:
     decision = reading.value
     since_s = decision.since.seconds + decision.since.nanos / 1e9
-    at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
+    at = clock(since_s)
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
     lines += [f"  person: {each}" for each in people]

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-from fleet.client.claims import UNKNOWN, Claim, GatewayStarts, motors_claim
+from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim
 from schemas import messages
+from schemas.local_time import date_and_clock
 
 MIN_COLUMN_WIDTH: Final = 4
 """Minimum width of a column that is shortened."""
@@ -47,7 +48,7 @@ class CarStatus:
     """What a command would wait for."""
     heard: bool = False
     """True if bytes came from the car over the link that is open."""
-    rest: Claim = field(default_factory=lambda: Claim(UNKNOWN))
+    rest: CarClaim = field(default_factory=lambda: CarClaim(UNKNOWN))
     """The last claim about the motors, also of a gateway that has ended since."""
     _rest_boot: str = ""
     _starts: GatewayStarts = field(default_factory=GatewayStarts)
@@ -218,7 +219,7 @@ def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "")
 
 
 def _date(stamp: Any) -> str:
-    return f"{stamp.ToDatetime(UTC):%Y-%m-%d %H:%M} UTC"
+    return date_and_clock(stamp.seconds)
 
 
 _SECONDS: Final = re.compile(r"[\d.]+ s\b")

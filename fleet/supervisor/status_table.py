@@ -3,7 +3,6 @@
 import asyncio
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
 from rich.console import Console, Group
@@ -13,6 +12,7 @@ from rich.text import Text
 
 from fleet.supervisor.car_status import CarStatus, fit
 from fleet.supervisor.restart_policy import RunState
+from schemas.local_time import clock
 
 if TYPE_CHECKING:
     from fleet.supervisor.supervisor import Supervisor, SupervisorEvent
@@ -51,7 +51,7 @@ class Table:
         """Print an event above the table, unless the car's row shows it."""
         if event.what in ("process", "hold", "end", "ready", "missing"):
             name = "" if event.what in ("ready", "missing") else f"{event.name}: "
-            line = Text(f"{datetime.now(UTC):%H:%M:%S} {name}{event.words}")
+            line = Text(f"{clock(time.time())} {name}{event.words}")
             self._safely(lambda: self._console.print(line))
 
     async def draw(self) -> None:

@@ -4,7 +4,7 @@ import pytest
 
 from fleet.client.claims import (
     LATE_MESSAGE_NS,
-    Claim,
+    CarClaim,
     GatewayStarts,
     is_bad_rest,
     link_claim,
@@ -49,14 +49,14 @@ def test_without_a_gateway_nothing_is_claimed_but_what_was() -> None:
 @pytest.mark.parametrize(
     ("claim", "begins", "bad"),
     [
-        (Claim("off", "shown"), "stopped", False),
-        (Claim("off", "sent", why="red sends no readings"), "stop sent, red sends no readings", False),
-        (Claim("off", "sent"), "stop sent", False),
-        (Claim("stopping"), "NOT CONFIRMED", True),
-        (Claim("unknown"), "NOT CONFIRMED", True),
+        (CarClaim("off", "shown"), "stopped", False),
+        (CarClaim("off", "sent", why="red sends no readings"), "stop sent, red sends no readings", False),
+        (CarClaim("off", "sent"), "stop sent", False),
+        (CarClaim("stopping"), "NOT CONFIRMED", True),
+        (CarClaim("unknown"), "NOT CONFIRMED", True),
     ],
 )
-def test_stopped_is_said_only_of_what_was_shown(claim: Claim, begins: str, bad: bool) -> None:
+def test_stopped_is_said_only_of_what_was_shown(claim: CarClaim, begins: str, bad: bool) -> None:
     words = rest_words(claim, "red")
     assert words.startswith(begins)
     assert is_bad_rest(words) is bad

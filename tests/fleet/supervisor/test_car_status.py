@@ -25,6 +25,7 @@ from fleet.supervisor.status_table import Table
 from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.local_time import date_and_clock
 
 
 def test_a_row_says_what_is_new_once() -> None:
@@ -138,20 +139,23 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
         (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # a hold of this run
         (
             pb.Safety(hold=MIAS),
-            "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. To end that: fleet resume red --fleet lab",
+            (
+                f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
+                "To end that: fleet resume red --fleet lab"
+            ),
         ),
         (
             pb.Safety(hold=MIAS, estops=[BOBS]),
             (
-                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC: red only accepts stops; "
-                "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. "
+                f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)}: red only accepts stops; "
+                f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
                 "To end that: fleet resume red --fleet lab --estops and then fleet resume red --fleet lab"
             ),
         ),
         (
             pb.Safety(estops=[BOBS, BOBS]),
             (
-                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC and 1 more: red only accepts stops. "
+                f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)} and 1 more: red only accepts stops. "
                 "To end that: fleet resume red --fleet lab --estops"
             ),
         ),
