@@ -214,11 +214,12 @@ def describe_end(results: Mapping[str, str]) -> str:
     bad = [f"{words}: {', '.join(groups[words])}" for words in (NOT_STOPPED, NOT_CONFIRMED) if groups[words]]
     if bad:
         return f"{'; '.join(bad)}. They may be moving: go to them."
-    if not results:
+    known = sum(len(cars) for cars in groups.values())  # the gateways of the others had not started
+    if not known:
         return "no car had been started"
-    if len(groups[STOPPED]) == len(results):
+    if len(groups[STOPPED]) == known:
         return "every car that was started is stopped"
-    return "; ".join(f"{words}: {', '.join(cars)}" for words, cars in groups.items() if cars) or "no car was reached"
+    return "; ".join(f"{words}: {', '.join(cars)}" for words, cars in groups.items() if cars)
 
 
 _RESULTS: Final = (NOT_STOPPED, NOT_CONFIRMED, STOPPED, STOP_SENT, NEVER_REACHED)

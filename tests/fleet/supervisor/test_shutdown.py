@@ -82,6 +82,7 @@ def test_if_it_does_not_come_nothing_was_shown(tmp_path: Path) -> None:
     ("results", "words"),
     [
         ({}, "no car had been started"),
+        ({"red": "its gateway had not started, so it got no command"}, "no car had been started"),
         ({"red": STOPPED, "blue": STOPPED}, "every car that was started is stopped"),
         ({"red": STOPPED, "blue": f"{STOP_SENT}, blue is deaf"}, f"{STOPPED}: red; {STOP_SENT}: blue"),
         (
