@@ -11,6 +11,7 @@ from typing import Final
 
 import click
 
+from fleet.client.claims import CarClaim, motors_claim
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
@@ -65,7 +66,7 @@ def why(
 def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
-    people = _people(client, subjects)
+    people, motors = _people(client, subjects)
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
         if not people or any(car not in people for car in subjects):
             raise click.ClickException(_no_plan(client))
@@ -79,8 +80,12 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
             names = [name.removeprefix("role ") for name in sorted(found)]
             near = did_you_mean(subject, names) or f"There are decisions about: {', '.join(names) or 'nothing yet'}."
             raise click.ClickException(f"No decision about {subject}. {near}")
-        deeds = people.get(subject, [])
-        click.echo(json.dumps(reading.as_dict() | {"people": deeds}) if as_json else _describe(reading, deeds))
+        deeds, claim = people.get(subject, []), motors.get(subject)
+        if as_json:
+            claimed = None if claim is None else claim.as_dict()
+            click.echo(json.dumps(reading.as_dict() | {"people": deeds, "motors": claimed}))
+        else:
+            click.echo(_describe(reading, deeds, claim))
 
 
 def _no_plan(client: Fleet) -> str:
@@ -90,23 +95,28 @@ def _no_plan(client: Fleet) -> str:
     return f"{NO_PLAN}{other}."
 
 
-def _people(client: Fleet, cars: Sequence[str]) -> dict[str, list[str]]:
-    """Return by car who stopped, paused, borrowed or drives it, and what ends that. Empty `cars`: all cars."""
-    found = {}
+def _people(client: Fleet, cars: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, CarClaim]]:
+    """Return by car who stopped, paused, borrowed or drives it, with what ends that, and what is claimed of its motors.
+
+    Empty `cars`: all cars.
+    """
+    found, motors = {}, {}
     for car in cars or ["*"]:
         for reading in client.get(f"{car}/state/safety") if car == "*" or keys.is_name(car) else ():
+            motors[reading.car] = motors_claim(reading.value, reading.age_s())
             deeds = [f"{words}; `{todo}` ends it" for words, todo in describe_people(reading.car, reading.value)]
             if deeds:
                 found[reading.car] = deeds
-    return found
+    return found, motors
 
 
-def _describe(reading: Reading, people: Sequence[str]) -> str:
+def _describe(reading: Reading, people: Sequence[str], motors: CarClaim | None) -> str:
     decision = reading.value
     since_s = decision.since.seconds + decision.since.nanos / 1e9
     at = clock(since_s)
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
+    lines += [f"  motors: {motors.words}"] if motors is not None else []
     lines += [f"  person: {each}" for each in people]
     lines += [f"  reading: {each}" for each in decision.readings]
     lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]

@@ -24,8 +24,8 @@ _LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": 
 _VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
 _EVENT: Final = "last event"
 """The column that gets the remaining width."""
-_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", _EVENT)
-_OPTIONAL_COLUMNS: Final = ("Hz", _EVENT, "motion")
+_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "motors", "held, driven by", "battery", "Hz", _EVENT)
+_OPTIONAL_COLUMNS: Final = ("Hz", _EVENT, "motion", "motors")
 """Columns that a narrow terminal leaves out, in this order."""
 _MIN_EVENT_WIDTH: Final = 16
 
@@ -108,6 +108,7 @@ def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
         Text(row.motion),
+        Text(row.rest.basic if row.motors else ""),
         Text(held or row.lease, "red" if held else ""),
         Text(row.battery, "red" if row.battery.endswith(("low", "critical")) else ""),
         Text(rate, justify="right"),

@@ -608,3 +608,21 @@ def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
         asked += [(ask.car, ask.led) for ask in run.until(run.now + 0.5, every=0.5).asks if ask.led is not None]
     assert asked[:2] == [("red", (255, 0, 0)), ("red", (0, 0, 0))]
     assert run.roles == {"blue": "patrol"}
+
+
+def test_a_car_in_doubt_does_not_keep_a_phase_from_its_timeout() -> None:
+    plan = parse(
+        """
+roles: {scout: {mode: tracking, count: 1}}
+phases:
+  look: {timeout_s: 2, on_timeout: rest}
+  rest: {}
+"""
+    )
+    recovering, doubted = PolicyRun(plan, "green", "red"), PolicyRun(plan, "green", "red")
+    recovering.change("red", motors="unknown")
+    doubted.change("red", motors="unknown", doubted=True)
+    for run in (recovering, doubted):
+        run.at(0.0)
+        run.until(4.0)
+    assert (recovering.memory.phase.name, doubted.memory.phase.name) == ("look", "rest")
