@@ -211,7 +211,8 @@ def claims_of(
 
 def is_ready(claims: CarClaims, safety: Any) -> bool:
     """Return True if a command to this car would wait for nothing now. What it has not shown delays none."""
-    return safety is not None and claims.link.what in _OPEN and not safety.waits_for
+    is_old = claims.link.is_stale or claims.motors.is_stale  # such as those of a replay, or of a gateway that hangs
+    return safety is not None and claims.link.what in _OPEN and not safety.waits_for and not is_old
 
 
 def describe_end_of_doubt(car: str) -> str:

@@ -1,7 +1,8 @@
 """`fleet list` with a silent car, and with a car of another platform than configured."""
 
 import sys
-from datetime import UTC, datetime
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
@@ -96,6 +97,12 @@ def test_motors_have_their_basis_and_a_car_is_ready_or_waits() -> None:
     assert [shown(name, row) for name in ("ready", "motors", "shows stops")] == ["ready", "off (sent)", "no"]
     waiting = row_of("red", states(waits_for="its first stop, for 1.2 s at most"))
     assert (waiting["ready"], shown("ready", waiting)) == (False, "waits for its first stop, for 1.2 s at most")
+
+
+def test_of_old_states_no_car_is_ready() -> None:
+    old = {topic: replace(each, time=each.time - timedelta(seconds=60)) for topic, each in states().items()}
+    row = row_of("red", old)
+    assert (row["ready"], shown("ready", row), shown("motors", row)) == (False, "-", "off (sent, stale)")
 
 
 def test_without_a_gateway_no_link_is_online_and_no_motors_are_off() -> None:
