@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
@@ -21,7 +21,9 @@ from typing import Any, Final
 
 import click
 
+from fleet.client.claims import SHOWN
 from fleet.client.client import Fleet
+from fleet.client.outcome import Outcome
 from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
@@ -271,7 +273,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     outcomes = client.stop()
     run.check(
         "stop",
-        f"all three stopped within {max(each.took_s for each in outcomes):.1f} s"
+        f"sent to all three within {max(each.took_s for each in outcomes):.1f} s, shown by {_shown(outcomes)}"
         if all(each.ok for each in outcomes)
         else ", ".join(str(each) for each in outcomes if not each.ok),
         ok=all(each.ok for each in outcomes),
@@ -292,6 +294,11 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     coordinator.send_signal(signal.SIGTERM)
     code = _ended(coordinator)
     run.check("coordinator ends", _ends({"the coordinator": code}), ok=code == 0)
+
+
+def _shown(outcomes: Sequence[Outcome]) -> str:
+    """Return the cars whose own readings show that they stopped."""
+    return ", ".join(each.car for each in outcomes if each.basis == SHOWN) or "none"
 
 
 def _ends(codes: Mapping[str, int | None]) -> str:

@@ -172,8 +172,6 @@ class CarGateway:
             self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
         if self._not_taken:
             self._commands.log(Level.WARNING, "other_link", self._not_taken)
-        if self._learned_file.trouble:
-            self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
         self._service.attach(
             self._loop,
             values=self._values_due,
@@ -299,6 +297,9 @@ class CarGateway:
             self._commands.log(Level.WARNING, "port_shared", trouble)
 
     def _log_open(self) -> None:
+        if self._learned_file.trouble:
+            self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
+            self._learned_file.trouble = ""
         self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open. The gateway stops the car first.")
 
     async def _read(self, link: Link) -> None:

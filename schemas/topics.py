@@ -189,7 +189,7 @@ CAR_TOPICS: Final = (
         Qos.STATE,
         1.0,
         _STATE,
-        {"worst_stop_s": "s"},
+        {"worst_stop_s": "s", "shown_age_s": "s", "trust_since_s": "s"},
         words={"motors": ("off", "on", "stopping", "unknown"), "motors_basis": ("shown", "sent")},
         entity="safety",
     ),

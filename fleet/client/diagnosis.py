@@ -5,11 +5,12 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from typing import Any, Final
 
+from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import person_of
+from schemas.local_time import clock
 
 RECENT_COMMAND_S: Final = 600.0
 """Maximum age of a command that `fleet doctor` looks at."""
@@ -50,10 +51,17 @@ class CarEvidence:
     """The roles of the plan (fleet.v1.Assignment)."""
     coordinated: bool = False
     """True if a coordinator is on the bus."""
+    ages_s: Mapping[str, float] = field(default_factory=dict)
+    """The age of each message of `states`. Empty: they have just come."""
 
     def of(self, name: str) -> Any:
-        """Return the newest message of a topic. None if there is none."""
-        return self.states.get(name)
+        """Return the newest message of a topic. None if there is none, or if its gateway has gone since."""
+        return self.states.get(name) if self.present else None
+
+    @property
+    def claims(self) -> CarClaims:
+        """What is claimed of motors, mode and link."""
+        return claims_of(self.states, self.ages_s, present=self.present)
 
     @property
     def failed(self) -> list[tuple[float, Any]]:
@@ -133,12 +141,21 @@ def _contradicted(e: CarEvidence) -> str:
     return f"It may be no {health.platform} car: {'; '.join(health.platform_contradictions)}."
 
 
-def _unproven(e: CarEvidence) -> str:
-    safety, link = e.of("state/safety"), e.of("state/link")
-    lost = 0 if link is None else link.rejects.get(_NOT_OBEYED, 0)
-    if safety is None or (safety.trust != "unproven" and not (lost and safety.trust != "stopped")):
+def _doubted(e: CarEvidence) -> str:
+    safety, health = e.of("state/safety"), e.of("state/health")
+    doubted = health is not None and health.doubted
+    if not doubted and (safety is None or safety.trust != "unproven"):
         return ""
-    return "Readings arrive, and the car has not reacted to a stop. The wire to its RX pin may be loose."
+    before = "It has shown its stops before, and did" if doubted else "It could have shown its last stop, and did"
+    return f"{before} not show the last one. Plans leave it alone. {describe_end_of_doubt(e.car)}"
+
+
+def _out_of_range(e: CarEvidence) -> str:
+    health = e.of("state/health")
+    if health is None or not health.out_of_range:
+        return ""
+    fields = ", ".join(health.out_of_range)
+    return f"Always out of range, and so never published: {fields}. Its program is not that of {health.platform} cars."
 
 
 def _silent(e: CarEvidence) -> bool:
@@ -229,7 +246,7 @@ def _held(e: CarEvidence) -> str:
     safety = e.of("state/safety")
     if safety is None or not safety.HasField("hold"):
         return ""
-    return f"On hold: {safety.hold.by} stopped it. No plan moves it until someone resumes it."
+    return f"On hold: {safety.hold.by} sent it a stop. No plan moves it until someone resumes it."
 
 
 def _leased(e: CarEvidence) -> str:
@@ -298,11 +315,12 @@ CHECKS: Final = (
     DoctorCheck("adapter_full", _adapter_full, "fleet check"),
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
-    DoctorCheck("not_shown", _unproven, "fleet stop {car}"),
+    DoctorCheck("not_shown", _doubted, "fleet stop {car}"),
     DoctorCheck("no_frames", _baud, "fleet logs {car}"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
     DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
     DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
+    DoctorCheck("out_of_range", _out_of_range, "fleet watch {car}/frame/rx"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
     DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
     DoctorCheck("paused", _paused, "fleet unpause"),
@@ -339,25 +357,42 @@ def diagnose(evidence: CarEvidence) -> list[DoctorFinding]:
 def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
     """Yield what is known of the car, as names and texts."""
     link, health = evidence.of("state/link"), evidence.of("state/health")
+    claims, battery = evidence.claims, evidence.of("sensor/battery")
+    if not evidence.present:
+        for name, claim in claims.by_name.items():
+            if claim.past is not None:
+                yield name, claim.words
     if link is not None:
         rejected = ", ".join(f"{count} {cause}" for cause, count in sorted(link.rejects.items()))
         counts = f"{link.rx_frames} frames in, {link.tx_frames} out, {link.reconnects} reconnects"
-        yield "link", f"{link.state} for {link.since_s:.0f} s, {counts}{f'; rejected: {rejected}' if rejected else ''}"
+        yield (
+            "link",
+            f"{claims.link.short} for {link.since_s:.0f} s, {counts}{f'; rejected: {rejected}' if rejected else ''}",
+        )
     if (mode := evidence.of("state/mode")) is not None:
         inferred = "" if mode.inferred == mode.asked else f", probably {mode.inferred}"
-        yield "mode", f"{mode.asked}, {mode.verdict}{inferred}{f': {mode.evidence}' if mode.evidence else ''}"
+        yield "mode", f"{claims.mode.short}{inferred}{f': {mode.evidence}' if mode.evidence else ''}"
     if (safety := evidence.of("state/safety")) is not None:
-        basis = f", {safety.motors_basis}" if safety.motors_basis else ""
-        why = f": {safety.trust_evidence}" if safety.trust_evidence else ""
-        yield "motors", f"{safety.motors}{basis}; {safety.trust}{why}"
+        yield "motors", f"{claims.motors.words}; trust {safety.trust}"
         yield "control", _control(evidence.car, safety)
     if health is not None:
         seen = "; ".join(health.platform_evidence) or "nothing was seen yet"
-        yield "platform", f"{health.platform}: {seen}"
-    if (battery := evidence.of("sensor/battery")) is not None:
-        yield "battery", f"{battery.voltage_v:.2f} V, {battery.level}"
+        volts = f", battery {battery.voltage_v:.2f} V ({battery.level})" if battery is not None else ""
+        yield "platform", f"{health.platform}{volts}: {seen}"
+        yield "reports", describe_reports(health)
     yield "refused", _describe_refused(evidence)
     yield "services", ", ".join(_services(evidence, health))
+
+
+def describe_reports(health: Any) -> str:
+    """Return what was learned of a car's reports: their rhythm, and whether they show that a stop arrived."""
+    rhythm = ""
+    if health.HasField("interval_s"):
+        blocks = "".join(
+            f", {each.replace('_', ' ')} +{health.blocks_s[each]:.2f} s" for each in sorted(health.blocks_s)
+        )
+        rhythm = f"every {health.interval_s:.2f} s (spread {health.interval_spread_s:.2f} s{blocks}); "
+    return f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
 
 
 def as_dict(evidence: CarEvidence) -> dict[str, Any]:
@@ -386,7 +421,7 @@ def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
 def _who(deed: Any, stamp: Any) -> str:
     """Return the person of an e-stop, a pause, a hold or a loan, with rank, time and reason."""
     rank = f" ({deed.rank})" if deed.rank else ""
-    since = f" since {datetime.fromtimestamp(stamp.seconds).astimezone():%H:%M:%S}" if stamp.seconds else ""
+    since = f" since {clock(stamp.seconds)}" if stamp.seconds else ""
     why = f": {deed.why}" if getattr(deed, "why", "") else ""
     return f"{person_of(deed.by) or deed.by}{rank}{since}{why}"
 

@@ -2,30 +2,32 @@
 
 from typing import Final
 
+from fleet.client.claims import NOT_CONFIRMED, STOP_SENT, STOPPED
 from schemas.commands import COMMANDS
 
 _ANY: Final = "*"
 _ESTOP: Final[dict[str, str]] = {
     "shown": "emergency-stopped ({took_s:.1f} s)",
     "complete": "emergency-stopped ({took_s:.1f} s)",
-    "unconfirmed": "emergency stop sent, which {car} cannot confirm",
-    "sent": "emergency-stopped",
+    "unconfirmed": "emergency stop sent, {words}",
+    "sent": "emergency stop sent",
 }
 _STOP: Final[dict[str, str]] = {
-    "shown": "stopped ({took_s:.1f} s)",
-    "complete": "stopped ({took_s:.1f} s)",
-    "unconfirmed": "stop sent, which {car} cannot confirm",
-    "sent": "stopped",
+    "shown": f"{STOPPED} ({{took_s:.1f}} s)",
+    "complete": f"{STOPPED} ({{took_s:.1f}} s)",
+    "unconfirmed": f"{STOP_SENT}, {{words}}",
+    "sent": STOP_SENT,
 }
 
 EFFECTS: Final[dict[str, dict[str, str]]] = {
     **{verb: {"sent": row.effect} for verb, row in COMMANDS.items() if row.effect},
     "drive": {
-        "complete": "drove{detail}, then stopped",
-        "unconfirmed": "drive sent, NOT CONFIRMED",
-        "sent": "driving{detail}",
+        "shown": "drove{detail}",
+        "complete": "drive over{detail}",
+        "unconfirmed": "{words}",
+        "sent": "drive sent,{detail}",
     },
-    "release": {"shown": "stopped", "unconfirmed": "stop sent", "sent": "stopped"},
+    "release": {"shown": STOPPED, "unconfirmed": f"{STOP_SENT}, {{words}}", "sent": "nothing to stop"},
     "stop": _STOP,
     "estop": _ESTOP,
     "estop_fleet": _ESTOP,
@@ -48,7 +50,7 @@ NEXT_STEPS: Final = {
 }
 """End of the text of a command that was carried out, by verb."""
 
-_STOP_FAILURES: Final = {"not_shown": "stop sent, {words}", "rejected": "{words}", "failed": "{words}"}
+_STOP_FAILURES: Final = {"not_shown": f"{STOP_SENT}, {{words}}", "rejected": "{words}", "failed": "{words}"}
 """The gateway's words of a stop that failed begin with the fact for the car."""
 STOP_VERBS: Final = frozenset({"stop", "estop", "estop_fleet", "pause", "release"})
 
@@ -58,7 +60,9 @@ def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, word
     tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
     template = next((table[result] for result in results for table in tables if result in table), "{words}")
     shown = f" {detail}" if detail else ""
-    text = template.format(car=car, detail=shown, words=words, took_s=took_s).removesuffix(": ")
+    if "not_shown" in results and not words.startswith("NOT "):
+        words = f"{NOT_CONFIRMED}: {car} {words}"
+    text = template.format(car=car, detail=shown, words=words, took_s=took_s).removesuffix(": ").removesuffix(", ")
     return f"{text} ({words})" if words and "{words}" not in template else text
 
 

@@ -16,6 +16,8 @@ NO_RESULT: Final = "no_result"
 """The code of a command whose last event is missing."""
 _STAYS: Final = ("estopped", "held")
 """Reasons of a resume after which the car is still stopped."""
+_SENT_FOR: Final = "sent for "
+"""First words of the gateway about a drive that went as requested; its time follows."""
 _FAILED_PHASES: Final = frozenset({"superseded", "expired", "failed", "rejected"})
 
 OUTCOME_MARGIN_S: Final = 5.0
@@ -61,9 +63,12 @@ class Outcome:
     took_s: float = 0.0
     """Time from the request until the outcome was known."""
     basis: str = ""
-    """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot."""
+    """Of a stop: `shown` if the car's readings show that it stands, `sent` if they cannot.
+
+    Of a drive: `shown` if a reading shows that the car moved, `sent` if none does.
+    """
     effect: str = ""
-    """The effect of the command in words: `LED set`, `stopped (1.2 s)`, `refused: ...`."""
+    """The effect of the command in words: `LED set`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""
     next_step: str = ""
     """How to end what the command began, such as the release of an e-stop. Empty if there is nothing to end."""
 
@@ -168,7 +173,7 @@ class Progress:
             self._end(SENT, reason, words, at, ok=True)
 
     def on_event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float, basis: str = "") -> None:
-        """Handle one `event/command`. Only the last event of a stop has a basis."""
+        """Handle one `event/command`. Only the last event of a stop or a drive has a basis."""
         self._sent_event = self._sent_event or phase == SENT
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
         self._basis = basis
@@ -236,6 +241,7 @@ class Progress:
             self._end(self._phase, "", words, at, ok=False)
             return
         if self._joined:
+            self._basis = "sent"
             self._end(SENT, "", "the running drive was extended", at, ok=True)
             return
         words = (
@@ -260,6 +266,7 @@ class Progress:
         if self.outcome is None:
             took_s = at - self._asked_at
             done = {"shown": "shown", "sent": "unconfirmed"}.get(self._basis, phase)
+            has_time = self._until is Until.OVER and words.startswith(_SENT_FOR)
             effect = describe(
                 self._verb,
                 (done, phase) if ok else (reason, phase if phase in _FAILED_PHASES else ""),
@@ -268,6 +275,8 @@ class Progress:
                 words=words,
                 took_s=took_s,
             )
-            worst_case_s = self._worst_case_s or None
+            if has_time and done == "shown":
+                effect = f"drove {words.removeprefix(_SENT_FOR)}"
+            worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
             self.outcome = Outcome(self.car, ok, phase, reason, words, worst_case_s, took_s, self._basis, effect, after)

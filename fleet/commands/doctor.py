@@ -20,6 +20,8 @@ from fleet.recording.tools.summary import growing, total
 from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean
 
+MAX_STOP_LINES: Final = 20
+"""Maximum stops that were not shown, a line each; --json lists all."""
 MAX_FURTHER_FINDINGS: Final = 3
 """Number of findings that stand on the line after the likely cause."""
 
@@ -30,16 +32,23 @@ examples:
   fleet doctor
   fleet doctor red
   fleet doctor latest
+  fleet doctor latest red     # why did red not stop
 
 The first line is the likely cause with what to type. Exit code 1: something is odd."""
 )
 @click.argument("name", required=False, metavar="[CAR | SESSION]", shell_complete=complete_car)
+@click.argument("car", required=False, metavar="[CAR]")
 @json_option
 @bus_options
-def doctor(name: str | None, connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Say in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars."""
+def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *, as_json: bool) -> None:
+    """Say in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars.
+
+    Of a session it names each stop that was not shown or did not stop its car: the car, the time and the cause.
+    """
     if name is not None and (session := _session_of(name)) is not None:
-        _show_session(session, as_json=as_json)
+        _show_session(session, car or "", as_json=as_json)
+    if car is not None:
+        raise click.UsageError(f'"{name}" is no session, and a second name needs one: fleet doctor SESSION CAR')
     with Fleet(connect, fleet, kind="person") as client:
         found = collect(client)
         if not found:
@@ -70,20 +79,28 @@ def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
     _show(findings, describe(evidence))
 
 
-def _show_session(path: Path, *, as_json: bool) -> None:
-    """Print what is known of a session, and exit."""
+def _show_session(path: Path, car: str, *, as_json: bool) -> None:
+    """Print what is known of a session, and exit. car: the only car to look at; empty: all."""
     try:
         session = Session(path)
     except NoSession as error:
         raise click.ClickException(str(error)) from None
-    checkup, progress = SessionCheckup(), watched("doctor", total(session))
+    checkup, progress = SessionCheckup(car=car), watched("doctor", total(session))
     verdict = verify(session, lambda rows: checkup.watch(progress(rows)), growing(session))
+    if car and car not in checkup.cars:
+        near = did_you_mean(car, checkup.cars) or f"Cars: {', '.join(sorted(checkup.cars))}."
+        raise click.ClickException(f'No car "{car}" in {session.name}. {near}')
     findings = list(checkup.findings(verdict, session.name))
     if as_json:
         click.echo(json.dumps(checkup.as_dict(verdict, session.name)))
     else:
         click.echo(_first_line(session.name, findings))
         _show(findings, checkup.facts(verdict))
+        stops = checkup.unshown.stops
+        for stop in stops[:MAX_STOP_LINES]:
+            click.echo(f"  {stop.describe()}")
+        if len(stops) > MAX_STOP_LINES:
+            click.echo(f"  and {len(stops) - MAX_STOP_LINES} more: --json lists all")
     raise SystemExit(1 if findings else 0)
 
 

@@ -11,6 +11,7 @@ from typing import IO, Any, Final
 
 import click
 
+from fleet.client.claims import is_bad_rest
 from fleet.client.client import default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.group import chosen_person
@@ -18,7 +19,6 @@ from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running, open_client
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
-from fleet.supervisor.shutdown import NOT_STOPPED
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, messages_of, resolve_endpoint
 from schemas.process import signals, startup
@@ -91,7 +91,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         last, gone = _until_ended(bus, fleet, received)
     results = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == "ended"
-    bad = sorted(car for car, words in results.items() if words.startswith(NOT_STOPPED))
+    bad = sorted(car for car, words in results.items() if is_bad_rest(words))
     if as_json:
         click.echo(json.dumps({"ended": ended, "cars": results}))
     else:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import click
 
 from fleet.client import history
+from fleet.client.claims import claims_of, describe_end_of_doubt, is_ready
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
@@ -36,9 +37,23 @@ from schemas.bus import Sample, intersects
 from schemas.colors import car_color, hex_color
 from schemas.suggestion import did_you_mean
 
-CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
-OPTIONAL_CAR_COLUMNS: Final = ("platform", "verdict", "driver", "motion")
+CAR_COLUMNS: Final = (
+    "car",
+    "platform",
+    "link",
+    "ready",
+    "mode",
+    "verdict",
+    "motion",
+    "motors",
+    "shows stops",
+    "driver",
+    "hold",
+    "battery",
+)
+OPTIONAL_CAR_COLUMNS: Final = ("platform", "shows stops", "verdict", "driver", "motion", "motors", "ready")
 """Columns that a narrow terminal leaves out, in this order."""
+_SHOWS: Final = {"yes": "yes", "no": "no", "not_known_yet": "not known"}
 _KEY_COLUMNS: Final = ("key", "type", "unit", "rate", "age")
 _DAY_S: Final = 86_400.0
 _UNHEARD_S: Final = 3.0
@@ -51,9 +66,10 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, cars: Sequence[str], *, as_json: bool) -> None:
-    """List cars: platform, link, mode and how sure it is, motion, who is in control, hold and battery.
+    """List cars: link, ready or what for it waits, mode, motors and what that rests on, who is in control, battery.
 
-    On a narrow terminal columns are left out: platform, verdict, driver, motion. --json has them all.
+    SHOWS STOPS: whether the car's reports show that a stop arrived. A car that cannot show it drives and stops like any
+    other. On a narrow terminal columns are left out: platform, shows stops, verdict and more. --json has them all.
     """
     show_cars(client, resolve_cars(client, cars), as_json=as_json)
 
@@ -75,7 +91,10 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
     colors = {car: colors.get(car) or car_color(car, index) for index, car in enumerate(sorted(latest))}
     if only:
         latest = {car: latest[car] for car in only}
-    rows = [{**row_of(car, values), "color": hex_color(colors[car])} for car, values in sorted(latest.items())]
+    rows = [
+        {**row_of(car, values, present=car in cars), "color": hex_color(colors[car])}
+        for car, values in sorted(latest.items())
+    ]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
         click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
@@ -89,26 +108,35 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
     for row in rows:
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
+        if row["doubted"]:
+            click.echo(f"fleet: {row['shows_stops_words']}. {describe_end_of_doubt(row['car'])}", err=True)
 
 
-def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
-    """Return the row of a car in `fleet list`, for the table and for JSON. readings: its latest ones, by topic."""
+def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -> dict[str, Any]:
+    """Return the row of a car in `fleet list`, for the table and for JSON.
+
+    readings: its latest ones, by topic. present: True if its gateway is on the bus.
+    """
     values = {topic: reading.value for topic, reading in readings.items()}
+    ages_s = {topic: reading.age_s() for topic, reading in readings.items()}
+    claimed = claims_of(values, ages_s, present=present)
     measured = readings.get("sensor/battery")
-    link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
+    link, motion = values.get("state/link"), values.get("state/motion") if present else None
     safety, battery = values.get("state/safety"), values.get("sensor/battery")
     health = values.get("state/health")
     last_rx_s = link.last_rx_s if link and link.HasField("last_rx_s") else None
     return {
         "car": car,
-        "link": link.state if link else "no answer",
+        "link": claimed.link.what if link or not present else "no answer",
         "reason": link.reason if link else "",
-        "unheard": link is not None and _unheard(link.state, last_rx_s, safety.motors if safety else ""),
+        "ready": is_ready(claimed, safety),
+        "waits_for": safety.waits_for if safety and present else None,
+        "unheard": present and link is not None and _unheard(link.state, last_rx_s, safety.motors if safety else ""),
         "last_rx_s": None if last_rx_s is None else round(last_rx_s, 3),
         "platform": health.platform if health else None,
         "platform_contradictions": list(health.platform_contradictions) if health else [],
-        "mode": mode.asked if mode else None,
-        "verdict": mode.verdict if mode else None,
+        "mode": claimed.mode.what if "state/mode" in values else None,
+        "verdict": claimed.mode.basis or None,
         "motion": motion.motion if motion else None,
         "driver": safety.lease.holder if safety and safety.HasField("lease") else None,
         "driver_kind": safety.lease.kind if safety and safety.HasField("lease") else None,
@@ -116,7 +144,13 @@ def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
         "paused": safety.pauses[-1].by if safety and safety.pauses else None,
         "lent": safety.loan.to if safety and safety.HasField("loan") else None,
         "estops": [estop.id for estop in safety.estops] if safety else [],
-        "motors": safety.motors if safety else None,
+        "motors": claimed.motors.what if safety else None,
+        "motors_basis": claimed.motors.basis or None,
+        "claims": {name: claim.as_dict() for name, claim in claimed.by_name.items()},
+        "shows_stops": health.shows_stops or None if health else None,
+        "shows_stops_words": health.shows_stops_words if health else "",
+        "doubted": health.doubted if health else False,
+        "out_of_range": list(health.out_of_range) if health else [],
         "battery_v": battery.voltage_v if battery else None,
         "battery_level": battery.level if battery else None,
         "battery_age_s": round(measured.age_s(), 3) if measured else None,
@@ -149,8 +183,28 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
     if name == "link" and row["unheard"]:
         silence = "no reading yet" if row["last_rx_s"] is None else f"silent for {row['last_rx_s']:.0f} s"
         return f"{row['link']} ({silence})"
+    if name == "ready":
+        return _readiness(row)
+    if name == "motors":
+        return _cell(row, name)
+    if name == "shows stops":
+        return "in doubt" if row["doubted"] else _SHOWS.get(row["shows_stops"], "-")
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
+
+
+def _readiness(row: Mapping[str, Any]) -> str:
+    if row["ready"]:
+        return "ready"
+    return f"waits for {row['waits_for']}" if row["waits_for"] else "-"
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    """Return the cell of a claim: what, basis, and its age if it is old."""
+    if row[name] is None:
+        return "-"
+    basis = [row["claims"][name]["basis"], "stale" if "state/safety" in row["stale"] else None]
+    return f"{row[name]} ({', '.join(filter(None, basis))})" if any(basis) else str(row[name])
 
 
 @click.command(

@@ -5,22 +5,24 @@ import json
 import re
 import time
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Final
 
 import click
 
+from fleet.client.claims import CarClaim, motors_claim
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import WrongFile, bus_options, json_option, open_client, with_client
-from fleet.commands.params import complete_car
+from fleet.commands.params import SessionPath, complete_car
 from fleet.policy.requests import PlanRequest
 from schemas import keys
 from schemas.bus import Failure
+from schemas.local_time import clock
 from schemas.suggestion import did_you_mean
 
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
@@ -32,19 +34,39 @@ _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.comma
 examples:
   fleet why red
   fleet why              # every car, role and phase
-  fleet why patrol --json"""
+  fleet why patrol --json
+  fleet why red --session latest --at 14:05   # why did red not stop then"""
 )
 @click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...", shell_complete=complete_car)
+@click.option("--session", type=SessionPath(), help="Explain a car in this recording, at the time of --at.")
+@click.option("--at", "at", metavar="TIME", help="Local time of day (14:05, 14:05:12), or a time in the session.")
 @json_option
-@with_client
-def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
+@bus_options
+def why(
+    subjects: tuple[str, ...], session: Path | None, at: str | None, connect: str | None, fleet: str, *, as_json: bool
+) -> None:
     """Explain why a car does what it does: what the plan decided, from which readings, and what would change it.
 
-    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that.
+    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at:
+    what happened to one car around that time of a recording, and why a stop was not shown.
     """
+    if session is not None or at is not None:
+        from fleet.commands.why_session import explain_session
+
+        if session is None or at is None or len(subjects) != 1:
+            raise click.UsageError(
+                "of a recording, give one car, --session and --at: fleet why red --session latest --at 14:05"
+            )
+        explain_session(subjects[0], session, at, as_json=as_json)
+        return
+    with open_client(connect, fleet) as client:
+        _explain_now(client, subjects, as_json=as_json)
+
+
+def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
-    people = _people(client, subjects)
+    people, motors = _people(client, subjects)
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
         if not people or any(car not in people for car in subjects):
             raise click.ClickException(_no_plan(client))
@@ -58,8 +80,12 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
             names = [name.removeprefix("role ") for name in sorted(found)]
             near = did_you_mean(subject, names) or f"There are decisions about: {', '.join(names) or 'nothing yet'}."
             raise click.ClickException(f"No decision about {subject}. {near}")
-        deeds = people.get(subject, [])
-        click.echo(json.dumps(reading.as_dict() | {"people": deeds}) if as_json else _describe(reading, deeds))
+        deeds, claim = people.get(subject, []), motors.get(subject)
+        if as_json:
+            claimed = None if claim is None else claim.as_dict()
+            click.echo(json.dumps(reading.as_dict() | {"people": deeds, "motors": claimed}))
+        else:
+            click.echo(_describe(reading, deeds, claim))
 
 
 def _no_plan(client: Fleet) -> str:
@@ -69,23 +95,28 @@ def _no_plan(client: Fleet) -> str:
     return f"{NO_PLAN}{other}."
 
 
-def _people(client: Fleet, cars: Sequence[str]) -> dict[str, list[str]]:
-    """Return by car who stopped, paused, borrowed or drives it, and what ends that. Empty `cars`: all cars."""
-    found = {}
+def _people(client: Fleet, cars: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, CarClaim]]:
+    """Return by car who stopped, paused, borrowed or drives it, with what ends that, and what is claimed of its motors.
+
+    Empty `cars`: all cars.
+    """
+    found, motors = {}, {}
     for car in cars or ["*"]:
         for reading in client.get(f"{car}/state/safety") if car == "*" or keys.is_name(car) else ():
+            motors[reading.car] = motors_claim(reading.value, reading.age_s())
             deeds = [f"{words}; `{todo}` ends it" for words, todo in describe_people(reading.car, reading.value)]
             if deeds:
                 found[reading.car] = deeds
-    return found
+    return found, motors
 
 
-def _describe(reading: Reading, people: Sequence[str]) -> str:
+def _describe(reading: Reading, people: Sequence[str], motors: CarClaim | None) -> str:
     decision = reading.value
     since_s = decision.since.seconds + decision.since.nanos / 1e9
-    at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
+    at = clock(since_s)
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
+    lines += [f"  motors: {motors.words}"] if motors is not None else []
     lines += [f"  person: {each}" for each in people]
     lines += [f"  reading: {each}" for each in decision.readings]
     lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]

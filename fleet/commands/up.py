@@ -7,6 +7,7 @@ import signal
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -27,6 +28,7 @@ from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, buil
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
+from schemas.local_time import clock
 from schemas.process import signals, startup, stdio
 from schemas.yaml_document.document import read_text
 
@@ -301,10 +303,10 @@ def _written(write: _Write, event: SupervisorEvent) -> None:
 
 
 def _json(event: SupervisorEvent) -> None:
-    time = datetime.now(UTC).isoformat(timespec="milliseconds")
-    click.echo(json.dumps({"time": time, "what": event.what, "name": event.name, "words": event.words}))
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    click.echo(json.dumps({"time": now, "what": event.what, "name": event.name, "words": event.words}))
 
 
 def _plain(event: SupervisorEvent) -> None:
     name = "" if event.what in (READY, MISSING) else f"{event.name}: "
-    click.echo(f"{datetime.now(UTC):%H:%M:%S} {name}{event.words}")
+    click.echo(f"{clock(time.time())} {name}{event.words}")

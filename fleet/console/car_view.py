@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from fleet.client.claims import UNKNOWN, CarClaims, GatewayStarts, claims_of
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
@@ -69,6 +70,7 @@ class CarView:
         self._newest: dict[str, tuple[Any, float]] = {}
         self._trend = BatteryTrend()
         self._present = False
+        self._starts = GatewayStarts()
         self._changed_at: float | None = None
         """When the gateway joined or left the bus."""
 
@@ -84,6 +86,8 @@ class CarView:
                 level = "error" if value.level >= 4 else "warning" if value.level == 3 else "info"
                 self._note(value.timestamp, words, level)
             case _:
+                if not self._counts(topic, value):
+                    return
                 self._newest[topic] = (value, now)
                 if topic == "sensor/battery":
                     self._trend.add(value.voltage_v, now)
@@ -93,15 +97,32 @@ class CarView:
     def on_presence(self, now: float, *, present: bool) -> None:
         """Handle that the car's gateway is on the bus, or not."""
         if present is not self._present or self._changed_at is None:
+            if present and self._changed_at is not None:
+                self._forget_states()  # what the last gateway claimed is over: the returning one says what is so
             self._present, self._changed_at = present, now
 
-    @property
-    def motors(self) -> tuple[str, str]:
-        """State of the motors and what it rests on. Without a gateway nobody knows it any more."""
-        safety = self._newest.get("state/safety")
-        if safety is None or self._gone_at is not None:
-            return "unknown", ""
-        return safety[0].motors, safety[0].motors_basis
+    def _counts(self, topic: str, value: Any) -> bool:
+        """Return False for a late state of an earlier gateway. Forget the states of that one if a new one speaks."""
+        if not topic.startswith("state/"):
+            return True
+        before = self._starts.current
+        if not self._starts.take(value.boot_id, messages.stamp_ns(value.stamp)):
+            return False
+        if before and self._starts.current != before:
+            self._forget_states()
+        return True
+
+    def _forget_states(self) -> None:
+        for topic in [each for each in self._newest if each.startswith("state/")]:
+            del self._newest[topic]
+
+    def claims(self, now: float) -> CarClaims:
+        """Return what is claimed of motors, mode and link. Without a gateway nobody knows it any more."""
+        states = {topic: message for topic, (message, _) in self._newest.items()}
+        return claims_of(states, self._ages_s(now), present=self._gone_at is None)
+
+    def _ages_s(self, now: float) -> dict[str, float]:
+        return {topic: max(0.0, now - at) for topic, (_, at) in self._newest.items()}
 
     @property
     def _gone_at(self) -> float | None:
@@ -119,6 +140,7 @@ class CarView:
             present=self._present,
             states={topic: message for topic, (message, _) in self._newest.items()},
             commands=[(now - at, event) for at, event in self._events],
+            ages_s=self._ages_s(now),
         )
         # Recorder and plan have pages of their own.
         facts = [(name, words) for name, words in describe(evidence) if name != "services"]
@@ -152,27 +174,30 @@ class CarView:
         if found is None:
             return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
         link, at = found
-        shown = {"state": link.state, "reason": link.reason, "since_s": int(link.since_s + now - at)}
-        if link.state == "online":
+        claim = self.claims(now).link
+        if claim.past is not None:
+            return {"link": {"state": claim.what, "reason": "", "since_s": 0}}
+        shown = {"state": claim.what, "reason": claim.why, "since_s": int(link.since_s + now - at)}
+        if claim.what == "online":
             shown["since_s"] = 0  # a growing number that nobody needs would draw the card each second
         return {"link": shown}
 
-    def _mode(self, _: float) -> dict[str, Any]:
-        mode = self._get("state/mode")
-        if mode is None:
+    def _mode(self, now: float) -> dict[str, Any]:
+        mode, claim = self._get("state/mode"), self.claims(now).mode
+        if mode is None or claim.past is not None or claim.is_stale:
             return {"mode": {"asked": "unknown", "inferred": "unknown", "verdict": "assumed", "evidence": ""}}
         return {
             "mode": {
-                "asked": mode.asked,
+                "asked": claim.what,
                 "inferred": mode.inferred,
-                "verdict": mode.verdict if self._gone_at is None else "assumed",
-                "evidence": mode.evidence,
+                "verdict": claim.basis,
+                "evidence": claim.why,
             }
         }
 
     def _motion(self, now: float) -> dict[str, Any]:
         motion = self._fresh("state/motion", now)
-        if motion is None:
+        if motion is None or self._gone_at is not None:
             return {"motion": {"motion": "unknown", "owner": "", "speed": None, "fan": False, "servo_deg": None}}
         shown = {
             "motion": motion.motion,
@@ -184,10 +209,13 @@ class CarView:
         }
         return {"motion": shown}
 
-    def _safety(self, _: float) -> dict[str, Any]:
-        safety = self._get("state/safety")
-        state, basis = self.motors
-        shown: dict[str, Any] = {"motors": {"state": state, "basis": basis}, "hold": None, "lease": None, "estops": []}
+    def _safety(self, now: float) -> dict[str, Any]:
+        safety, claim = self._get("state/safety"), self.claims(now).motors
+        motors = {"state": claim.what, "basis": claim.basis}
+        past = claim if claim.is_stale else claim.past
+        if past is not None:  # a card has no room for an age, so it claims nothing that is old
+            motors = {"state": UNKNOWN, "basis": "", "past": past.basic}
+        shown: dict[str, Any] = {"motors": motors, "hold": None, "lease": None, "estops": []}
         if safety is None:
             return shown
         if safety.HasField("hold"):
@@ -218,6 +246,8 @@ class CarView:
             return {"platform": "", **UNKNOWN_ABILITIES.as_dict()}
         return {
             "platform": health.platform,
+            "shows": "doubt" if health.doubted else health.shows_stops,
+            "shows_words": health.shows_stops_words,
             **abilities_of(health.platform, tuple(health.capabilities)).as_dict(),
         }
 

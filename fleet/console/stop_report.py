@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+from fleet.client.claims import SENT
 from fleet.client.outcome import NO_ANSWER, Outcome
 from schemas.commands import STOPS
 
@@ -29,9 +30,9 @@ class StopReport:
             return
         match event.phase:
             case "complete":
-                self._set(car, event.basis or "shown", now)
+                self._set(car, event.basis or SENT, now)
             case "sent" if event.basis:
-                self._set(car, event.basis, now)
+                self._set(car, event.basis, now, event.words)
             case "failed" | "rejected" | "expired":
                 self._set(car, "failed", now, event.words or event.reason)
             case _:
@@ -57,7 +58,7 @@ class StopReport:
             if outcome is None:
                 self._set(car, "failed", now, "its gateway is not on the bus: look at the car")
             elif outcome.ok:
-                self._set(car, outcome.basis or "sent", now, outcome.words)
+                self._set(car, outcome.basis or SENT, now, outcome.words)
             else:
                 self._set(car, "failed", now, outcome.words or outcome.reason or NO_ANSWER)
 

@@ -218,13 +218,13 @@ def _is_ready(
 ) -> bool:
     """Return True if every car that can be commanded is known and in the mode that was decided last.
 
-    Cars that a person has taken, lost cars and absent cars count as ready, unless no car is present yet.
+    Cars that a person has taken, lost, doubted and absent cars count as ready, unless no car is present yet.
     """
     for car, barrier in barrier_of.items():
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         if barrier is not None:
             if _has_no_state(known) or (
-                not barrier[1] and known.present and known.link != LOST and _is_recovering(known)
+                not barrier[1] and known.present and known.link != LOST and not known.doubted and _is_recovering(known)
             ):
                 return False
             continue
@@ -261,6 +261,11 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
         return Barrier(f"{car} is driven by {known.driven_by}", "that drive ends"), False
     if known.link == LOST:
         return Barrier(f"the link of {car} is lost", "its link is back"), False
+    if known.doubted:  # people may command it, and see what it does
+        ends = (
+            f"it shows a stop (`fleet stop {car}`), or a person who has looked at it resumes it (`fleet resume {car}`)"
+        )
+        return Barrier(f"{car} is in doubt: it has not shown its last stop", ends), False
     if _is_recovering(known):
         return Barrier(f"{car} is not in a known state yet", "its recovery ends: a reading comes from it"), False
     return None

@@ -81,6 +81,8 @@ class CarSnapshot:
     verdict: str = ""
     evidence: str = ""
     motors: str = ""
+    doubted: bool = False
+    """True if it has shown its stops before, and did not show the last one. A car that cannot show them is not."""
     link: str = ""
     """The state of its link, by its gateway; empty: no state yet."""
     platform: str = ""

@@ -6,6 +6,10 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
+from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim
+from schemas import messages
+from schemas.local_time import date_and_clock
+
 MIN_COLUMN_WIDTH: Final = 4
 """Minimum width of a column that is shortened."""
 MAX_CARS_LISTED: Final = 8
@@ -40,15 +44,28 @@ class CarStatus:
     """True if any gateway has published the car's state/safety."""
     reached: bool = False
     """True if any gateway has had an open link to the car."""
+    waits_for: str = ""
+    """What a command would wait for."""
+    heard: bool = False
+    """True if bytes came from the car over the link that is open."""
+    rest: CarClaim = field(default_factory=lambda: CarClaim(UNKNOWN))
+    """The last claim about the motors, also of a gateway that has ended since."""
+    _rest_boot: str = ""
+    _starts: GatewayStarts = field(default_factory=GatewayStarts)
     _counted: tuple[float, int] | None = None
     _reported: dict[str, str] = field(default_factory=dict)
 
     def take(self, topic: str, value: Any, now: float) -> str:
         """Update from a message. Return a line for a notable change, else an empty string."""
+        if topic.startswith("state/") and not self._starts.take(value.boot_id, messages.stamp_ns(value.stamp)):
+            if topic == "state/safety" and value.boot_id == self._rest_boot:
+                self.rest = motors_claim(value)  # the last words of a gateway that has just ended
+            return ""
         match topic:
             case "state/link":
                 self.link, self.reason = value.state, value.reason
                 self.reached |= value.state in _OPEN
+                self.heard = value.HasField("last_rx_s")
                 self._count(value.rx_frames, now)
                 return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")
             case "state/mode":
@@ -70,8 +87,13 @@ class CarStatus:
                 pass
         return ""
 
-    def reset(self) -> None:
-        """Forget the state: the car's gateway has ended."""
+    def reset(self, running: str = "") -> None:
+        """Forget the state: the car's gateway has ended. running: the boot_id of the next one, if it is known."""
+        if running:
+            self._starts.take(running)
+        else:
+            self._starts.end()
+        self.waits_for, self.heard = "", False
         self.link, self.reason, self.rate_hz, self._counted = "", "", None, None
         self.mode = self.verdict = self.motion = self.motors = self.lease = ""
         self._reported.clear()
@@ -81,6 +103,8 @@ class CarStatus:
         self.estop = " ".join(each.id for each in value.estops)
         self.lease = value.lease.holder if value.HasField("lease") else ""
         self.motors = value.motors
+        self.waits_for = value.waits_for
+        self.rest, self._rest_boot = motors_claim(value), value.boot_id
         if self.estop:
             return self._change("safety", f"e-stop {self.estop}")
         return self._change("safety", f"on hold by {self.hold}" if self.hold else "not on hold")
@@ -141,14 +165,19 @@ def fit(widths: Mapping[str, int], width: int, optional: Sequence[str], gap: int
 
 
 def describe_missing(row: CarStatus) -> str:
-    """Return why a car is not ready, an empty string if it is: its link is open and the state of its motors known."""
+    """Return why a car is not ready, an empty string if it is: its link is open, and a command to it waits for nothing.
+
+    What the car has not shown delays no command.
+    """
     if not row.link:
         return "its gateway is starting"
     if row.link == "lost":
         return f"link lost: {row.reason}" if row.reason else "link lost"
     if row.link == "stale":
         return "silent: is it switched on?"
-    return "" if row.motors in ("off", "on") else "not in a known state yet"
+    if row.motors in ("off", "on") or (row.heard and row.motors and not row.waits_for):
+        return ""
+    return f"waits for {row.waits_for}" if row.waits_for else "nothing was heard from it yet"
 
 
 def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str, console: str = "") -> str:
@@ -190,7 +219,7 @@ def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "")
 
 
 def _date(stamp: Any) -> str:
-    return f"{stamp.ToDatetime(UTC):%Y-%m-%d %H:%M} UTC"
+    return date_and_clock(stamp.seconds)
 
 
 _SECONDS: Final = re.compile(r"[\d.]+ s\b")

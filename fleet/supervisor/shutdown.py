@@ -7,12 +7,24 @@ If a gateway cannot stop its car, a new gateway tries again, until the car has s
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from fleet.client.claims import (
+    NOT_CONFIRMED,
+    NOT_STOPPED,
+    OFF,
+    SHOWN,
+    STOP_SENT,
+    STOPPED,
+    is_bad_rest,
+    rest_words,
+)
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, RunState, delay_s
 
-NOT_STOPPED: Final = "NOT STOPPED"
-"""First words of the result for a car that may be moving."""
+LAST_CLAIM_TIMEOUT_S: Final = 1.0
+"""Timeout for the last state of a gateway that has ended in order: it may arrive after its end."""
+NEVER_REACHED: Final = "never reached"
+"""First words of the result for a car to which no gateway had a link."""
 GATEWAY_START_TIMEOUT_S: Final = 20.0
 """Timeout for the first heartbeat of a gateway that has not yet reached its car."""
 NOT_TRIED: Final = "not connected yet"
@@ -49,6 +61,8 @@ class GatewayShutdown:
         # Several attempts may be needed: a port may need a moment after its gateway was killed.
         self._tries: dict[str, int] = {}
         """Number of new gateways that were started to stop a car."""
+        self._unclaimed: dict[str, float] = {}
+        """Gateways that ended in order before their last state arrived, and until when to wait for it."""
         self.results: dict[str, str] = {}
         """Result by car, without the cars that a reload removed."""
 
@@ -60,7 +74,7 @@ class GatewayShutdown:
     @property
     def not_stopped(self) -> list[str]:
         """The cars that may be moving."""
-        return sorted(car for car, words in self.results.items() if words.startswith(NOT_STOPPED))
+        return sorted(car for car, words in self.results.items() if is_bad_rest(words))
 
     def begin(self, process: ManagedProcess) -> None:
         """Shut down this gateway."""
@@ -74,7 +88,7 @@ class GatewayShutdown:
         elif process.child is None:
             self._finish(process, "its gateway had not started, so it got no command")
         elif process.status.state is RunState.REFUSED:
-            self._finish(process, f"{NOT_STOPPED}: no gateway was running ({process.status.words})")
+            self._finish(process, self._unstopped(process, f"no gateway was running ({process.status.words})"))
         else:
             self._replace(process, process.status.words or "no gateway was running")
 
@@ -82,7 +96,7 @@ class GatewayShutdown:
         """Stop retrying. Gateways that were never replaced still get one replacement."""
         self._hurried = True
         for name, process in list(self._pending.items()):
-            if self._tries.get(name, 0) < 2:
+            if self._tries.get(name, 0) < 2 or name in self._unclaimed:
                 continue
             if process.status.alive:
                 self._end(process)
@@ -101,16 +115,18 @@ class GatewayShutdown:
     def _forget(self, name: str) -> None:
         self._pending.pop(name, None)
         self._awaited.discard(name)
+        self._unclaimed.pop(name, None)
         self._tries.pop(name, None)
 
     def on_exit(self, process: ManagedProcess) -> None:
         """Handle the end of a gateway: note the result or start a replacement."""
         if process.name not in self._pending or process.code is None:
             return
-        words = f"{NOT_STOPPED}: {_why(process)}"
+        words = self._unstopped(process, _why(process))
         crashed = process.code < 0 or process.status.state is RunState.WAITING
         if process.code == 0:
-            self._finish(process, "stopped")
+            self._unclaimed[process.name] = self._processes.now + LAST_CLAIM_TIMEOUT_S
+            self._finish_claimed(process)
         elif process.name not in self._tries and crashed:
             self._replace(process, _why(process))
         elif self._is_retried(process):
@@ -120,8 +136,28 @@ class GatewayShutdown:
         else:
             self._finish(process, words)
 
+    def _finish_claimed(self, process: ManagedProcess) -> None:
+        """Finish a gateway that ended in order: its last claim says whether the car has shown its stop."""
+        row = self._rows.get(process.name)
+        if row is not None and row.rest.what == OFF:
+            self._finish(process, rest_words(row.rest, process.name))
+        elif self._processes.now >= self._unclaimed[process.name]:
+            self._finish(process, STOP_SENT)
+
+    def _unstopped(self, process: ManagedProcess, why: str) -> str:
+        """Return the result for a car that its gateway did not stop."""
+        row = self._rows.get(process.name)
+        if row is None or not row.reached:
+            return f"{NEVER_REACHED}, so it got no command ({why.rstrip('.')})"
+        if row.rest.what == OFF and row.rest.basis == SHOWN:
+            return f"{STOPPED}, as it showed before its gateway ended ({why.rstrip('.')})"
+        could_not_reach = process.code is None or process.code < 0 or row.link in ("", "lost")
+        return f"{NOT_STOPPED if could_not_reach else NOT_CONFIRMED}: {why}"
+
     def turn(self, now: float) -> None:
         """Send SIGTERM to gateways that have reached their car or exceeded their timeout."""
+        for name in list(self._unclaimed):
+            self._finish_claimed(self._pending[name])
         for name in sorted(self._awaited):
             process = self._pending[name]
             overdue = now - process.status.since > (
@@ -133,7 +169,7 @@ class GatewayShutdown:
                 case RunState.STARTING if overdue:
                     self._end(process)
                 case RunState.WAITING if now - process.status.due > GATEWAY_START_TIMEOUT_S:
-                    self._finish(process, f"{NOT_STOPPED}: {process.status.words}")
+                    self._finish(process, self._unstopped(process, process.status.words))
 
     def _is_retried(self, process: ManagedProcess) -> bool:
         """Return True if another gateway may stop the car. A car that was never reached does not move."""
@@ -170,6 +206,24 @@ class GatewayShutdown:
         if not process.leaving:
             self.results[process.name] = words
         self._on_result(process.name, words)
+
+
+def describe_end(results: Mapping[str, str]) -> str:
+    """Describe in one line what became of the cars. results: words by car, as in `GatewayShutdown.results`."""
+    groups = {words: sorted(car for car, said in results.items() if said.startswith(words)) for words in _RESULTS}
+    bad = [f"{words}: {', '.join(groups[words])}" for words in (NOT_STOPPED, NOT_CONFIRMED) if groups[words]]
+    if bad:
+        return f"{'; '.join(bad)}. They may be moving: go to them."
+    known = sum(len(cars) for cars in groups.values())  # the gateways of the others had not started
+    if not known:
+        return "no car had been started"
+    if len(groups[STOPPED]) == known:
+        return "every car that was started is stopped"
+    return "; ".join(f"{words}: {', '.join(cars)}" for words, cars in groups.items() if cars)
+
+
+_RESULTS: Final = (NOT_STOPPED, NOT_CONFIRMED, STOPPED, STOP_SENT, NEVER_REACHED)
+"""The first words of each result."""
 
 
 def _why(process: ManagedProcess) -> str:

@@ -3,7 +3,6 @@
 import asyncio
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
 from rich.console import Console, Group
@@ -13,6 +12,7 @@ from rich.text import Text
 
 from fleet.supervisor.car_status import CarStatus, fit
 from fleet.supervisor.restart_policy import RunState
+from schemas.local_time import clock
 
 if TYPE_CHECKING:
     from fleet.supervisor.supervisor import Supervisor, SupervisorEvent
@@ -24,8 +24,8 @@ _LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": 
 _VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
 _EVENT: Final = "last event"
 """The column that gets the remaining width."""
-_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", _EVENT)
-_OPTIONAL_COLUMNS: Final = ("Hz", _EVENT, "motion")
+_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "motors", "held, driven by", "battery", "Hz", _EVENT)
+_OPTIONAL_COLUMNS: Final = ("Hz", _EVENT, "motion", "motors")
 """Columns that a narrow terminal leaves out, in this order."""
 _MIN_EVENT_WIDTH: Final = 16
 
@@ -51,7 +51,7 @@ class Table:
         """Print an event above the table, unless the car's row shows it."""
         if event.what in ("process", "hold", "end", "ready", "missing"):
             name = "" if event.what in ("ready", "missing") else f"{event.name}: "
-            line = Text(f"{datetime.now(UTC):%H:%M:%S} {name}{event.words}")
+            line = Text(f"{clock(time.time())} {name}{event.words}")
             self._safely(lambda: self._console.print(line))
 
     async def draw(self) -> None:
@@ -108,6 +108,7 @@ def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
         Text(row.motion),
+        Text(row.rest.basic if row.motors else ""),
         Text(held or row.lease, "red" if held else ""),
         Text(row.battery, "red" if row.battery.endswith(("low", "critical")) else ""),
         Text(rate, justify="right"),

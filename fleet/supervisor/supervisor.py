@@ -23,7 +23,7 @@ from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProces
 from fleet.supervisor.reload import compare
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
 from fleet.supervisor.service import ReloadRefused, RestartNeeded, SupervisorService
-from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown
+from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown, describe_end
 from fleet.supervisor.spec import (
     CONSOLE,
     COORDINATOR,
@@ -394,9 +394,9 @@ class Supervisor:
         if process.kind is not ProcessKind.GATEWAY:
             return
         row = self.rows.get(process.name)
+        self._shutdown.on_exit(process)
         if row is not None:
             row.reset()
-        self._shutdown.on_exit(process)
         if self._shutdown.may_start(process.name):
             return
         if process.leaving:
@@ -413,7 +413,7 @@ class Supervisor:
         elif row is not None and topic == "state/health":
             # A late message of an earlier process is no heartbeat of its successor.
             if self.processes.on_heartbeat(car, value.pid):
-                row.reset()
+                row.reset(value.boot_id)
         elif row is not None:
             if topic == "state/safety" and not row.safety_received:
                 row.safety_received = True
@@ -494,9 +494,7 @@ class Supervisor:
                 self.processes.end(process, grace)
                 await self._until_ended([process])
         await asyncio.wait([stop_query], timeout=SERVICE_EXIT_TIMEOUT_S)
-        left = ", ".join(self._shutdown.not_stopped)
-        words = "every car that was started is stopped" if self._shutdown.results else "no car had been started"
-        self._say("end", SELF, f"NOT STOPPED: {left}. They may be moving: go to them." if left else words)
+        self._say("end", SELF, describe_end(self._shutdown.results))
 
     async def _until_ended(self, processes: list[ManagedProcess]) -> None:
         while self._shutdown.pending or any(process.status.alive for process in processes):

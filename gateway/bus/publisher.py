@@ -370,6 +370,8 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     trust = control.model.trust
     message.trust = trust.state
     message.trust_evidence = trust.evidence
+    if trust.since > float("-inf"):
+        message.trust_since_s = max(0.0, now - trust.since)
     if trust.shown_at is not None:
         message.shown_age_s = max(0.0, now - trust.shown_at)
     message.worst_stop_s = control.stops.worst_s(now)

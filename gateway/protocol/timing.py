@@ -19,8 +19,7 @@ COLOR_S: Final = 0.10  # color frame
 MODE_CLOSE_S: Final = 1.0  # mode closed (`x0`)
 RASPBERRY_PI_FAN_S: Final = 1.0  # Raspberry Pi: fan
 RANGING_S: Final = 1.0  # once a second in mode 0: a ranging without an echo
-# docs/reference/protocol.md#programs-that-people-have: the interval until that of the car is learned
-REPORT_INTERVAL_S: Final = 1.25
+REPORT_INTERVAL_S: Final = 1.25  # programs that people have: the interval until that of the car is learned
 DIGITLESS_OPEN_S: Final = 2.0  # hazards: a MODE frame that lost its digits opens mode 0, which blocks for 2.0 to 2.3 s
 # the longest block outside avoidance: opening a mode, up to 3.5 s
 LONGEST_BLOCK_S: Final = max(row.open_s for row in MODES.values())

@@ -317,7 +317,7 @@ class Lease(_message.Message):
     def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Safety(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan", "people", "waits_for")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan", "people", "waits_for", "trust_since_s")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -337,6 +337,7 @@ class Safety(_message.Message):
     LOAN_FIELD_NUMBER: _ClassVar[int]
     PEOPLE_FIELD_NUMBER: _ClassVar[int]
     WAITS_FOR_FIELD_NUMBER: _ClassVar[int]
+    TRUST_SINCE_S_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -356,7 +357,8 @@ class Safety(_message.Message):
     loan: Loan
     people: CarPeople
     waits_for: str
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ..., people: _Optional[_Union[CarPeople, _Mapping]] = ..., waits_for: _Optional[str] = ...) -> None: ...
+    trust_since_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ..., people: _Optional[_Union[CarPeople, _Mapping]] = ..., waits_for: _Optional[str] = ..., trust_since_s: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions", "shows_stops", "shows_stops_words", "doubted", "interval_s", "interval_spread_s", "interval_no_echo_s", "blocks_s", "reporting_modes", "out_of_range")

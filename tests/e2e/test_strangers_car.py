@@ -86,7 +86,7 @@ def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_s
                 car.wire.arm(ByteGap(GapDirection.TO_CAR, 3600.0, early=True))
             up.process.popen.send_signal(signal.SIGINT)
             tried = up.until("end", "red", "A fresh gateway tries to stop the car")
-            assert tried["words"].startswith("NOT STOPPED: ")
+            assert tried["words"].startswith("NOT CONFIRMED: ")
             assert by_name["red"].true_mode == MODES["obstacle_avoidance"]
             by_name["red"].wire.mend()
             up.until("end", "red", "stopped")
@@ -97,8 +97,8 @@ def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_s
             ended = [*up.heard, *map(json.loads, up.process.lines())]
             words = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
             assert words["red"] == "stopped"
-            assert words["blue"].startswith("NOT STOPPED: ")
-            assert words["@supervisor"] == "NOT STOPPED: blue. They may be moving: go to them."
+            assert words["blue"].startswith("NOT CONFIRMED: ")
+            assert words["@supervisor"] == "NOT CONFIRMED: blue. They may be moving: go to them."
             assert by_name["blue"].true_mode == MODES["obstacle_avoidance"]
             for name in by_name:
                 assert "may still be moving" in up.fleet("logs", name).stdout

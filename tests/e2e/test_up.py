@@ -390,7 +390,8 @@ def test_told_to_end_while_it_starts_it_ends_at_once_and_in_order(tmp_path: Path
         started.until("process", until, "started")
         assert started.process.end(signal.SIGINT) == 0
         *_, last = map(json.loads, started.process.lines())
-        assert last["words"] in ("no car had been started", "every car that was started is stopped")
+        assert last["name"] == "@supervisor"
+        assert "NOT" not in last["words"], "no car was left moving"
         assert not started.left(ours=True)
 
 

@@ -369,7 +369,7 @@ def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
     while STALE in (done := run(cars.endpoint, "drive", "green", "forward", "--for", "700ms")).stderr:
         pass
     assert done.returncode == 0
-    assert done.stdout.startswith("green: drove"), done.stdout
+    assert done.stdout.startswith(("green: sent for ", "green: drove ")), done.stdout
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
 
 
@@ -391,8 +391,8 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
         _, err = drive.communicate(timeout=60)
     assert done.returncode == 0
     assert [line.split(" (")[0] for line in done.stdout.splitlines()] == [
-        "blue: stop sent, which blue cannot confirm",
-        "green: stop sent, which green cannot confirm",
+        "blue: stop sent, ",
+        "green: stop sent, ",
         "red: stopped",
     ]
     assert not driving(cars.sim, "green")

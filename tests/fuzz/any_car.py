@@ -1,7 +1,7 @@
 """Draws a car of the protocol, and uses it on a whole link: another rhythm, other blocks, another program.
 
-The cars that people have differ (docs/reference/protocol.md#programs-that-people-have). Whatever a car can show, it must
-be usable (5), and its drives must begin and end on time (6).
+The cars that people have differ (docs/reference/protocol.md#programs-that-people-have). Whatever a car can show, it
+must be usable (5), and its drives must begin and end on time (6).
 """
 
 import random
@@ -180,8 +180,8 @@ class UseEpisode:
     def _block_s(self) -> float:
         """Return the longest block of this car that a drive can meet.
 
-        Until the gateway has learned it, a longer block than the expected one loses the first frame of a drive, which is
-        repeated after 1.1 s. A ranging without an echo also makes the car read a stop together with the repeated motion
+        Until the gateway has learned it, a longer block than the expected one loses the first frame of a drive. It
+        repeats it after 1.1 s. A ranging without an echo also makes the car read a stop together with the repeated motion
         before it, and lose it.
         """
         if not self._has_echo:

@@ -91,7 +91,8 @@ function Card({ car }) {
         <${Verdict} table=${verdicts} name=${mode.verdict}
           detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
       <//>
-      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} /><//>
+      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.past(car.motors.past)}` : ""}<//>
+      ${car.shows && car.shows !== "yes" && html`<${Row} name=${t.showsStops}>${t.shows[car.shows] ?? ""} ${car.shows_words}<//>`}
       <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${who(car.motion.owner)})` : ""}<//>
       <${Row} name=${t.battery}>
         ${battery

@@ -16,7 +16,7 @@ export const verdicts = {
 
 export const motors = {
   "off shown": ["■", "off, shown by its readings"],
-  "off sent": ["□", "off as sent; this car cannot show it"],
+  "off sent": ["□", "off as sent; nothing shows it"],
   off: ["□", "off"],
   on: ["▶", "on"],
   stopping: ["…", "stopping, not shown yet"],
@@ -51,8 +51,8 @@ export const stopStates = {
   asked: ["…", "asked"],
   stopping: ["…", "stopping"],
   shown: ["✓", "stands, shown"],
-  sent: ["□", "stop sent; this car cannot show it"],
-  failed: ["✕", "not stopped"],
+  sent: ["□", "stop sent; nothing shows it"],
+  failed: ["✕", "NOT CONFIRMED"],
 };
 
 export const pad = [
@@ -70,6 +70,9 @@ export const t = {
   drive: "Drive",
   noCars: "No car is on the bus yet. `fleet up` connects the cars of your fleet file; `fleet up --sim 3` simulates three.",
   connecting: "Connecting to the console…",
+  past: (claim) => `(was ${claim})`,
+  showsStops: "Shows stops",
+  shows: { no: "no:", not_known_yet: "not known yet:", doubt: "in doubt, no plan uses it:" },
   consoleLost: "The console does not answer. A car that you drove stops by itself. STOP is still sent; look at the cars.",
   hubLost: "The console has lost the bus. What the cards show is old, and a STOP may not arrive: look at the cars.",
   stopUnsent: "STOP has not reached the console. Go to the cars, or type `fleet stop` in a terminal.",

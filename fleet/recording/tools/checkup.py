@@ -8,12 +8,14 @@ from typing import Any, Final
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.tools.stop_findings import NOT_SHOWN_CODE, NOT_STOPPED_CODE, WATCHED_TOPICS, StopFindings, log_code
 from fleet.recording.tools.verify import SessionVerdict
 from schemas import keys
 from schemas.commands import STOPS
+from schemas.local_time import clock
 
 _REFUSED_PHASES: Final = ("rejected", "failed")
-_TOPICS: Final = ("event/command", "event/log")
+_STOP_VERBS: Final = (*STOPS, "pause")
 
 
 @dataclass(slots=True)
@@ -22,48 +24,52 @@ class SessionCheckup:
 
     stops: Counter[str] = field(default_factory=Counter)
     """Ended stops by `shown`, `sent` or `failed`."""
-    unshown: Counter[str] = field(default_factory=Counter)
+    unshown: StopFindings = field(default_factory=StopFindings)
+    """The stops that a car did not show, or that did not stop it."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Refused commands by reason."""
+    """Refused commands by reason, without stops."""
     broken: Counter[str] = field(default_factory=Counter)
     """Lost links."""
-    left_moving: set[str] = field(default_factory=set)
-    """Cars whose gateway ended before they had shown their stop."""
+    car: str = ""
+    """The only car to look at. Empty: all."""
+    cars: set[str] = field(default_factory=set)
+    """The cars of the session."""
     _decoder: MessageDecoder = field(default_factory=MessageDecoder)
 
     def watch(self, rows: Iterable[Row]) -> Iterator[Row]:
         """Pass on rows and count what they are."""
         for row in rows:
-            info, _, _, _, data = row
+            info, _, log_ns, _, data = row
             key = keys.parse(info.channel.topic)
-            if key is not None and key.topic in _TOPICS:
+            if key is not None and not key.car.startswith("@"):
+                self.cars.add(key.car)
+            if key is not None and key.topic in WATCHED_TOPICS and self.car in ("", key.car):
                 message = self._decoder.message(info, data)
                 if message is not None:
-                    self.add(key.car, key.topic, message)
+                    self.add(key.car, key.topic, message, log_ns)
             yield row
 
-    def add(self, car: str, topic: str, message: Any) -> None:
-        """Count one message."""
+    def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
+        """Count one message. at_ns: its time if it has no stamp."""
+        self.unshown.add(car, topic, message, at_ns)
         if topic == "event/log":
-            code = message.name.partition("/")[2]
-            self.unshown[car] += code == "not_shown"
-            self.broken[car] += code == "link_lost"
-            if code == "not_stopped":
-                self.left_moving.add(car)
-            return
-        if message.verb in STOPS and (message.basis or message.phase == "failed"):
-            self.stops[message.basis or "failed"] += 1
-        if message.phase in _REFUSED_PHASES:
-            self.refused[message.reason or message.phase] += 1
+            self.broken[car] += log_code(message) == "link_lost"
+        elif topic == "event/command":
+            is_stop = message.verb in _STOP_VERBS
+            if is_stop and (message.basis or message.phase == "failed"):
+                self.stops[message.basis or "failed"] += 1
+            if message.phase in _REFUSED_PHASES and not is_stop:
+                self.refused[message.reason or message.phase] += 1
 
     def findings(self, verdict: SessionVerdict, name: str) -> Iterator[DoctorFinding]:
         """Yield what is odd, the most important first. name: of the session, as one types it."""
         replay, verify = f"fleet replay {name}", f"fleet sessions verify {name}"
-        if self.left_moving:
-            cars = ", ".join(sorted(self.left_moving))
-            yield DoctorFinding("not_stopped", f"{cars}: the gateway ended before the car had shown its stop.", replay)
-        if cars := _most(self.unshown):
-            yield DoctorFinding("not_shown", f"Stops that the car could have shown and did not: {cars}.", replay)
+        for code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
+            if stops := self.unshown.of(code):
+                first, more = stops[0], len(stops) - 1
+                words = first.describe() + (f" And {more} more like it." if more else "")
+                at = clock(first.at_ns / 1e9).partition(" ")[0]
+                yield DoctorFinding(code, words, f"fleet why {first.car} --at {at} --session {name}")
         if verdict.damage:
             words = "; ".join(f"{file} {why}" for file, why in verdict.damage.items())
             yield DoctorFinding("damage", f"Damaged: {words}.", f"fleet sessions recover {name}")
@@ -96,7 +102,8 @@ class SessionCheckup:
     def as_dict(self, verdict: SessionVerdict, name: str) -> dict[str, Any]:
         """Return the findings and what is known, for JSON."""
         found = [asdict(finding) for finding in self.findings(verdict, name)]
-        return {"session": verdict.session, "findings": found, "facts": dict(self.facts(verdict))}
+        stops = [each.as_dict() for each in self.unshown.stops]
+        return {"session": verdict.session, "findings": found, "facts": dict(self.facts(verdict)), "stops": stops}
 
 
 def _most(counts: Counter[str]) -> str:

@@ -45,6 +45,7 @@ ODD: dict[str, CarEvidence] = {
     "link_down": with_states(link=pb.Link(state="lost", reason="no such port", since_s=12)),
     "platform_contradicted": with_states(health=pb.Health(platform="stm32", platform_contradictions=["7.91 V"])),
     "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
+    "out_of_range": with_states(health=pb.Health(platform="arduino", out_of_range=["PV"])),
     "no_frames": with_states(
         link=pb.Link(state="stale", last_rx_s=12, rx_frames=40, rejects={"no_start": 40, "wrong_baud": 1})
     ),
@@ -121,6 +122,41 @@ def test_each_rejected_frame_counts_once() -> None:
     assert diagnose(with_states(link=within)) == []
 
 
+def test_a_doubted_car_is_a_finding_and_one_that_cannot_show_is_none() -> None:
+    cannot = pb.Health(platform="arduino", shows_stops="no", shows_stops_words="red's reports do not react to frames")
+    sent = pb.Safety(motors="off", motors_basis="sent", trust="stopped")
+    lost = pb.Link(state="online", rx_frames=500, rejects={"not_obeyed": 4})
+    cannot_show = with_states(health=cannot, safety=sent, link=lost)
+    assert diagnose(cannot_show) == []
+    assert dict(describe(cannot_show))["reports"].endswith("red's reports do not react to frames")
+    for doubted in (
+        with_states(health=pb.Health(platform="arduino", shows_stops="yes", doubted=True)),
+        ODD["not_shown"],
+    ):
+        (found,) = diagnose(doubted)
+        assert found.code == "not_shown"
+        assert found.todo == "fleet stop red"
+        assert "`fleet resume red`" in found.cause
+        assert "RX" not in found.cause
+
+
+def test_what_was_learned_of_the_reports_is_a_fact() -> None:
+    health = pb.Health(platform="arduino", shows_stops="yes", shows_stops_words="they show it", interval_s=1.25)
+    health.blocks_s["mode_close"] = 1.0
+    assert dict(describe(with_states(health=health)))["reports"] == (
+        "every 1.25 s (spread 0.00 s, mode close +1.00 s); they show it"
+    )
+
+
+def test_the_last_claims_of_a_gateway_that_is_gone_are_told_as_past() -> None:
+    gone = evidence(present=False, ages_s={"state/safety": 40.0, "state/link": 40.0, "state/mode": 40.0})
+    facts = dict(describe(gone))
+    assert facts["motors"].startswith("unknown: its gateway is gone, and said off (shown")
+    assert facts["motors"].endswith("40 s ago")
+    assert facts["link"].startswith("no gateway")
+    assert [each.code for each in diagnose(gone)] == ["no_gateway"]
+
+
 def test_a_command_that_somebody_replaced_is_no_refusal() -> None:
     assert diagnose(evidence(commands=[refused("superseded", phase="failed")])) == []
 
@@ -137,7 +173,7 @@ def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
     facts = dict(describe(replace(ODD["damaged_frames"], commands=[refused("leased", age_s=60), last])))
     assert "90 frames in" in facts["link"]
     assert "rejected: 3 noise, 8 truncated" in facts["link"]
-    assert facts["mode"] == "manual, confirmed: reports come"
-    assert facts["motors"] == "off, shown; stopped"
-    assert facts["platform"] == "arduino: a sonar with fractions"
+    assert facts["mode"] == "manual (confirmed): reports come"
+    assert facts["motors"] == "off (shown); trust stopped"
+    assert facts["platform"] == "arduino, battery 7.90 V (ok): a sonar with fractions"
     assert facts["refused"] == "drive of mia 3 s ago: red is on hold [held] (1 more before)"

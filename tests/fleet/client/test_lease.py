@@ -107,7 +107,7 @@ def holder(cars: Cars, car: str) -> str:
 
 def test_a_leased_car_drives_and_is_given_back(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease() as car:
-        assert asked(lambda: car.drive("forward", 0.5)).phase == "complete"
+        assert asked(lambda: car.drive("forward", 0.5)).basis in ("sent", "shown")
         assert holder(cars, "red") == "bot"
     assert holder(cars, "red") == ""
 

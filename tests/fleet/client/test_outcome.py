@@ -135,9 +135,10 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
             "stop",
             "",
             ("sent", "", "no sonar echo", "sent"),
-            "stop sent, which red cannot confirm (no sonar echo); motors off within 0.5 s if the frames arrived",
+            "stop sent, no sonar echo; motors off within 0.5 s if the frames arrived",
         ),
         ("stop", "", ("failed", "not_shown", "NOT CONFIRMED: x", ""), "stop sent, NOT CONFIRMED: x [not_shown]"),
+        ("stop", "", ("failed", "not_shown", "is silent", ""), "stop sent, NOT CONFIRMED: red is silent [not_shown]"),
         ("stop", "", ("rejected", "link_down", "NOT STOPPED: x", ""), "NOT STOPPED: x [link_down]"),
         (
             "estop",
@@ -152,9 +153,12 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
             "emergency-stopped (1.0 s). One release frees all cars: `fleet resume --estops`",
         ),
         ("resume", "", ("sent", "estopped", "still e-stopped", ""), "still e-stopped [estopped]"),
-        ("release", "", ("sent", "", "red is at rest", ""), "stopped (red is at rest)"),
-        ("drive", "1.0 s", ("complete", "", "", ""), "drove 1.0 s, then stopped"),
-        ("drive", "1.0 s", ("complete", "", "only 0.3 s", ""), "drove, then stopped (only 0.3 s)"),
+        ("release", "", ("sent", "", "red is at rest", ""), "nothing to stop (red is at rest)"),
+        ("drive", "1.0 s", ("sent", "", "sent for 1.0 s", "sent"), "sent for 1.0 s"),
+        ("drive", "1.0 s", ("sent", "", "sent for 1.0 s; it is deaf", "sent"), "sent for 1.0 s; it is deaf"),
+        ("drive", "1.0 s", ("complete", "", "sent for 1.0 s; it moved", "shown"), "drove 1.0 s; it moved"),
+        ("drive", "1.0 s", ("complete", "", "only 0.3 s; it moved", "shown"), "drove (only 0.3 s; it moved)"),
+        ("drive", "1.0 s", ("complete", "", "", ""), "drive over 1.0 s"),
         ("drive", "1.0 s", ("superseded", "superseded", "stop by mia", ""), "ended early: stop by mia [superseded]"),
         ("drive", "1.0 s", ("rejected", "held", "", ""), "refused [held]"),
         ("drive", "1.0 s", ("expired", "expired", "red was busy", ""), "not done: red was busy [expired]"),
@@ -246,3 +250,24 @@ def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], 
     assert progress.outcome.code == "no_answer"
     assert progress.outcome.words.startswith("another program answered for red: no result. It ")
     assert progress.outcome.words.endswith("Look at the car.")
+
+
+@pytest.mark.parametrize(
+    ("last", "ok", "basis"),
+    [
+        (("sent", "", "sent for 3.0 s", "sent"), True, "sent"),
+        (("complete", "", "sent for 3.0 s; its distance changed from 1.20 m to 0.80 m", "shown"), True, "shown"),
+        (("superseded", "superseded", "stop by mia", ""), False, ""),
+        (("rejected", "held", "", ""), False, ""),
+        (("expired", "expired", "red was busy", ""), False, ""),
+    ],
+)
+def test_a_drive_is_ok_if_it_was_sent_whole(last: tuple[str, str, str, str], ok: bool, basis: str) -> None:
+    progress = Progress("red", Until.OVER, 100.0, 3.0, verb="drive", detail="3.0 s")
+    progress.on_event("sent", "", "", 0.0, 100.1)
+    assert progress.outcome is None, "the motion was sent, and the drive goes on"
+    phase, reason, words, last_basis = last
+    progress.on_event(phase, reason, words, 0.0, 103.2, last_basis)
+    assert progress.outcome is not None
+    assert (progress.outcome.ok, progress.outcome.basis, progress.outcome.phase) == (ok, basis, phase)
+    assert ("drove" in progress.outcome.effect) == (basis == "shown")

@@ -1,7 +1,8 @@
 """`fleet list` with a silent car, and with a car of another platform than configured."""
 
 import sys
-from datetime import UTC, datetime
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
@@ -77,3 +78,34 @@ def test_the_row_of_a_car_has_its_color_on_a_terminal(
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     show_table(("car",), [{"car": "red"}], colors=["#010203"])
     assert capsys.readouterr().out.splitlines()[1] == f"{dot}red"
+
+
+def states(**fields: Any) -> dict[str, Reading]:
+    now = datetime.now(UTC)
+    return {
+        "state/link": Reading("fleet/red/state/link", now, pb.Link(state="online", last_rx_s=0.1)),
+        "state/mode": Reading("fleet/red/state/mode", now, pb.Mode(asked="manual", verdict="confirmed")),
+        "state/safety": Reading("fleet/red/state/safety", now, pb.Safety(motors="off", motors_basis="sent", **fields)),
+        "state/health": Reading("fleet/red/state/health", now, pb.Health(platform="arduino", shows_stops="no")),
+    }
+
+
+def test_motors_have_their_basis_and_a_car_is_ready_or_waits() -> None:
+    row = row_of("red", states())
+    assert (row["motors"], row["motors_basis"], row["ready"], row["shows_stops"]) == ("off", "sent", True, "no")
+    assert row["claims"]["motors"]["age_s"] is not None
+    assert [shown(name, row) for name in ("ready", "motors", "shows stops")] == ["ready", "off (sent)", "no"]
+    waiting = row_of("red", states(waits_for="its first stop, for 1.2 s at most"))
+    assert (waiting["ready"], shown("ready", waiting)) == (False, "waits for its first stop, for 1.2 s at most")
+
+
+def test_of_old_states_no_car_is_ready() -> None:
+    old = {topic: replace(each, time=each.time - timedelta(seconds=60)) for topic, each in states().items()}
+    row = row_of("red", old)
+    assert (row["ready"], shown("ready", row), shown("motors", row)) == (False, "-", "off (sent, stale)")
+
+
+def test_without_a_gateway_no_link_is_online_and_no_motors_are_off() -> None:
+    row = row_of("red", states(), present=False)
+    assert (row["link"], row["ready"], row["motors"], row["motors_basis"]) == ("no gateway", False, "unknown", None)
+    assert (row["mode"], row["verdict"]) == ("unknown", None)

@@ -60,8 +60,62 @@ def test_a_gateway_that_has_gone_says_for_how_long() -> None:
     view.on_presence([], 25.0)
     (car,) = view.as_list(32.0)
     assert (car["gateway"], car["gone_s"]) == (False, 12)
-    assert car["motors"] == {"state": "unknown", "basis": ""}, "what it showed before is no news of now"
-    assert car["mode"]["verdict"] == "assumed"
+    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)"}, "it showed that before"
+    assert (car["mode"]["asked"], car["mode"]["verdict"]) == ("unknown", "assumed")
+
+
+def test_a_link_without_a_gateway_is_not_online() -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    view.car("red").on_message("state/link", pb.Link(state="online"), 10.0)
+    assert view.as_list(10.5)[0]["link"]["state"] == "online"
+    view.on_presence([], 11.0)
+    assert view.as_list(11.5)[0]["link"]["state"] == "no gateway"
+
+
+def test_a_returning_gateway_does_not_bring_the_last_ones_claims_back() -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    states = {
+        "state/link": pb.Link(state="online", boot_id="a"),
+        "state/mode": pb.Mode(asked="manual", verdict="confirmed", boot_id="a"),
+        "state/safety": pb.Safety(motors="off", motors_basis="shown", boot_id="a"),
+    }
+
+    def told() -> tuple[str, str, str]:
+        (car,) = view.as_list(21.0)
+        return car["link"]["state"], car["mode"]["verdict"], car["motors"]["basis"]
+
+    for topic, state in states.items():
+        view.car("red").on_message(topic, state, 20.0)
+    assert told() == ("online", "confirmed", "shown")
+    view.on_presence([], 20.2)
+    view.on_presence(["red"], 20.9)
+    assert told() == ("unknown", "assumed", ""), "nobody has said anything yet"
+    for topic, state in states.items():
+        view.car("red").on_message(topic, state, 21.0)
+    view.car("red").on_message("state/link", pb.Link(state="lost", boot_id="b"), 21.0)
+    assert told() == ("lost", "assumed", ""), "the new one speaks: all else was said by the last one"
+    for topic, state in states.items():
+        view.car("red").on_message(topic, state, 21.0)
+    assert told() == ("lost", "assumed", ""), "late messages of the last one"
+
+
+def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
+    assert view.as_list(10.0)[0]["motors"]["basis"] == "shown"
+    (car,) = view.as_list(60.0)
+    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)"}
+
+
+def test_a_car_that_cannot_show_its_stops_says_so() -> None:
+    view = view_of()
+    health = pb.Health(platform="arduino", shows_stops="no", shows_stops_words="its reports do not react to frames")
+    view.car("red").on_message("state/health", health, 1.0)
+    (car,) = view.as_list(1.0)
+    assert (car["shows"], car["shows_words"]) == ("no", "its reports do not react to frames")
 
 
 def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:

@@ -47,7 +47,7 @@ def test_the_panel_has_the_doctors_lines() -> None:
     shown = view.diagnose(5.0)
     assert shown["findings"] == ["The link has been lost for 4 s: unplugged. Type: fleet scan"]
     facts = dict(shown["facts"])
-    assert facts["link"].startswith("lost for 4 s, 0 frames in")
+    assert facts["link"].startswith("lost (4 s old) for 4 s, 0 frames in")
     assert facts["refused"] == "stop of mia 3 s ago: rejected [link_down]"
     assert "services" not in facts
 

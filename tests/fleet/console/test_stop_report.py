@@ -28,6 +28,13 @@ def test_a_car_is_shown_only_by_a_complete_stop() -> None:
     assert report.as_dict()["cars"][2]["took_s"] == 1.4
 
 
+def test_a_complete_stop_without_a_basis_is_not_taken_for_a_shown_one() -> None:
+    report = StopReport(1, "stop", "us", ["red", "blue"], 10.0, 0)
+    report.on_event("red", event("complete"), 10.1)
+    report.on_event("blue", event("sent", basis="sent", words="blue sends no readings"), 10.2)
+    assert states(report) == {"red": ("sent", ""), "blue": ("sent", "blue sends no readings")}
+
+
 def test_a_late_event_and_a_drive_change_nothing() -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_event("red", event("complete", verb="drive"), 10.1)

@@ -41,6 +41,26 @@ def test_a_car_is_unheard_until_all_is_known_that_could_forbid_a_command() -> No
     assert observer.unconfirmed == {"red"}, "what was known of it may no longer be so"
 
 
+def published(topic: str, message: object) -> Sample:
+    name = topics.TOPICS[topic].message
+    payload = message.SerializeToString()  # type: ignore[attr-defined]  # a message
+    return Sample(f"fleet/red/{topic}", payload, messages.encoding_of(name), 0, 1)
+
+
+def test_a_car_is_in_doubt_while_its_gateway_says_so() -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    assert not observer.cars["red"].doubted
+    observer.on_sample(published("state/safety", pb.Safety(car="red", trust="unproven")), 101.0, None)
+    assert observer.cars["red"].doubted
+    observer.on_sample(published("state/safety", pb.Safety(car="red", trust="stopped")), 102.0, None)
+    assert not observer.cars["red"].doubted
+    observer.on_sample(published("state/health", pb.Health(car="red", shows_stops="yes", doubted=True)), 103.0, None)
+    assert observer.cars["red"].doubted, "it was driven since, and has still not shown a stop"
+    observer.on_sample(published("state/health", pb.Health(car="red", shows_stops="no")), 104.0, None)
+    assert not observer.cars["red"].doubted, "a car that cannot show its stops is used like any other"
+
+
 def test_a_car_is_forgotten_a_minute_after_its_gateway_went_but_not_one_that_is_named() -> None:
     observer = FleetObserver({"blue": CarSnapshot(listed=True)})
     for car in ("red", "green", "blue"):

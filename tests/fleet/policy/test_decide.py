@@ -51,6 +51,7 @@ rules:
         (replace(HERE, present=False), None, False),
         (replace(HERE, link="lost"), None, False),
         (replace(HERE, motors="unknown"), None, False),
+        (replace(HERE, doubted=True), None, False),
         (replace(HERE, motors="unknown", verdict="contradicted", mode="tracking"), "tracking", True),
     ],
 )
@@ -59,6 +60,20 @@ def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str 
     (decision, *_) = result.decisions
     assert decision.mode == mode
     assert bool(result.asks) is asks
+
+
+def test_a_car_in_doubt_is_left_alone_with_the_reason_and_what_ends_it_and_delays_no_phase() -> None:
+    run = PolicyRun(ONE, "green", "red")
+    run.at(0.0)
+    run.change("green", doubted=True, motors="unknown")
+    run.until(1.7)
+    assert run.roles == {"red": "scout"}
+    assert "in doubt" in run.of("green").why
+    assert "`fleet stop green`" in run.of("green").would_change
+    assert "`fleet resume green`" in run.of("green").would_change
+    run.change("green", doubted=False, motors="off")
+    run.until(3.0)
+    assert "in doubt" not in run.of("green").why, "it is free again"
 
 
 def test_a_role_goes_to_another_after_a_moment_and_does_not_come_back() -> None:
@@ -497,6 +512,8 @@ changes = st.tuples(
             {"platform": "raspberry_pi"},
             {"motors": "unknown"},
             {"motors": "off"},
+            {"doubted": True},
+            {"doubted": False},
             {"light": True},
             {"light": False},
             {"voltage": 6.5},
@@ -591,3 +608,21 @@ def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
         asked += [(ask.car, ask.led) for ask in run.until(run.now + 0.5, every=0.5).asks if ask.led is not None]
     assert asked[:2] == [("red", (255, 0, 0)), ("red", (0, 0, 0))]
     assert run.roles == {"blue": "patrol"}
+
+
+def test_a_car_in_doubt_does_not_keep_a_phase_from_its_timeout() -> None:
+    plan = parse(
+        """
+roles: {scout: {mode: tracking, count: 1}}
+phases:
+  look: {timeout_s: 2, on_timeout: rest}
+  rest: {}
+"""
+    )
+    recovering, doubted = PolicyRun(plan, "green", "red"), PolicyRun(plan, "green", "red")
+    recovering.change("red", motors="unknown")
+    doubted.change("red", motors="unknown", doubted=True)
+    for run in (recovering, doubted):
+        run.at(0.0)
+        run.until(4.0)
+    assert (recovering.memory.phase.name, doubted.memory.phase.name) == ("look", "rest")

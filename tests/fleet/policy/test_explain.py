@@ -45,6 +45,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "not on the bus": {"present": False, "mode": ""},
     "not heard yet": {"mode": ""},
     "in recovery": {"motors": "unknown"},
+    "in doubt": {"doubted": True},
     "link lost": {"link": "lost"},
     "on hold": {"held_by": "ann"},
     "e-stopped": {"estopped_by": "ann"},

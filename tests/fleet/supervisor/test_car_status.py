@@ -25,6 +25,7 @@ from fleet.supervisor.status_table import Table
 from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.local_time import date_and_clock
 
 
 def test_a_row_says_what_is_new_once() -> None:
@@ -40,21 +41,46 @@ def test_a_row_says_what_is_new_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("link", "motors", "why"),
+    ("link", "motors", "waits_for", "why"),
     [
-        (pb.Link(), "", "its gateway is starting"),
-        (pb.Link(state="lost", reason="no such port"), "unknown", "link lost: no such port"),
-        (pb.Link(state="stale", reason="open"), "unknown", "silent: is it switched on?"),
-        (pb.Link(state="online"), "stopping", "not in a known state yet"),
-        (pb.Link(state="online"), "off", ""),
-        (pb.Link(state="quiet"), "on", ""),
+        (pb.Link(), "", "", "its gateway is starting"),
+        (pb.Link(state="lost", reason="no such port"), "unknown", "its link", "link lost: no such port"),
+        (pb.Link(state="stale", reason="open"), "unknown", "", "silent: is it switched on?"),
+        (pb.Link(state="online"), "stopping", "", "nothing was heard from it yet"),
+        (
+            pb.Link(state="online", last_rx_s=0.1),
+            "unknown",
+            "its first stop, for 1 s",
+            "waits for its first stop, for 1 s",
+        ),
+        (pb.Link(state="online", last_rx_s=0.1), "unknown", "", ""),  # in doubt, and yet it takes commands
+        (pb.Link(state="online"), "off", "", ""),
+        (pb.Link(state="quiet"), "on", "", ""),
     ],
 )
-def test_a_car_is_ready_when_its_link_is_open_and_its_motors_are_known(link: pb.Link, motors: str, why: str) -> None:
+def test_a_car_is_ready_when_its_link_is_open_and_a_command_waits_for_nothing(
+    link: pb.Link, motors: str, waits_for: str, why: str
+) -> None:
     row = CarStatus("red")
     row.take("state/link", link, 0.0)
-    row.take("state/safety", pb.Safety(motors=motors), 0.0)
+    row.take("state/safety", pb.Safety(motors=motors, waits_for=waits_for), 0.0)
     assert describe_missing(row) == why
+
+
+def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
+    row = CarStatus("red")
+    row.take("state/link", pb.Link(state="online", boot_id="a"), 0.0)
+    row.take("state/safety", pb.Safety(motors="on", boot_id="a"), 0.0)
+    row.reset()
+    row.take("state/link", pb.Link(state="online", boot_id="a"), 1.0)
+    row.take("state/safety", pb.Safety(motors="off", motors_basis="sent", boot_id="a"), 1.0)
+    assert (row.link, row.motors) == ("", "")
+    assert (row.rest.what, row.rest.basis) == ("off", "sent"), "its last words tell how it stopped the car"
+    row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
+    row.reset("b")
+    row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
+    row.take("state/link", pb.Link(state="online", boot_id="a"), 2.0)
+    assert row.link == "quiet"
 
 
 @pytest.mark.parametrize(
@@ -113,20 +139,23 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
         (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # a hold of this run
         (
             pb.Safety(hold=MIAS),
-            "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. To end that: fleet resume red --fleet lab",
+            (
+                f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
+                "To end that: fleet resume red --fleet lab"
+            ),
         ),
         (
             pb.Safety(hold=MIAS, estops=[BOBS]),
             (
-                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC: red only accepts stops; "
-                "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. "
+                f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)}: red only accepts stops; "
+                f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
                 "To end that: fleet resume red --fleet lab --estops and then fleet resume red --fleet lab"
             ),
         ),
         (
             pb.Safety(estops=[BOBS, BOBS]),
             (
-                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC and 1 more: red only accepts stops. "
+                f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)} and 1 more: red only accepts stops. "
                 "To end that: fleet resume red --fleet lab --estops"
             ),
         ),

@@ -11,7 +11,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 
 def log(code: str) -> Log:
-    return Log(name=f"red/{code}", message="red")
+    return Log(name=f"red {code}", message="red has not reacted to the stop")
 
 
 def event(**fields: Any) -> pb.CommandEvent:
@@ -29,6 +29,8 @@ def event(**fields: Any) -> pb.CommandEvent:
         ("gaps", [], {"missing": [{"key": "fleet/red/sensor/line", "count": 3}]}),
         ("link_breaks", [log("link_lost"), log("link_lost")], {}),
         ("refused", [event(verb="drive", phase="rejected", reason="held")], {}),
+        ("not_shown", [event(verb="stop", phase="failed", reason="not_shown")], {}),
+        ("not_stopped", [event(verb="estop", phase="rejected", reason="link_down")], {}),
     ],
 )
 def test_each_condition_has_its_finding(code: str, messages: list[Any], verdict: dict[str, Any]) -> None:

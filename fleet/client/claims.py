@@ -1,0 +1,222 @@
+"""What is claimed of a car's motors, mode and link: the one source of words for it. Pure: time is an argument.
+
+A car acknowledges nothing, so each such statement is a claim. It has a basis (the car's own readings, or only the
+frames that were sent), a time since when it is so, and an age: the time since its gateway published it. A gateway that
+has ended vouches for nothing. Its last claims are told as past, with their age, and never as present ones.
+
+Lists, status, shutdown, doctor, console and Python take their words from here, so that one car is described in one way.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from schemas import topics
+
+STOPPED: Final = "stopped"
+"""First words of a stop that the car's own readings show."""
+STOP_SENT: Final = "stop sent"
+"""First words of a stop of a car that cannot show it."""
+NOT_CONFIRMED: Final = "NOT CONFIRMED"
+"""First words of a stop that the car could have shown and did not."""
+NOT_STOPPED: Final = "NOT STOPPED"
+"""First words of a stop that did not reach a car that may be moving."""
+UNKNOWN: Final = "unknown"
+SHOWN: Final = "shown"
+SENT: Final = "sent"
+NO_GATEWAY: Final = "no gateway"
+OFF: Final = "off"
+_MAX_KNOWN_ENDED: Final = 8
+"""Number of ended gateways of a car whose late messages are recognized."""
+LATE_MESSAGE_NS: Final = 2_000_000_000
+"""Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
+_OPEN: Final = ("online", "quiet", "stale")
+_STATES: Final = ("state/safety", "state/mode", "state/link")
+
+
+@dataclass(frozen=True, slots=True)
+class CarClaim:
+    """One statement about a car."""
+
+    what: str
+    """Such as `off`, `tracking` or `online`. `unknown` if nobody knows."""
+    basis: str = ""
+    """Motors: `shown`, `sent`. Mode: `confirmed`, `assumed`, `contradicted`. Empty if there is none."""
+    since_s: float | None = None
+    """Time since when it is so. None if that is not known."""
+    age_s: float | None = None
+    """Time since the gateway published it. None if it never did."""
+    why: str = ""
+    """The evidence or the cause, for a person."""
+    past: "CarClaim | None" = None
+    """The last claim of a gateway that is gone."""
+    is_stale: bool = False
+    """True if the gateway should have published it again meanwhile."""
+
+    @property
+    def basic(self) -> str:
+        """The claim with its basis."""
+        return f"{self.what} ({self.basis})" if self.basis else self.what
+
+    @property
+    def short(self) -> str:
+        """The claim with its basis and, if it is old, its age: one cell of a table."""
+        old = f", {describe_age(self.age_s)} old" if self.is_stale and self.age_s is not None else ""
+        basis = f" ({self.basis}{old})" if self.basis else f" ({old.removeprefix(', ')})" if old else ""
+        return f"{self.what}{basis}"
+
+    @property
+    def words(self) -> str:
+        """The claim as a sentence without an end: what, basis, since when, why."""
+        if self.past is not None and self.past.age_s is not None:
+            return f"{self.what}: its gateway is gone, and said {self.past.short} {describe_age(self.past.age_s)} ago"
+        since = f" for {describe_age(self.since_s)}" if self.since_s is not None else ""
+        return f"{self.short}{since}{f': {self.why}' if self.why else ''}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {
+            "what": self.what,
+            "basis": self.basis or None,
+            "since_s": _rounded(self.since_s),
+            "age_s": _rounded(self.age_s if self.past is None else self.past.age_s),
+            "words": self.words,
+        }
+
+
+def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
+    """Return what is claimed of the motors. safety: the newest fleet.v1.Safety; None: there is none."""
+    if safety is None or not safety.motors:
+        return CarClaim(UNKNOWN)
+    since_s = safety.trust_since_s + age_s if safety.HasField("trust_since_s") else None
+    claim = CarClaim(
+        safety.motors,
+        safety.motors_basis,
+        since_s,
+        age_s,
+        safety.trust_evidence,
+        is_stale=_is_stale("state/safety", age_s),
+    )
+    return claim if present else CarClaim(UNKNOWN, past=claim)
+
+
+def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
+    """Return what is claimed of the mode. mode: the newest fleet.v1.Mode; None: there is none."""
+    if mode is None or not mode.asked:
+        return CarClaim(UNKNOWN)
+    since_s = mode.evidence_age_s + age_s if mode.HasField("evidence_age_s") else None
+    is_stale = _is_stale("state/mode", age_s)
+    claim = CarClaim(mode.asked, mode.verdict, since_s, age_s, mode.evidence, is_stale=is_stale)
+    return claim if present else CarClaim(UNKNOWN, past=claim)
+
+
+def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
+    """Return what is claimed of the link. link: the newest fleet.v1.Link; None: there is none."""
+    if link is None or not link.state:
+        return CarClaim(UNKNOWN if present else NO_GATEWAY)
+    claim = CarClaim(link.state, "", link.since_s + age_s, age_s, link.reason, is_stale=_is_stale("state/link", age_s))
+    return claim if present else CarClaim(NO_GATEWAY, past=claim)
+
+
+def rest_words(motors: CarClaim, car: str) -> str:
+    """Return what a gateway's last claim says of its stop: stopped, stop sent, or not confirmed."""
+    if motors.what != OFF:
+        return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
+    if motors.basis == SHOWN:
+        return STOPPED
+    return ", ".join(filter(None, (STOP_SENT, motors.why)))
+
+
+def is_bad_rest(words: str) -> bool:
+    """Return True if the words about the end of a car say that it may be moving."""
+    return words.startswith((NOT_STOPPED, NOT_CONFIRMED))
+
+
+def describe_age(age_s: float) -> str:
+    """Return a time for a person: 3 s, 12 min, 5 h."""
+    if age_s < 120:
+        return f"{age_s:.0f} s"
+    return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
+
+
+def _is_stale(topic: str, age_s: float) -> bool:
+    after_s = topics.TOPICS[topic].stale_after_s
+    return after_s is not None and age_s > after_s
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+class GatewayStarts:
+    """Recognizes which messages are from the running gateway of a car.
+
+    Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
+    reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
+    them ends. So a message that is stamped clearly later than all others counts, whatever its start.
+    """
+
+    def __init__(self) -> None:
+        self.current = ""
+        """The boot_id of the running gateway. Empty if it is not known."""
+        self._newest_ns = 0
+        self._ended: dict[str, None] = {}
+
+    def take(self, boot_id: str, stamp_ns: int = 0) -> bool:
+        """Return True if a message of this start counts. A new start ends the one before."""
+        if boot_id in self._ended and stamp_ns <= self._newest_ns + LATE_MESSAGE_NS:
+            return False
+        if boot_id and boot_id != self.current:
+            self.end()
+            self._ended.pop(boot_id, None)
+            self.current = boot_id
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        return True
+
+    def end(self) -> None:
+        """Note that the running gateway has ended: its messages count no more."""
+        if self.current:
+            self._ended[self.current] = None
+            while len(self._ended) > _MAX_KNOWN_ENDED:
+                del self._ended[next(iter(self._ended))]
+        self.current = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CarClaims:
+    """The claims about one car."""
+
+    motors: CarClaim
+    mode: CarClaim
+    link: CarClaim
+
+    @property
+    def by_name(self) -> dict[str, CarClaim]:
+        """The claims by what they are about."""
+        return {"motors": self.motors, "mode": self.mode, "link": self.link}
+
+
+def claims_of(
+    states: Mapping[str, Any], ages_s: Mapping[str, float] | None = None, *, present: bool = True
+) -> CarClaims:
+    """Return the claims about a car. states: the newest messages by topic, with their ages."""
+    ages = ages_s or {}
+    safety, mode, link = ((states.get(topic), ages.get(topic, 0.0)) for topic in _STATES)
+    return CarClaims(
+        motors_claim(*safety, present=present),
+        mode_claim(*mode, present=present),
+        link_claim(*link, present=present),
+    )
+
+
+def is_ready(claims: CarClaims, safety: Any) -> bool:
+    """Return True if a command to this car would wait for nothing now. What it has not shown delays none."""
+    is_old = claims.link.is_stale or claims.motors.is_stale  # such as those of a replay, or of a gateway that hangs
+    return safety is not None and claims.link.what in _OPEN and not safety.waits_for and not is_old
+
+
+def describe_end_of_doubt(car: str) -> str:
+    """Return how the doubt about a car ends: no plan uses it until then."""
+    return (
+        f"`fleet stop {car}` ends the doubt if it shows that stop, `fleet resume {car}` if a person has looked at it."
+    )

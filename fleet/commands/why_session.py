@@ -1,0 +1,77 @@
+"""`fleet why CAR --session S --at TIME`: what happened to a car around a time of a recording."""
+
+import json
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.recording import time_spec
+from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.selection import Selection
+from fleet.recording.tools.car_timeline import (
+    DECISION_TOPIC,
+    STATE_BEFORE_NS,
+    TIMELINE_AFTER_NS,
+    TIMELINE_BEFORE_NS,
+    TIMELINE_TOPICS,
+    CarTimeline,
+    message_time_ns,
+)
+from fleet.recording.tools.summary import of_session
+from schemas import keys
+from schemas.local_time import clock_times, date_and_clock
+from schemas.suggestion import did_you_mean
+
+MAX_TIMELINE_LINES: Final = 60
+"""Maximum lines of a timeline; --json has all."""
+
+
+def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
+    """Print why a stop of this car was not shown then, and what happened before and after."""
+    try:
+        session = Session(path)
+    except NoSession as error:
+        raise click.ClickException(str(error)) from None
+    summary = of_session(session)
+    begin_ns, end_ns = _times(at, summary.start_ns, summary.end_ns)
+    span = f"{date_and_clock(summary.start_ns / 1e9)} to {date_and_clock(summary.end_ns / 1e9)}"
+    if end_ns <= summary.start_ns or begin_ns > summary.end_ns:
+        raise click.ClickException(f"{at} is not in {session.name}: it is from {span}.")
+    cars = sorted({key.car for each in summary.keys if (key := keys.parse(each)) and not key.car.startswith("@")})
+    if car not in cars:
+        near = did_you_mean(car, cars) or f"Cars: {', '.join(cars)}."
+        raise click.ClickException(f'No car "{car}" in {session.name}. {near}')
+    timeline = CarTimeline(car, begin_ns - TIMELINE_BEFORE_NS, end_ns + TIMELINE_AFTER_NS)
+    selection = Selection(
+        (*(f"*/{car}/{topic}" for topic in TIMELINE_TOPICS), f"*/{DECISION_TOPIC}"),
+        timeline.begin_ns - STATE_BEFORE_NS,
+        timeline.end_ns,
+    )
+    decoder = MessageDecoder()
+    for info, _, log_ns, _, data in session.rows(selection):
+        key, message = keys.parse(info.channel.topic), decoder.message(info, data)
+        if key is not None and message is not None:
+            topic = f"{key.car}/{key.topic}" if key.car.startswith("@") else key.topic
+            timeline.add(topic, message, message_time_ns(message, log_ns))
+    if as_json:
+        click.echo(json.dumps(timeline.as_dict()))
+        return
+    stops = timeline.nearest
+    for stop in stops:
+        click.echo(stop.describe())
+    if not stops:
+        click.echo(f"{car}: no stop failed around {date_and_clock(begin_ns / 1e9)}.")
+    for entry in timeline.entries[:MAX_TIMELINE_LINES]:
+        click.echo(f"  {entry}")
+    if len(timeline.entries) > MAX_TIMELINE_LINES:
+        click.echo(f"  and {len(timeline.entries) - MAX_TIMELINE_LINES} more: --json lists all")
+
+
+def _times(at: str, start_ns: int, end_ns: int) -> tuple[int, int]:
+    found = clock_times(at, start_ns, end_ns)
+    if found is not None:
+        return found
+    at_ns = time_spec.at_ns(at, start_ns, end_ns)
+    return at_ns, at_ns + 1_000_000_000

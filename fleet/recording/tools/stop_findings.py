@@ -1,0 +1,120 @@
+"""Finds the stops of a session that a car did not show, or that did not reach it: car, time and cause. Pure.
+
+A gateway records such a stop twice: as the last event of each command that asked for it, and in its log. Both have the
+same words, so they are one finding here. What the gateway said of the car just before is the likely cause: a link that
+was lost, a car in doubt, or one whose reports cannot show a stop.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from fleet.client.claims import claims_of
+from schemas import messages
+from schemas.commands import STOPS
+from schemas.local_time import clock
+
+NOT_STOPPED_CODE: Final = "not_stopped"
+NOT_SHOWN_CODE: Final = "not_shown"
+WATCHED_TOPICS: Final = ("event/command", "event/log", "state/link", "state/health")
+_SAME_STOP_NS: Final = 3_000_000_000
+"""Maximum time between the records of one stop."""
+_STOP_VERBS: Final = frozenset({*STOPS, "pause"})
+_FAILED: Final = frozenset({"failed", "rejected", "expired"})
+_OPEN: Final = frozenset({"online", "quiet"})
+
+
+@dataclass(slots=True)
+class UnshownStop:
+    """One stop that was not shown (`not_shown`), or did not reach the car or was given up (`not_stopped`)."""
+
+    car: str
+    at_ns: int
+    code: str
+    asked: str
+    """Who asked for it, such as `stop by mia`. Empty: the gateway itself."""
+    words: str
+    """The words of the gateway."""
+    cause: str
+    """What was known of the car just before."""
+
+    def describe(self) -> str:
+        """Return car, time and cause."""
+        what = "was not shown" if self.code == NOT_SHOWN_CODE else "did not stop it"
+        cause = f" Before that: {self.cause}." if self.cause else ""
+        asked = self.asked or "a stop of its gateway"
+        return f"{self.car} at {clock(self.at_ns / 1e9)}: {asked} {what}: {self.words}{cause}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {
+            "car": self.car,
+            "at": clock(self.at_ns / 1e9),
+            "at_ns": self.at_ns,
+            "code": self.code,
+            "asked": self.asked,
+            "words": self.words,
+            "cause": self.cause,
+        }
+
+
+@dataclass(slots=True)
+class StopFindings:
+    """The stops of one session that were not shown, in the order of their times."""
+
+    stops: list[UnshownStop] = field(default_factory=list)
+    _states: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The newest states by car and topic."""
+
+    def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
+        """Take in a message of `WATCHED_TOPICS`. at_ns: its time if it has no stamp."""
+        if topic.startswith("state/"):
+            self._states.setdefault(car, {})[topic] = message
+        elif topic == "event/log":
+            code = log_code(message)
+            if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
+                self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
+        elif message.verb in _STOP_VERBS and message.phase in _FAILED:
+            code = NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
+            asked = f"{message.verb} by {message.sender or 'somebody'}"
+            self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)
+
+    def of(self, code: str) -> list[UnshownStop]:
+        """Return the stops with this code."""
+        return [each for each in self.stops if each.code == code]
+
+    def _note(self, car: str, at_ns: int, code: str, asked: str, words: str) -> None:
+        core = _core(words, car)
+        for other in reversed(self.stops):
+            before = _core(other.words, car)
+            is_same = other.car == car and abs(at_ns - other.at_ns) <= _SAME_STOP_NS
+            if is_same and (core in before or before in core):
+                other.code = NOT_STOPPED_CODE if NOT_STOPPED_CODE in (code, other.code) else code
+                if asked and asked not in other.asked:
+                    other.asked = f"{other.asked} and {asked}" if other.asked else asked
+                if len(words) > len(other.words):
+                    other.words = words
+                return
+        self.stops.append(UnshownStop(car, at_ns, code, asked, words, ", ".join(self._causes(car, words))))
+
+    def _causes(self, car: str, words: str) -> Iterator[str]:
+        states = self._states.get(car, {})
+        link, health = claims_of(states).link, states.get("state/health")
+        if link.what not in (*_OPEN, "unknown"):
+            reason = f" ({link.why})" if link.why and link.why not in words else ""
+            yield f"its link was {link.what}{reason}"
+        if health is not None and (health.doubted or health.shows_stops in ("no", "not_known_yet")):
+            yield health.shows_stops_words or f"whether it shows stops: {health.shows_stops}"
+
+
+def log_code(record: Any) -> str:
+    """Return the code of a log record: its name is the car's name and the code."""
+    code: str = record.name.replace("/", " ").rpartition(" ")[2]
+    return code
+
+
+def _core(words: str, car: str) -> str:
+    """Return the part of the gateway's words that its event and its log share."""
+    text = words.removeprefix("NOT CONFIRMED: ").removeprefix("NOT STOPPED: ")
+    text = text.removeprefix(f"{car} may still be moving: ").removeprefix(f"{car} ")
+    return text.partition(". ")[0].rstrip(".")

@@ -1,0 +1,46 @@
+"""Times as people read them: local, with the zone, everywhere in one form."""
+
+import re
+from datetime import datetime, timedelta
+from typing import Final
+
+_CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
+_NS: Final = 1_000_000_000
+
+
+def clock(at_s: float) -> str:
+    """Return a time of day, such as `14:05:12 CET`. at_s: s since the epoch."""
+    return _local(at_s).strftime("%H:%M:%S %Z") if _is_date(at_s) else f"{at_s:.0f} s"
+
+
+def date_and_clock(at_s: float) -> str:
+    """Return a date and a time of day, such as `2026-11-25 14:05:12 CET`."""
+    return _local(at_s).strftime("%Y-%m-%d %H:%M:%S %Z") if _is_date(at_s) else f"{at_s:.0f} s"
+
+
+def clock_times(text: str, start_ns: int, end_ns: int) -> tuple[int, int] | None:
+    """Return when a local time of day (`14:05`, `14:05:12`) begins and ends, on a day from `start_ns` to `end_ns`.
+
+    The first such day counts, or else the day of `start_ns`. None if the text is no time of day.
+    """
+    found = _CLOCK.fullmatch(text)
+    if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3] or 0) > 59:
+        return None
+    length_ns = (1 if found[3] else 60) * _NS
+    first = _local(start_ns / _NS).replace(
+        hour=int(found[1]), minute=int(found[2]), second=int(found[3] or 0), microsecond=0, tzinfo=None
+    )
+    days = [
+        round((first + timedelta(days=day)).timestamp()) * _NS
+        for day in range((end_ns - start_ns) // (86_400 * _NS) + 2)
+    ]
+    begin_ns = next((each for each in days if each + length_ns > start_ns and each <= end_ns), days[0])
+    return begin_ns, begin_ns + length_ns
+
+
+def _local(at_s: float) -> datetime:
+    return datetime.fromtimestamp(at_s).astimezone()
+
+
+def _is_date(at_s: float) -> bool:
+    return 0 <= at_s < 2e11  # not so: the clock of another writer was wrong
