@@ -180,8 +180,8 @@ class UseEpisode:
     def _block_s(self) -> float:
         """Return the longest block of this car that a drive can meet.
 
-        Until the gateway has learned it, a longer block than the expected one loses the first frame of a drive. It
-        repeats it after 1.1 s. A ranging without an echo also makes the car read a stop together with the repeated motion
+        Until the gateway has learned it, a longer block than the expected one loses the first frame of a drive. It is
+        repeated after 1.1 s. A ranging without an echo makes the car read a stop together with the repeated motion
         before it, and lose it.
         """
         if not self._has_echo:
