@@ -197,6 +197,7 @@ class CarMonitor:
         )
         self._log.log(Level.WARNING, "unheard", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self._executor.senders.halt_streams(now)
         running = self._stops.running
         if model.at_rest and running is None:
             self._stops.stop_again(now)
@@ -209,6 +210,7 @@ class CarMonitor:
         words = f"{self.model.name} sends readings again. The gateway stops it first."
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self._executor.senders.halt_streams(now)
         self.model.learn(TrustEvent.HEARD, now, words)
         self._stops.on_contact(now, words)
 

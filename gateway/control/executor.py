@@ -50,6 +50,7 @@ class Executor:
         model.link_open = True
         model.evidence.begin_link()
         model.pacing.reset()
+        self.senders.halt_streams(now)
         model.learn(TrustEvent.LINK_OPENED, now)
         self.stops.begin_recovery(FrameOrigin.RECOVERY, now, [])
 
@@ -61,6 +62,7 @@ class Executor:
         model.believed.repeat = False
         model.learn(TrustEvent.LINK_LOST, now, reason)
         self.mode_sent = self._source = None
+        self.senders.halt_streams(now)  # a press from before the loss does not drive the car after it
         self.stops.link_down(reason, now, cause=cause)
         self.queue.drop(Phase.FAILED, cause, reason, now)
         model.mode.forget()

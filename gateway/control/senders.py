@@ -63,6 +63,12 @@ class Senders:
             self._halted.discard(oldest)
         return name not in self._halted
 
+    def halt_streams(self, now: float) -> None:
+        """Require a pause of all streams: what held a joystick down before a loss must not drive the car after it."""
+        self._halted.update(
+            name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_PAUSE_S
+        )
+
     def halt(self, now: float, by: str = "") -> None:
         """Require a pause of all senders that have just driven: the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may

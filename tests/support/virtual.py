@@ -81,10 +81,18 @@ class Pair:
         self.until(lambda: self.control.model.known and self.control.model.mode.inferred is not None, 30.0)
         return self
 
-    def ask(self, what: Action, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
+    def ask(
+        self,
+        what: Action,
+        *,
+        verb: str = "test",
+        sender: Sender | None = None,
+        identity: str = "",
+        streamed: bool = False,
+    ) -> Answer:
         """Send a command, and write the frames that control has due."""
         self.number += 1
-        command = Command(identity or f"c{self.number}", verb, sender or Sender(), what)
+        command = Command(identity or f"c{self.number}", verb, sender or Sender(), what, streamed=streamed)
         answer = self.control.command(command, self.now)
         self._pump()
         return answer

@@ -84,6 +84,30 @@ def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
     assert "nothing shows that it hears this" in answer.words
 
 
+def test_a_stream_from_before_a_silence_or_a_lost_link_drives_no_car_after_it() -> None:
+    for how in ("silence", "link"):
+        pair = Pair("arduino", start_s=2.0).ready()
+        wire = Wire(pair)
+        wire.stuck = how == "silence"
+        if how == "link":
+            pair.lose()
+        for _ in range(80):
+            pair.ask(Drive(Motion.FORWARD, 0.5), streamed=True)
+            pair.run(0.1, linked=how == "silence")
+        if how == "link":
+            pair.connect()
+        else:
+            wire.free()
+        for _ in range(150):
+            pair.ask(Drive(Motion.FORWARD, 0.5), streamed=True)
+            pair.run(0.1)
+        assert not pair.car.truth.driving, how
+        pair.run(0.6)
+        pair.ask(Drive(Motion.FORWARD, 0.5), streamed=True)
+        pair.run(0.1)
+        assert pair.car.truth.driving, "another press does"
+
+
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     """The answer warns at once, and the stop fails while the car is silent. With a free wire the next stop ends."""
