@@ -130,7 +130,9 @@ class CarView:
         return None if self._present else self._changed_at
 
     def describe_gateway(self) -> list[tuple[str, str]]:
-        """Return what the car's gateway knows, as names and texts."""
+        """Return what the car's gateway knows, as names and texts. A gateway that is gone knows nothing any more."""
+        if self._gone_at is not None:
+            return []
         return describe_gateway(*(self._get(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def diagnose(self, now: float) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from collections import deque
 from typing import Any, Final
 
+from fleet.client.diagnosis import describe_reports
 from schemas import messages
 
 MAX_FRAMES: Final = 60
@@ -49,6 +50,7 @@ def describe_gateway(link: Any, health: Any, safety: Any, mode: Any) -> list[tup
         rows += [(name, str(getattr(health, name))) for name in _HEALTH]
         rows.append(("platform evidence", "; ".join(health.platform_evidence)))
         rows.append(("platform contradictions", "; ".join(health.platform_contradictions)))
+        rows.append(("its reports", describe_reports(health)))
         rows.append(("loop lag", f"{health.loop_lag_s * 1e3:.0f} ms"))
     if safety is not None:
         rows += [("trust", safety.trust), ("trust evidence", safety.trust_evidence)]

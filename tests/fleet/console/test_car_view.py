@@ -71,6 +71,7 @@ def test_a_link_without_a_gateway_is_not_online() -> None:
     assert view.as_list(10.5)[0]["link"]["state"] == "online"
     view.on_presence([], 11.0)
     assert view.as_list(11.5)[0]["link"]["state"] == "no gateway"
+    assert view.car("red").describe_gateway() == []
 
 
 def test_a_returning_gateway_does_not_bring_the_last_ones_claims_back() -> None:
