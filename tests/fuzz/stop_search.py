@@ -765,7 +765,7 @@ class Episode:
     def _ends_s(self) -> float:
         """Return the maximum time from the request of a stop to its end."""
         traits = self.plan.traits
-        return 5.5 + max(12.0, 3 * (traits.interval_s + traits.spread_s + traits.close_s + 0.1))
+        return 5.5 + max(12.0, 4 * (traits.interval_s + traits.spread_s + traits.close_s + 0.1))
 
     @property
     def _shows(self) -> bool:
