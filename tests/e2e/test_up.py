@@ -193,7 +193,8 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         assert started.ask("drive", "red", motion="forward", duration_s=10)["status"] in TAKEN
         done = started.fleet("down")
         assert done.returncode == 0, done.stderr
-        assert done.stdout == "green: stopped\nred: stopped\n"
+        ended = [line.partition(",")[0] for line in done.stdout.splitlines()]
+        assert ended == ["green: stop sent", "red: stopped"], "green is an STM32 car, which can show nothing"
         assert started.process.wait() == 0
         with pytest.raises(urllib.error.URLError):
             get_page(port)
@@ -273,7 +274,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             reader.join()
         said = shown.decode()
         assert "red: stopped" in said
-        assert "green: stopped" in said
+        assert "green: stop sent" in said
         assert " 0 lost" in said
     finally:
         if process.poll() is None:

@@ -1,6 +1,5 @@
 """`fleet why` and `fleet plan` without a plan."""
 
-from datetime import datetime
 from pathlib import Path
 
 import zenoh
@@ -11,6 +10,7 @@ from fleet.client.client import Fleet
 from schemas import keys
 from schemas.bus import reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.local_time import clock
 from tests.support.ports import free_endpoint
 
 
@@ -50,7 +50,7 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
         safety.loan.CopyFrom(pb.Loan(to="eve", by="ann@lab-1", rank="lead", expires_in_s=60))
         safety.loan.since.seconds = at = 1_790_000_000
         safety.pauses.add(by="ann@lab-1", rank="lead", why="listen").stamp.seconds = at
-        since = f"by ann (lead) since {datetime.fromtimestamp(at).astimezone():%H:%M:%S}"
+        since = f"by ann (lead) since {clock(at)}"
         shown = run("why").stdout
         assert f"paused with the whole fleet {since}: listen; `fleet unpause` ends it; " in shown
         assert f"lent to eve {since}, for another 60 s; `fleet lend red --end` ends it. No plan" in shown

@@ -197,7 +197,7 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     assert told["since"] <= told["stamp"]
     said = cars.start("-m", "fleet.cli", "why", "red")
     assert said.wait() == 0
-    assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d\)", said.lines()[0]), said.stderr
+    assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d \S+\)", said.lines()[0]), said.stderr
     nobody = cars.start("-m", "fleet.cli", "why", "purple")
     assert nobody.wait() == 1
     assert "No decision about purple. There are decisions about: blue, green, red" in nobody.stderr
