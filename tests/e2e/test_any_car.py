@@ -23,7 +23,7 @@ MOVES_S = 1.5
 
 
 @dataclass(frozen=True)
-class Kind:
+class CarKind:
     """One kind of car: the words of the simulator, the platform that the gateway is told, and what it can show."""
 
     name: str
@@ -34,19 +34,19 @@ class Kind:
 
 
 KINDS = (
-    Kind("often", "arduino+interval=0.71", "arduino", "yes"),
-    Kind("today", "arduino+interval=1.25", "arduino", "yes"),
-    Kind("slow", "arduino+interval=2.2", "arduino", "yes"),
-    Kind("text", "arduino+interval=1.25+text", "arduino", "yes"),
-    Kind("timer", "arduino+timer+interval=1.0", "arduino", "no"),
-    Kind("stm32", "stm32", "stm32", "no"),
-    Kind("course", "course", "raspberry_pi+no_readings", "no", modes=False),
-    Kind("silent", "arduino+interval=1.25+silent=tracking", "arduino", "yes"),
+    CarKind("often", "arduino+interval=0.71", "arduino", "yes"),
+    CarKind("today", "arduino+interval=1.25", "arduino", "yes"),
+    CarKind("slow", "arduino+interval=2.2", "arduino", "yes"),
+    CarKind("text", "arduino+interval=1.25+text", "arduino", "yes"),
+    CarKind("timer", "arduino+timer+interval=1.0", "arduino", "no"),
+    CarKind("stm32", "stm32", "stm32", "no"),
+    CarKind("course", "course", "raspberry_pi+no_readings", "no", modes=False),
+    CarKind("silent", "arduino+interval=1.25+silent=tracking", "arduino", "yes"),
 )
 
 
 @dataclass
-class Cars:
+class KindsUnderTest:
     """A fleet with one car of each kind, and its simulator."""
 
     fleet: FleetProcesses
@@ -54,7 +54,7 @@ class Cars:
 
 
 @pytest.fixture(scope="module")
-def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
+def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KindsUnderTest]:
     """Start all cars, and wait until each is ready. It takes no longer than `USABLE_S`."""
     fleet = FleetProcesses(free_endpoint(), Path(tmp_path_factory.mktemp("cars")))
     try:
@@ -65,7 +65,7 @@ def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
         for kind in KINDS:
             wait_for(lambda kind=kind: is_ready(fleet, kind.name), f"{kind.name} is ready")
         assert time.monotonic() - began < USABLE_S + BUSY_S
-        yield Cars(fleet, sim)
+        yield KindsUnderTest(fleet, sim)
     finally:
         fleet.close()
 
@@ -75,19 +75,21 @@ def is_ready(fleet: FleetProcesses, car: str) -> bool:
     return safety is not None and safety.trust != "unknown" and not safety.waits_for
 
 
-def commands(cars: Cars, *words: str, kinds: tuple[Kind, ...] = KINDS) -> dict[str, tuple[int, dict[str, Any]]]:
+def commands(
+    cars: KindsUnderTest, *words: str, kinds: tuple[CarKind, ...] = KINDS
+) -> dict[str, tuple[int, dict[str, Any]]]:
     """Run one `fleet` command for each car, all at once. Return the exit codes and outcomes by car."""
     verb, *rest = words
     running = {kind.name: cars.fleet.start("-m", "fleet.cli", verb, kind.name, *rest, "--json") for kind in kinds}
     return {name: (process.wait(), json.loads(process.lines()[0])) for name, process in running.items()}
 
 
-def truth(cars: Cars, kind: Kind) -> dict[str, Any]:
+def truth(cars: KindsUnderTest, kind: CarKind) -> dict[str, Any]:
     return dict(cars.sim.say({"car": kind.name, "ask": "truth"}))
 
 
 @pytest.mark.xdist_group("any_car")
-def test_a_drive_begins_at_once_and_is_said_as_it_is(cars: Cars) -> None:
+def test_a_drive_begins_at_once_and_is_said_as_it_is(cars: KindsUnderTest) -> None:
     for kind in KINDS:
         asked_at = time.monotonic()
         answer = cars.fleet.ask("drive", kind.name, motion="forward", duration_s=2.0)
@@ -104,7 +106,7 @@ def test_a_drive_begins_at_once_and_is_said_as_it_is(cars: Cars) -> None:
 
 
 @pytest.mark.xdist_group("any_car")
-def test_a_mode_opens_and_stays_and_a_stop_stops(cars: Cars) -> None:
+def test_a_mode_opens_and_stays_and_a_stop_stops(cars: KindsUnderTest) -> None:
     with_modes = tuple(kind for kind in KINDS if kind.modes)
     for name, (code, outcome) in commands(cars, "mode", "tracking", kinds=with_modes).items():
         assert code == 0, (name, outcome)
@@ -122,8 +124,8 @@ def test_a_mode_opens_and_stays_and_a_stop_stops(cars: Cars) -> None:
 
 
 @pytest.mark.xdist_group("any_car")
-def test_what_a_car_can_show_is_found_out_and_said(cars: Cars) -> None:
-    def found(kind: Kind) -> str:
+def test_what_a_car_can_show_is_found_out_and_said(cars: KindsUnderTest) -> None:
+    def found(kind: CarKind) -> str:
         return str(cars.fleet.state("health", kind.name).shows_stops)
 
     commands(cars, "stop")
