@@ -26,7 +26,7 @@ from gateway.control.backoff import Attempts
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth, LinkState
-from gateway.control.events import Level
+from gateway.control.events import Level, OutgoingFrame
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
@@ -42,6 +42,7 @@ from schemas import bus
 from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
+from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
@@ -101,8 +102,11 @@ class Settings:
 class CarGateway:
     """One car's gateway. `run` returns after `stop`, when the car has stopped."""
 
-    def __init__(self, settings: Settings, opened: bus.Bus, service: CarService) -> None:
+    def __init__(
+        self, settings: Settings, opened: bus.Bus, service: CarService, sleep: SleepWatch | None = None
+    ) -> None:
         self._settings = settings
+        self._sleep = sleep or SleepWatch(clock_pair())
         self._bus = opened
         self._service = service
         self._loop = asyncio.get_running_loop()
@@ -176,8 +180,8 @@ class CarGateway:
             self._loop,
             values=self._values_due,
             histories=self._histories_due,
-            command=self._commands.on_query,
-            streamed=self._commands.on_sample,
+            command=self._on_query,
+            streamed=self._on_sample,
             senders=self._on_sender_tokens,
             cars=self._estop_sync.on_tokens,
         )
@@ -408,9 +412,9 @@ class CarGateway:
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
-        self._on_gap(now)
+        self._on_gap(now)  # before the decoder: reports that are read late may look like a pause
         self._on_events(self._decoder.tick(now))
-        while (link := self._link) is not None and (write := self._control.poll(self._loop.time())) is not None:
+        while (link := self._link) is not None and (write := self._next_frame()) is not None:
             self._decoder.sent(write.data, self._loop.time())  # an echo may arrive before the write returns
             try:
                 await link.write(write.data)
@@ -428,6 +432,12 @@ class CarGateway:
             self._health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
 
+    def _next_frame(self) -> OutgoingFrame | None:
+        """Return the frame to write now, if any. The computer may have slept since the last one."""
+        now = self._loop.time()
+        self._on_gap(now)
+        return self._control.poll(now)
+
     # ------------------------------------------------------------------ commands
 
     async def _answer(self, backlog: bus.Backlog[tuple[str, zenoh.Query]]) -> None:
@@ -440,6 +450,15 @@ class CarGateway:
             except Exception:  # a bad query must not end the gateway
                 log.exception("a query could not be answered")
             await asyncio.sleep(0)
+
+    def _on_query(self, item: tuple[zenoh.Query, str]) -> None:
+        """Take a command. After a sleep of the computer the car is stopped before any command is taken."""
+        self._on_gap(self._loop.time())
+        self._commands.on_query(item)
+
+    def _on_sample(self, sample: bus.Sample) -> None:
+        self._on_gap(self._loop.time())
+        self._commands.on_sample(sample)
 
     def _flush(self) -> None:
         """Publish records and states, save the safety state, answer the pending queries."""
@@ -507,7 +526,11 @@ class CarGateway:
                 worst = 0.0
 
     def _on_gap(self, now: float) -> None:
-        """Handle a gap of the loop: a stalled process may have lost the bus, and stops a driven car."""
+        """Handle a gap of the loop, or a sleep: the process may have lost the bus, and stops a driven car."""
+        if (slept_s := self._sleep.take()) > 0:
+            self._publisher.on_bus_lost(now)
+            self._control.on_sleep(slept_s, now, counted=MONOTONIC_COUNTS_SLEEP)
+            self._wake.set()
         gap_s = now - self._alive_at - CHECK_INTERVAL_S
         if gap_s > BUS_LOSS_GAP_S:
             self._publisher.on_bus_lost(now)

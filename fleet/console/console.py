@@ -39,6 +39,7 @@ from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
 from schemas.keys import person_of
+from schemas.process.suspend import SleepWatch, clock_pair
 
 MAX_PAGES: Final = 32
 """Maximum number of connected pages."""
@@ -58,8 +59,9 @@ class TooManyPages(Exception):
 class Console:
     """Everything that the pages share. All methods run on the loop."""
 
-    def __init__(self, fleet: Fleet, place: Path, file: Path) -> None:
+    def __init__(self, fleet: Fleet, place: Path, file: Path, sleep: SleepWatch | None = None) -> None:
         self._fleet = fleet
+        self._sleep = sleep or SleepWatch(clock_pair())
         self.sessions = SessionsApi(fleet, place, self.management_refusal)
         self.setup = SetupApi(fleet, file)
         self._presses = PressBook()
@@ -144,6 +146,7 @@ class Console:
         next_at = loop.time()
         while True:
             now = time.monotonic()
+            self._end_presses_of_sleep()
             for press in self._presses.expire(now):
                 self._end(press, "The page did not answer for 0.3 s.")
             tick = f'{{"t":"tick","n":{self._presses.tick(now)}}}'
@@ -163,6 +166,12 @@ class Console:
                 self._show("plan", self._plan_text())
             next_at = max(next_at + TICK_INTERVAL_S, loop.time())
             await asyncio.sleep(next_at - loop.time())
+
+    def _end_presses_of_sleep(self) -> None:
+        """End every press after a sleep of this computer: its clock stood still, so no echo looks late."""
+        if self._sleep.take() > 0:
+            for press in self._presses.on_sleep():
+                self._end(press, "The computer of the console slept.")
 
     def _show_rights(self) -> None:
         """Show each page what its person may not do, if that has changed. End presses that are refused by now."""
@@ -317,6 +326,7 @@ class Console:
 
     def _on_message(self, page: PageLink, message: PageMessage) -> None:
         now = time.monotonic()
+        self._end_presses_of_sleep()
         match message.kind:
             case "echo":
                 press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)

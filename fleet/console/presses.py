@@ -109,6 +109,11 @@ class PressBook:
         self._stopped_at = now
         return self._end(lambda _: True)
 
+    def on_sleep(self) -> list[HeldPress]:
+        """End every press: the computer slept. No tick from before counts, as its age does not show the sleep."""
+        self._ticks.clear()
+        return self._end(lambda _: True)
+
     def drop_cars(self, cars: set[str]) -> list[HeldPress]:
         """End every press of these cars: they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))

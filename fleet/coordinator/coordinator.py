@@ -34,6 +34,7 @@ from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to
 from schemas import keys, messages, topics
 from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.topics import Qos
 
 SENDER: Final = "coordinator-"
@@ -98,6 +99,7 @@ class Coordinator:
     """The people of the fleet file, who may change the plan. None: those that the gateways know."""
     run_name: str = ""
     """Name of its `fleet up` run: in a new run the plan begins anew."""
+    sleep: SleepWatch = field(default_factory=lambda: SleepWatch(clock_pair()))
     dropped: int = 0
     """Number of samples and queries dropped because the inbox was full."""
     _memory: PolicyState = field(default_factory=PolicyState)
@@ -160,6 +162,7 @@ class Coordinator:
                     linked_hubs = bus.hubs
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()
+                    self._check_sleep(observer, now)
                     hub_keeper.check(connected=bool(linked_hubs))
                     if not linked_hubs:
                         continue
@@ -183,6 +186,12 @@ class Coordinator:
                     self._save(replace(self._memory, stopped_by="", to_rest=frozenset()))
             finally:
                 self.client.close()  # ends pending commands
+
+    def _check_sleep(self, observer: FleetObserver, now: float) -> None:
+        """After a sleep of the computer, decide by new readings only. The sleep costs no car its role."""
+        if (slept_s := self.sleep.take()) > 0:
+            observer.on_sleep(0.0 if MONOTONIC_COUNTS_SLEEP else slept_s)
+            self._memory = on_hub_back(self._memory, now)
 
     # ------------------------------------------------------------------ one step
 

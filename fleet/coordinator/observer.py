@@ -94,6 +94,12 @@ class FleetObserver:
         for each in (self.cars, self.readings, self._absent_since):
             each.pop(car, None)
 
+    def on_sleep(self, slept_s: float) -> None:
+        """Let all readings age by a sleep of the computer, which the clock of their times does not count."""
+        for readings in self.readings.values():
+            for topic, reading in readings.items():
+                readings[topic] = replace(reading, at=reading.at - slept_s)
+
     def on_outcome(self, car: str, refusal: Refusal | None) -> None:
         """Note the refusal of a command, or (None) that one succeeded."""
         if car in self.cars:

@@ -8,11 +8,14 @@ import contextlib
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from fleet.policy.state import PersistedPolicy
 from schemas.atomic_file import write_atomically
 from schemas.state_dir import directory_of
+
+MAX_CLOCK_NOISE_S: Final = 1.0
+"""Maximum change of the start of a phase that is no step of the wall clock."""
 
 
 class CoordinatorStateFile:
@@ -68,5 +71,7 @@ class CoordinatorStateFile:
 
 
 def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:
-    """Return True if nothing but the start of the phase differs (its last digit follows the clock)."""
-    return replace(one, phase_since_s=0.0) == replace(other, phase_since_s=0.0)
+    """Return True if nothing differs but the last digits of the start of the phase, which follow the clock."""
+    # If the wall clock is set, the start is written again: else a restarted coordinator would take the step for time.
+    is_step = abs(one.phase_since_s - other.phase_since_s) > MAX_CLOCK_NOISE_S
+    return not is_step and replace(one, phase_since_s=0.0) == replace(other, phase_since_s=0.0)

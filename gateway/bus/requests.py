@@ -186,15 +186,14 @@ def _encoding(request: ParsedRequest) -> str:
 
 
 def _age_s(message: Any, request: ParsedRequest) -> float | None:
-    """Return the age of a request, s; None if unknown, and 0 if the sender's clock is ahead of ours."""
+    """Return the age of a request, s; None if unknown, negative if its sender's clock is ahead of ours."""
     if message.HasField("asked"):
-        asked_ns = messages.stamp_ns(message.asked)
-    elif request.sampled_ns is not None:
-        asked_ns = request.sampled_ns
-    else:
+        age_ns: int = request.now_ns - messages.stamp_ns(message.asked)
+        return age_ns / 1e9
+    if request.sampled_ns is None:
         return None
-    age_ns: int = request.now_ns - asked_ns
-    return max(0.0, age_ns / 1e9)
+    # After a wall clock was set back, the timestamps of Zenoh stay ahead of it until it has caught up.
+    return max(0.0, (request.now_ns - request.sampled_ns) / 1e9)
 
 
 def _text(field: str, value: str, forbidden: str = "") -> str:

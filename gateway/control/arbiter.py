@@ -35,6 +35,12 @@ from schemas.suggestion import did_you_mean
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""
+MAX_AHEAD_S: Final = 5.0
+"""Maximum time by which `asked` may lie in the future. Clocks of computers differ by less if they are set by NTP."""
+CLOCK_DOUBT_S: Final = 30.0
+"""Minimum lateness of a command that is rather a wrong clock than a slow network."""
+AFTER_SLEEP_S: Final = 2.0
+"""Time after a sleep of the computer in which a command without `asked` may be from before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,8 @@ class CommandContext:
     pauses: tuple[FleetPause, ...] = ()
     loan: Loan | None = None
     loan_until: float = 0.0
+    slept_at: float = float("-inf")
+    """When the last sleep of the computer was noticed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +142,8 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
         return None
     if isinstance(what, Pause):  # late is better than never, as of a stop
         return _may_direct(sender, "pause the fleet", context)
-    if command.age_s is not None and command.age_s > command.ttl_s:
-        return (
-            Reason.STALE,
-            f"the command arrived {command.age_s:.1f} s late (maximum {command.ttl_s:g} s). Send it again.",
-        )
+    if (words := _out_of_time(command, context)) is not None:
+        return Reason.STALE, words
     unknown = _unknown(what, context)
     if unknown is not None:
         return Reason.UNSUPPORTED, unknown
@@ -154,6 +159,22 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
             return _may_direct(sender, f"end the loan of {context.car}", context)
         case _:
             return _unmet(command, needs(what), context)
+
+
+def _out_of_time(command: Command, context: CommandContext) -> str | None:
+    """Return why the time of the command is no time of now; None if it is, or if the command has no time."""
+    age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
+    if age_s is None:
+        if context.now < context.slept_at + AFTER_SLEEP_S:
+            return "the computer has just slept, and the command may be from before. Send it again, with `asked`."
+        return None
+    if age_s < -MAX_AHEAD_S:
+        limit = f"maximum {MAX_AHEAD_S:g} s"
+        return f"the command was asked {-age_s:.0f} s in the future by its sender's clock ({limit}). {clocks}"
+    if age_s <= command.ttl_s:
+        return None
+    words = f"the command arrived {age_s:.1f} s late (maximum {command.ttl_s:g} s). Send it again."
+    return words if age_s < CLOCK_DOUBT_S else f"{words} If that does not help: {clocks.lower()[0]}{clocks[1:]}"
 
 
 def _unknown(what: Action, context: CommandContext) -> str | None:

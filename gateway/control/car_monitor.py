@@ -223,6 +223,20 @@ class CarMonitor:
             self._log.log(Level.ERROR, "stalled", words, now)
             self._executor.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
+    def on_sleep(self, slept_s: float, now: float) -> None:
+        """Stop the car first after a sleep of the computer, unless it has shown that it stands. Begin nothing again."""
+        model, stops = self.model, self._stops
+        model.evidence.reset_times()
+        model.mode.excuse_silence(now)
+        stands = model.at_rest and model.trust.shown and stops.running is None
+        then = f"{model.name} stood before, and stands" if stands else f"{model.name} is stopped first"
+        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
+        self._log.log(Level.WARNING, "slept", words, now)
+        self._executor.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
+        self._executor.senders.halt(now)  # a joystick that is still pushed restarts no car
+        if model.link_open and not stands:
+            stops.on_sleep(now)
+
     def _log_contradiction(self, before: Verdict, now: float) -> None:
         mode = self.model.mode
         if mode.verdict is not before and mode.verdict is Verdict.CONTRADICTED:

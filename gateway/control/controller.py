@@ -84,6 +84,8 @@ class Controller:
         self._speed_max = speed_max
         self._mover = ""
         """The person who moved the car last, by a drive or a mode."""
+        self._slept_at = float("-inf")
+        """When the last sleep of the computer was noticed."""
         self.was_open = False
         """True if the link was open at least once, so the car may have been driven."""
 
@@ -177,6 +179,16 @@ class Controller:
     def on_stall(self, gap_s: float, now: float) -> None:
         """Stop a driven car after a gap of the loop."""
         self._monitor.on_stall(gap_s, now)
+
+    def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
+        """Stop the car first after a sleep of the computer, and end the lease. `counted`: `now` went on meanwhile."""
+        self._slept_at = now
+        self.safety.lease = None
+        if counted:
+            self._senders.skip(slept_s)
+        else:
+            self.safety.loan_until -= slept_s
+        self._monitor.on_sleep(slept_s, now)
 
     def shut_down(self, now: float) -> None:
         """Stop the car and reject all later commands: the gateway ends."""
@@ -610,4 +622,5 @@ class Controller:
             pauses=self.safety.pauses,
             loan=self.safety.loan_at(now),
             loan_until=self.safety.loan_until,
+            slept_at=self._slept_at,
         )

@@ -69,6 +69,10 @@ class Senders:
             name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_PAUSE_S
         )
 
+    def skip(self, slept_s: float) -> None:
+        """Count no sleep of the computer as a pause of a stream. For a clock that goes on in a sleep."""
+        self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
+
     def halt(self, now: float, by: str = "") -> None:
         """Require a pause of all senders that have just driven: the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may

@@ -347,6 +347,15 @@ class StopExecutor:
         else:
             self._try_again(running, now)
 
+    def on_sleep(self, now: float) -> None:
+        """Stop the car first after a sleep of the computer. A stop from before goes on, with its next try at once."""
+        running = self.running
+        if running is not None and running.sequence.rank > sequences.SOFT.rank and not running.at_rest:
+            if running.frames_sent:
+                self._try_again(running, now)
+        elif running is not None or not self.shutting_down:
+            self.begin(self.full(now), FrameOrigin.STOP, now)
+
     def _may_probe(self, running: StopInProgress) -> bool:
         """Return True if the car could react to a `MODE00` now, and show it."""
         if running.case is StopCase.WRONG_PLATFORM:

@@ -163,6 +163,10 @@ class ModeEstimator:
             words = f"no reading as in mode {self.asked} for {own_s:.1f} s, the last one is as in mode {shape}"
             self._conclude(Verdict.CONTRADICTED, words, now)
 
+    def excuse_silence(self, now: float) -> None:
+        """Count no silence from before now: nobody could hear the car."""
+        self._excused_at = max(self._excused_at, now)
+
     @property
     def heard_at(self) -> float:
         """Return when the last reading arrived; -inf if none has."""

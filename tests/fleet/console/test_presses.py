@@ -122,3 +122,15 @@ def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
             book.expire(now)
             over = over or now - last_echo > MAX_ECHO_GAP_S
             assert not (over and book.alive)
+
+
+def test_a_sleep_of_the_computer_ends_every_press_and_no_tick_from_before_counts() -> None:
+    """The clock of the server stood still, so that neither the tick nor the echo looks old."""
+    book, tick = book_with_press()
+    (over,) = book.on_sleep()
+    assert over.cars == RED
+    assert book.alive == []
+    assert book.echo(1, 1, tick, 10.05) is None
+    with pytest.raises(PressRefused):
+        book.begin(1, 2, RED, "forward", tick, 10.05)
+    assert book.begin(1, 3, RED, "forward", book.tick(10.1), 10.1).id == 3

@@ -145,3 +145,15 @@ def test_a_token_that_names_no_car_is_ignored() -> None:
     observer = FleetObserver()
     observer.on_token("RED!", 100.0, alive=True)
     assert observer.present == set()
+
+
+def test_after_a_sleep_of_the_computer_no_reading_from_before_is_fresh() -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    observer.on_sample(said("sensor/range"), 100.0, None)
+    observer.on_sleep(3600.0)
+    ages = {100.0 - reading.at for reading in observer.snapshot(()).readings["red"].values()}
+    assert ages == {3600.0}
+    assert observer.present == {"red"}
+    observer.on_sample(said("sensor/range"), 100.2, None)
+    assert observer.snapshot(()).readings["red"]["sensor/range"].at == 100.2

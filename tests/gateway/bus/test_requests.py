@@ -281,7 +281,9 @@ def test_only_what_concerns_the_fleet_may_be_asked_by_wildcard(verb: str) -> Non
     [
         (None, None, None),
         (NOW - 1_500_000_000, None, 1.5),
-        (NOW + 1_500_000_000, None, 0.0),
+        (NOW + 1_500_000_000, None, -1.5),
+        (NOW + 3600 * 1_000_000_000, NOW, -3600.0),
+        (None, NOW + 3600 * 1_000_000_000, 0.0),
         (None, NOW - 2_000_000_000, 2.0),
         (NOW - 250_000_000, NOW - 9_000_000_000, 0.25),
         (0, None, NOW / 1e9),
@@ -336,7 +338,7 @@ def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
     assert words != "no words"
     assert command.verb == verb
     assert command.streamed is request.streamed
-    assert command.age_s is None or command.age_s >= 0
+    assert command.age_s is None or math.isfinite(command.age_s)
     assert 0 < command.ttl_s <= 3600
 
 

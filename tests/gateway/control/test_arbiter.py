@@ -229,3 +229,17 @@ def test_no_step_beyond_the_speed_that_is_allowed(
     if refusal is not None:
         assert refusal[0] is Reason.UNSUPPORTED
         assert f"Its maximum is {limit:.0%}" in refusal[1]
+
+
+@pytest.mark.parametrize(
+    ("age_s", "refused"),
+    [(-1e12, True), (-3600.0, True), (-5.1, True), (-4.9, False), (0.0, False), (2.0, False), (3600.0, True)],
+)
+@pytest.mark.parametrize("what", [*WHATS, *DIRECTIONS], ids=repr)
+def test_a_time_far_from_now_is_refused_but_a_stop_looks_at_no_clock(
+    what: Action, age_s: float, *, refused: bool
+) -> None:
+    calm = replace(situations()[0], profile=PROFILES["stm32+arm"], asked=Mode.MANUAL, closing=False, fan=True)
+    refusal = refuse(Command("c", "verb", Sender("ann", SenderKind.PERSON), what, age_s=age_s, ttl_s=2.0), calm)
+    is_stale = refusal is not None and refusal[0] is Reason.STALE
+    assert is_stale is (refused and not isinstance(what, Stop | EmergencyStop | Pause))

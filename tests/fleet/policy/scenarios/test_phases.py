@@ -86,3 +86,18 @@ def test_a_restarted_plan_begins_with_its_first_phase() -> None:
     step = run.at(12.1)
     assert step.memory.phase.name == "work"
     assert [each.decided for each in step.changed if each.subject == "phase"] == ["work"]
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, 0.0, 3600.0])
+def test_a_step_of_the_wall_clock_is_no_time_of_the_phase(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    """The clock is set while the coordinator runs. The next one must not take the step for time that has passed."""
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    run = PolicyRun(PLAN, "red")
+    run.until(3.0)
+    file, wall_s = CoordinatorStateFile("fleet", "tcp/x", "run-1"), 100_000.0
+    file.save(to_persisted(PLAN, run.memory, run.now, wall_s))
+    file.save(to_persisted(PLAN, run.memory, run.now, wall_s + step_s))
+    memory = restore(PLAN, FleetSnapshot(run.cars), file.load(), run.now, wall_s + step_s)
+    assert memory.phase.since == pytest.approx(run.memory.phase.since, abs=0.2)

@@ -1,0 +1,103 @@
+"""Measures how long the computer has slept, which `time.monotonic()` does not count on Linux and macOS.
+
+| system | with sleep | without sleep |
+|---|---|---|
+| Linux | CLOCK_BOOTTIME | CLOCK_MONOTONIC |
+| macOS | CLOCK_MONOTONIC_RAW (`mach_continuous_time`) | CLOCK_UPTIME_RAW (`mach_absolute_time`) |
+| Windows | GetTickCount64 | QueryUnbiasedInterruptTime |
+
+On every other system no sleep is noticed: the wall clock also steps when somebody sets it. A paused virtual machine is
+no sleep either: no clock of its system counts the pause.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+if sys.platform == "win32":
+    import ctypes
+
+# Of GetTickCount64 each reading is up to 16 ms old. On Linux and macOS the readings are exact.
+MIN_SLEEP_S: Final = 0.1
+"""Minimum difference of the clocks that counts as a sleep. No computer sleeps for a shorter time."""
+MAX_READ_S: Final = 0.001
+"""Maximum duration of an undisturbed reading of the clocks. After a longer one the first look reads them again."""
+MAX_READS: Final = 10
+"""Maximum readings of the first look. If the scheduler disturbs all of them, the best one counts."""
+MONOTONIC_COUNTS_SLEEP: Final = sys.platform == "win32"
+"""True if `time.monotonic()` and the times of asyncio go on during a sleep."""
+
+_CLOCKS: Final = {
+    "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
+    "darwin": ("CLOCK_MONOTONIC_RAW", "CLOCK_UPTIME_RAW"),
+}
+
+ClockPair = tuple[Callable[[], float], Callable[[], float]]
+"""Two clocks, s: one that goes on during a sleep of the computer, and one that stands still."""
+
+
+def clock_pair() -> ClockPair | None:
+    """Return the clocks of this system; None if it has no such pair."""
+    if sys.platform == "win32":
+        kernel = ctypes.windll.kernel32
+        kernel.GetTickCount64.restype = ctypes.c_uint64
+
+        def awake_s() -> float:
+            ticks = ctypes.c_uint64()
+            kernel.QueryUnbiasedInterruptTime(ctypes.byref(ticks))  # units of 100 ns
+            return ticks.value / 1e7
+
+        return (lambda: kernel.GetTickCount64() / 1e3), awake_s
+    names = _CLOCKS.get(sys.platform)
+    if names is None or not all(hasattr(time, name) for name in names):
+        return None
+    with_sleep, awake = (partial(time.clock_gettime, getattr(time, name)) for name in names)
+    return with_sleep, awake
+
+
+@dataclass(slots=True)
+class _Reading:
+    """The time slept since the start of the computer, s, as far as two clocks show it."""
+
+    at_least: float
+    at_most: float
+
+
+class SleepWatch:
+    """Measures the sleeps of the computer. `clocks`: None if the system has none, and no sleep is noticed.
+
+    A process may be interrupted between its readings of the two clocks. So it reads the one without sleep before and
+    after the other. Only what is certainly a sleep counts: an interruption never does.
+    """
+
+    def __init__(self, clocks: ClockPair | None) -> None:
+        self._clocks = clocks
+        self._slept_s = 0.0
+        if clocks is not None:
+            best = self._read(clocks)
+            for _ in range(MAX_READS - 1):
+                if best.at_most - best.at_least <= MAX_READ_S:
+                    break
+                best = min(best, self._read(clocks), key=lambda each: each.at_most - each.at_least)
+            self._slept_s = best.at_most
+
+    def take(self) -> float:
+        """Return how long the computer has slept since the last call, s; 0 if it has not."""
+        if self._clocks is None:
+            return 0.0
+        found = self._read(self._clocks)
+        slept_s = found.at_least - self._slept_s
+        if slept_s < MIN_SLEEP_S:
+            return 0.0
+        self._slept_s = found.at_least
+        return slept_s
+
+    @staticmethod
+    def _read(clocks: ClockPair) -> _Reading:
+        with_sleep, awake = clocks
+        before = awake()
+        total = with_sleep()
+        return _Reading(total - awake(), total - before)

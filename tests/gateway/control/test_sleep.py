@@ -1,0 +1,174 @@
+"""A sleep of the computer: the car is stopped first, and nothing from before the sleep goes on. Virtual time."""
+
+import pytest
+
+from gateway.control.arbiter import AFTER_SLEEP_S
+from gateway.control.commands import Drive, EmergencyStop, Fan, Lend, OneShot, Pause, Phase, Reason, SetMode, Stop
+from gateway.control.estimate.trust import Basis
+from gateway.control.senders import STREAM_PAUSE_S
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ColorLed
+from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
+
+FORWARD = Drive(Motion.FORWARD, 5.0)
+NIGHT_S = 8 * 3600.0
+
+
+@pytest.fixture
+def desk() -> Workbench:
+    return Workbench().ready()
+
+
+def sleep(desk: Workbench, slept_s: float = NIGHT_S, *, counted: bool = False) -> None:
+    """Let the computer sleep. `counted`: the clock of the gateway goes on meanwhile, as on Windows."""
+    if counted:
+        desk.now += slept_s
+        desk.car.report_at += slept_s
+    desk.sent.clear()
+    desk.control.on_sleep(slept_s, desk.now, counted=counted)
+    desk.pump()
+
+
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "stm32"])
+def test_a_drive_is_over_and_the_car_is_stopped_first(platform: str, *, counted: bool) -> None:
+    desk = Workbench(platform).ready()
+    desk.ask(FORWARD, PERSON, identity="drive")
+    desk.run(1.0)
+    sleep(desk, counted=counted)
+    assert desk.end("drive") == (Phase.EXPIRED, Reason.EXPIRED)
+    assert desk.frames[0] in (STOP, MODE00), "the stop goes out at once"
+    assert [entry.code for entry in desk.logs] == ["slept"]
+    assert desk.control.safety.lease is None
+    desk.run(8.0)
+    assert RUN not in desk.frames
+    assert desk.control.model.motors == "off"
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_what_was_queued_never_goes_out(desk: Workbench, *, counted: bool) -> None:
+    desk.ask(OneShot(ColorLed(1, 2, 3)), identity="led", pump=False)
+    desk.ask(Fan(), identity="fan", pump=False)
+    desk.ask(FORWARD, identity="drive", pump=False)
+    desk.ask(SetMode(Mode.TRACKING), identity="mode", pump=False)
+    sleep(desk, counted=counted)
+    desk.run(20.0)
+    assert not [data for data in desk.frames if data not in (STOP, MODE00)]
+    assert {desk.end(each) for each in ("led", "fan", "mode")} == {(Phase.EXPIRED, Reason.EXPIRED)}
+
+
+def test_a_mode_that_runs_is_stopped(desk: Workbench) -> None:
+    desk.ask(SetMode(Mode.TRACKING))
+    desk.run(4.0)
+    sleep(desk)
+    desk.run(12.0)
+    assert MODE00 in desk.frames
+    assert desk.control.model.at_rest
+
+
+def test_a_car_that_has_shown_that_it_stands_gets_no_frame(desk: Workbench) -> None:
+    desk.ask(Stop())
+    desk.run(8.0)
+    assert desk.control.model.basis is Basis.SHOWN
+    sleep(desk)
+    desk.run(4.0)
+    assert desk.frames == []
+    assert [entry.code for entry in desk.logs] == ["slept"]
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_the_silence_during_the_sleep_is_none_of_the_car(desk: Workbench, *, counted: bool) -> None:
+    desk.ask(Stop())
+    desk.run(8.0)
+    sleep(desk, counted=counted)
+    for _ in range(10):
+        desk.now += 0.2
+        desk.control.tick(desk.now)
+        desk.pump()
+    assert desk.control.model.is_heard
+    assert [entry.code for entry in desk.logs] == ["slept"]
+
+
+def test_report_times_from_before_the_sleep_show_nothing(desk: Workbench) -> None:
+    """The pause between two reports holds the whole sleep."""
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.ask(Stop(), identity="stop")
+    desk.run(1.5)
+    sleep(desk, 1.9, counted=True)
+    desk.hear()
+    assert desk.control.model.basis is not Basis.SHOWN, "one report after the sleep shows no pause"
+
+
+def test_a_stop_from_before_the_sleep_goes_on(desk: Workbench) -> None:
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.ask(Stop(), identity="stop", pump=False)
+    sleep(desk)
+    desk.run(9.0)
+    assert desk.end("stop")[0] is Phase.COMPLETE
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_a_joystick_that_is_still_pushed_must_pause(desk: Workbench, *, counted: bool) -> None:
+    for _ in range(5):
+        desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True, age_s=0.0)
+        desk.run(0.05)
+    sleep(desk, counted=counted)
+    assert desk.ask(FORWARD, PERSON, streamed=True, age_s=0.0).reason is Reason.HELD
+    desk.run(STREAM_PAUSE_S)
+    assert desk.ask(FORWARD, PERSON, streamed=True, age_s=0.0).status is not Phase.REJECTED
+
+
+def test_just_after_a_sleep_a_command_must_say_when_it_was_asked(desk: Workbench) -> None:
+    sleep(desk)
+    assert desk.ask(FORWARD, SCRIPT).reason is Reason.STALE
+    assert desk.ask(FORWARD, SCRIPT, age_s=NIGHT_S).reason is Reason.STALE
+    for what in (Stop(), EmergencyStop(), Pause()):
+        assert desk.ask(what, PERSON).reason is None
+    other = Workbench().ready()
+    sleep(other)
+    assert other.ask(FORWARD, SCRIPT, age_s=0.1).reason is None
+    third = Workbench().ready()
+    sleep(third)
+    third.run(AFTER_SLEEP_S)
+    assert third.ask(FORWARD, SCRIPT).reason is None
+
+
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize(("slept_s", "left"), [(590.0, True), (610.0, False)])
+def test_a_loan_counts_the_sleep(desk: Workbench, slept_s: float, *, left: bool, counted: bool) -> None:
+    desk.ask(Lend("ann", 600.0), PERSON)
+    sleep(desk, slept_s, counted=counted)
+    assert (desk.control.safety.loan_at(desk.now) is not None) is left
+
+
+def test_a_sleep_while_the_link_is_down_sends_nothing_and_is_said(desk: Workbench) -> None:
+    desk.control.link_down("gone", desk.now)
+    desk.logs.clear()
+    sleep(desk)
+    assert desk.frames == []
+    assert [entry.code for entry in desk.logs] == ["slept"]
+
+
+def test_a_stop_that_waits_for_evidence_is_sent_again_at_once(desk: Workbench) -> None:
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.ask(Stop(), identity="stop")
+    desk.until(lambda: bool(desk.control.stops.running and desk.control.stops.running.frames_sent))
+    sleep(desk)
+    desk.run(0.1)
+    assert MODE00 in desk.frames
+
+
+def test_a_sleep_at_the_end_of_the_gateway_begins_no_stop_after_it() -> None:
+    desk = Workbench("raspberry_pi").ready()
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.control.shut_down(desk.now)
+    sleep(desk)
+    desk.run(10.0)
+    assert desk.control.stops.finished
+    desk.sent.clear()
+    sleep(desk)
+    assert desk.control.stops.finished

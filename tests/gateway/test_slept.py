@@ -1,0 +1,83 @@
+"""A whole gateway in the test's own process. The test owns the clock that counts the sleeps of the computer."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+from gateway.bus.service import CarService
+from gateway.car import CarGateway, Settings
+from gateway.link import parse_url
+from gateway.protocol.platforms import parse_platform
+from schemas import bus
+from schemas.process.suspend import SleepWatch
+from tests.support.ports import free_endpoint
+from tests.support.processes import MODE00, FleetProcesses, TcpCar, wait_for
+
+RUN = b"$1,0,0,0,0,0,0,0,0#"
+STOPS = (MODE00, b"$0,0,0,0,0,0,0,0,0#")
+
+
+class SleepingLaptop:
+    """A computer that sleeps when the test says so."""
+
+    def __init__(self) -> None:
+        self.slept_s = 0.0
+        self.watch = SleepWatch((lambda: time.monotonic() + self.slept_s, time.monotonic))
+
+
+@contextlib.asynccontextmanager
+async def served(tmp_path: Path, computer: SleepingLaptop) -> AsyncIterator[tuple[FleetProcesses, TcpCar, list[str]]]:
+    """Serve a car that has shown that it stands. Yield its fleet, the car, and the codes of its log."""
+    fleet, car, codes = FleetProcesses(free_endpoint(), tmp_path), TcpCar(), list[str]()
+
+    def listen(sample: bus.Sample) -> None:
+        entry: Any = sample.message()
+        codes.append(entry.name.removeprefix("red "))
+
+    fleet.bus.subscribe("fleet/red/event/log", listen)
+    with bus.Bus.open(fleet.endpoint) as opened:
+        settings = Settings(
+            "red", parse_url(car.link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
+            retry=True,
+        )  # fmt: skip
+        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"), computer.watch)
+        serving = asyncio.ensure_future(gateway.run())
+        try:
+            await asyncio.to_thread(wait_for, lambda: MODE00 in car.received, "it is stopped at the connect")
+            car.obey()
+            await asyncio.to_thread(wait_for, lambda: "recovered" in codes, "it stands")
+            yield fleet, car, codes
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            car.close()
+            fleet.close()
+
+
+async def test_a_car_that_drove_through_a_sleep_is_stopped_before_anything_else(tmp_path: Path) -> None:
+    computer = SleepingLaptop()
+    async with served(tmp_path, computer) as (fleet, car, codes):
+        driven = await asyncio.to_thread(fleet.ask, "drive", motion="forward", duration_s=10)
+        assert driven["status"] in ("queued", "sent")
+        await asyncio.to_thread(wait_for, lambda: RUN in car.received, "it drives")
+        before = len(car.received)
+        computer.slept_s += 3600.0
+        late = await asyncio.to_thread(fleet.ask, "drive", motion="back", duration_s=10)
+        assert (late["status"], late["reason"]) == ("rejected", "stale"), "it may be from before the sleep"
+        await asyncio.to_thread(wait_for, lambda: len(car.received) > before, "a frame after the sleep")
+        assert car.received[before] in STOPS
+        await asyncio.to_thread(wait_for, lambda: "slept" in codes, "it says that it slept")
+        safety = await asyncio.to_thread(fleet.state, "safety")
+        assert not safety.HasField("lease")
+        assert RUN not in car.received[before:]
+
+
+async def test_a_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path) -> None:
+    computer = SleepingLaptop()
+    async with served(tmp_path, computer) as (_, _, codes):
+        computer.slept_s += 60.0
+        await asyncio.to_thread(wait_for, lambda: "slept" in codes, "it says that it slept")
+        assert codes.count("slept") == 1
