@@ -138,8 +138,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is longer. "
-        "No reading comes too early after the last, and no frame of ours follows its `MODE00`",
+        "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
+        "longer. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
         "the stop goes on, and a command may take its place",
     ),
     StopCase.NO_REACTION: EvidenceRow(

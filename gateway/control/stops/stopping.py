@@ -24,7 +24,7 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
 EVIDENCE_INTERVALS: Final = 4
-"""Minimum of that timeout, in intervals with a pause: two pauses, the report before them, and the silence after them."""
+"""Minimum of that timeout, in intervals with a pause: two pauses, the report before, and the silence after them."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer."""
 # The silence is longer than any block outside avoidance, so the car reads the next frame alone. With growth to 6.5 s
