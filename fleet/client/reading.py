@@ -17,7 +17,7 @@ from schemas.bus import Sample
 
 READING_QUEUE_LIMIT: Final = 1024
 """Maximum number of queued samples."""
-MAX_AHEAD_S: Final = 10.0
+MAX_STAMP_AHEAD_S: Final = 10.0
 """Maximum time by which a stamp may lie in the future. The clocks of two computers differ by less if NTP sets them."""
 _CLOSE_POLL_S: Final = 0.2
 """Interval at which a waiting reader notices that the stream was closed."""
@@ -72,7 +72,7 @@ class Reading:
         if topic is None or topic.stale_after_s is None:
             return False
         # A stamp from before a wall clock was set back tells no age. The value may be old.
-        is_ahead = (self.time - (now or datetime.now(UTC))).total_seconds() > MAX_AHEAD_S
+        is_ahead = (self.time - (now or datetime.now(UTC))).total_seconds() > MAX_STAMP_AHEAD_S
         return is_ahead or self.age_s(now) > topic.stale_after_s
 
     def __repr__(self) -> str:

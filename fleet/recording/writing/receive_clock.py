@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-MIN_STEP_NS: Final = 1_000_000_000
+SET_BACK_NS: Final = 1_000_000_000
 """Minimum by which a wall clock is set back. NTP corrects less than this slowly, and the receive times follow it."""
 
 
@@ -28,7 +28,7 @@ class ReceiveClock:
         """Return the time, ns since the epoch; never less than before."""
         monotonic_ns = self._monotonic_ns()
         ahead_ns = self._wall_ns() - monotonic_ns
-        if ahead_ns > self._ahead_ns - MIN_STEP_NS:
+        if ahead_ns > self._ahead_ns - SET_BACK_NS:
             self._ahead_ns = ahead_ns
         self._last_ns = max(self._last_ns, monotonic_ns + self._ahead_ns)
         return self._last_ns

@@ -11,7 +11,7 @@ HOUR = 3600 * S
 BEGAN = 1_795_000_000 * S
 
 
-class Clocks:
+class SetClock:
     """A wall clock that somebody sets, and a monotonic one."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Clocks:
     ],
 )
 def test_a_step_of_the_wall_clock(step_ns: int, found: int) -> None:
-    clocks = Clocks()
+    clocks = SetClock()
     assert clocks.wait(10 * S) == BEGAN + 10 * S
     assert clocks.wait(S, step_ns=step_ns) == BEGAN + found
     assert clocks.wait(S) == BEGAN + found + S
@@ -43,7 +43,7 @@ def test_a_step_of_the_wall_clock(step_ns: int, found: int) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 10 * S), st.sampled_from([0, 0, 0, HOUR, -HOUR, 5, -5, S // 2, -S // 2]))))
 def test_receive_times_never_go_back_and_time_that_passes_counts(steps: list[tuple[int, int]]) -> None:
-    clocks, before, passed = Clocks(), BEGAN, 0
+    clocks, before, passed = SetClock(), BEGAN, 0
     for ns, step_ns in steps:
         now = clocks.wait(ns, step_ns=step_ns)
         assert now >= before
