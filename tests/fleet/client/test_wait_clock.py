@@ -73,7 +73,13 @@ def test_a_wait_ends_only_after_its_time_and_always_then(seen: list[tuple[bool, 
 
 @pytest.mark.parametrize(
     ("stamp_s", "ends"),
-    [(-1.0, True), (-HOUR_S, False), (MAX_STAMP_AHEAD_S - 1.0, True), (MAX_STAMP_AHEAD_S + 1.0, False), (HOUR_S, False)],
+    [
+        (-1.0, True),
+        (-HOUR_S, False),
+        (MAX_STAMP_AHEAD_S - 1.0, True),
+        (MAX_STAMP_AHEAD_S + 1.0, False),
+        (HOUR_S, False),
+    ],
 )
 def test_a_stored_reading_from_before_the_clock_was_set_is_not_fresh(stamp_s: float, *, ends: bool) -> None:
     assert SteppedWait().query(stamp_s) is ends
