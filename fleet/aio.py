@@ -4,6 +4,7 @@ The blocking calls run in threads. A watch is an asynchronous iterator with a bo
 """
 
 import asyncio
+import time
 import weakref
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -115,7 +116,7 @@ class Fleet:
                     if waiting.ends(reading, datetime.now(UTC)):
                         return reading
                 async for reading in stream:
-                    if waiting.ends(reading, datetime.now(UTC)):
+                    if waiting.ends(reading, datetime.now(UTC), time.monotonic()):
                         return reading
         except TimeoutError:
             pass

@@ -6,6 +6,7 @@ from typing import Any
 
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
+from fleet.client.reading import MAX_STAMP_AHEAD_S
 from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
 
@@ -52,7 +53,10 @@ def _commands(client: Fleet) -> dict[str, list[tuple[float, Any]]]:
     for sample in client.bus.recall(keys.topic_key(client.name, "*", _EVENT.name), RECENT_COMMAND_S):
         with suppress(messages.BadPayload):
             event: Any = messages.parse(_EVENT.message, bytes(sample.payload), str(sample.encoding))
-            age_s = max(0.0, now - event.stamp.seconds - event.stamp.nanos / 1e9)
+            age_s = now - event.stamp.seconds - event.stamp.nanos / 1e9
+            if age_s < -MAX_STAMP_AHEAD_S:
+                continue  # from before the clock was set back: nothing tells its age
+            age_s = max(0.0, age_s)
             found.setdefault(event.car, []).append((age_s, event))
     for events in found.values():
         events.sort(key=lambda each: -each[0])

@@ -230,7 +230,7 @@ class Fleet:
                     return reading
             while (left := left_s()) > 0:
                 coming = stream.within(left)
-                if coming is not None and waiting.ends(coming, datetime.now(UTC)):
+                if coming is not None and waiting.ends(coming, datetime.now(UTC), time.monotonic()):
                     return coming
         raise waiting.timeout_error(written, timeout_s or 0.0, datetime.now(UTC))
 

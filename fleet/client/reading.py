@@ -17,6 +17,8 @@ from schemas.bus import Sample
 
 READING_QUEUE_LIMIT: Final = 1024
 """Maximum number of queued samples."""
+MAX_STAMP_AHEAD_S: Final = 10.0
+"""Maximum time by which a stamp may lie in the future. The clocks of two computers differ by less if NTP sets them."""
 _CLOSE_POLL_S: Final = 0.2
 """Interval at which a waiting reader notices that the stream was closed."""
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -65,9 +67,13 @@ class Reading:
         return max(0.0, ((now or datetime.now(UTC)) - self.time).total_seconds())
 
     def stale(self, now: datetime | None = None) -> bool:
-        """Return True if it is older than `stale_after_s` of its topic."""
+        """Return True if it is older than `stale_after_s` of its topic, or if its stamp is far in the future."""
         topic = topics.of_key(self.key)
-        return topic is not None and topic.stale_after_s is not None and self.age_s(now) > topic.stale_after_s
+        if topic is None or topic.stale_after_s is None:
+            return False
+        # A stamp from before a wall clock was set back tells no age. The value may be old.
+        is_ahead = (self.time - (now or datetime.now(UTC))).total_seconds() > MAX_STAMP_AHEAD_S
+        return is_ahead or self.age_s(now) > topic.stale_after_s
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{name}={'not measured' if text is None else text}" for name, text in self._fields())

@@ -2,10 +2,14 @@
 
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Final
 
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
 from schemas import topics
+
+CLOCK_STEP_S: Final = 60.0
+"""Minimum difference between stamps and arrivals that is a step of a clock, and no delay of a network."""
 
 
 class NotInTime(TimeoutError):
@@ -21,6 +25,8 @@ class _LastMatch:
     """The newest reading of one key."""
 
     at: datetime
+    arrived_s: float | None = None
+    """When it was published, s, monotonic; None if a query returned it."""
     since: datetime | None = None
     """Time of the first reading since which the condition has held without a gap."""
 
@@ -36,18 +42,25 @@ class ConditionWait:
         """The newest reading for which the condition is decidable."""
         self._undecided: Reading | None = None
 
-    def ends(self, reading: Reading, now: datetime) -> bool:
-        """Return True if this reading ends the wait. Stale readings and readings out of order do not."""
+    def ends(self, reading: Reading, now: datetime, arrived_s: float | None = None) -> bool:
+        """Return True if this reading ends the wait. Stale readings and readings out of order do not.
+
+        arrived_s: when it was published, s, monotonic; None if a query returned it. After a step of the wall clock or a
+        sleep of the computer, the time for which the condition must hold begins again.
+        """
         before = self._seen.get(reading.key)
+        if before is not None and _is_other_clock(reading, before, arrived_s):
+            before = None
         if before is not None and reading.time < before.at:
             return False
         holds = self._condition.holds(reading)
         if holds is None:
             self._undecided = reading if self._condition.read(reading) else self._undecided
-        elif self.last is None or self.last.time <= reading.time:
+        elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
-        seen = self._seen[reading.key] = _LastMatch(reading.time)
-        if not holds or reading.stale(now):
+        seen = self._seen[reading.key] = _LastMatch(reading.time, arrived_s)
+        # What was published just now is not old, even if the clock of its sender is ahead.
+        if not holds or (reading.stale(now) and (arrived_s is None or reading.time < now)):
             return False
         unbroken = before is not None and before.since is not None and not _gap(reading, before.at)
         seen.since = before.since if before is not None and unbroken else reading.time
@@ -64,6 +77,16 @@ class ConditionWait:
         values = ", ".join(self._condition.read(last))
         age = f"{last.age_s(now):.1f} s ago{' (stale)' if last.stale(now) else ''}"
         return NotInTime(f"{words}: {last.key} had {values}, {age}", last)
+
+
+def _is_other_clock(reading: Reading, before: _LastMatch, arrived_s: float | None) -> bool:
+    """Return True if the clock of the stamps was set between two readings."""
+    stamps_s = (reading.time - before.at).total_seconds()
+    if arrived_s is None:
+        return False
+    if before.arrived_s is None:
+        return stamps_s < -CLOCK_STEP_S
+    return abs(stamps_s - (arrived_s - before.arrived_s)) > CLOCK_STEP_S
 
 
 def _gap(reading: Reading, before: datetime) -> bool:

@@ -55,6 +55,10 @@ def clock_pair() -> ClockPair | None:
     if names is None or not all(hasattr(time, name) for name in names):
         return None
     with_sleep, awake = (partial(time.clock_gettime, getattr(time, name)) for name in names)
+    try:
+        with_sleep(), awake()
+    except OSError:  # an old kernel, or a sandbox without this clock
+        return None
     return with_sleep, awake
 
 

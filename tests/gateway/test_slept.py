@@ -13,6 +13,7 @@ from gateway.link import parse_url
 from gateway.protocol.platforms import parse_platform
 from schemas import bus
 from schemas.process.suspend import SleepWatch
+from tests.support.judge import Judge
 from tests.support.ports import free_endpoint
 from tests.support.processes import MODE00, FleetProcesses, TcpCar, wait_for
 
@@ -81,3 +82,35 @@ async def test_a_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path)
         computer.slept_s += 60.0
         await asyncio.to_thread(wait_for, lambda: "slept" in codes, "it says that it slept")
         assert codes.count("slept") == 1
+
+
+async def test_the_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -> None:
+    """The car does not sleep: it drives on meanwhile."""
+    laptop = SleepingLaptop()
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    judge = Judge.follow(fleet.bus)
+    _, (link,) = await asyncio.to_thread(fleet.simulate, "red:arduino:tcp", truth=True)
+    with bus.Bus.open(fleet.endpoint) as opened:
+        settings = Settings(
+            "red", parse_url(link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
+            retry=True,
+        )  # fmt: skip
+        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"), laptop.watch)
+        serving = asyncio.ensure_future(gateway.run())
+        try:
+            await asyncio.to_thread(fleet.ready)
+            await asyncio.to_thread(fleet.ask, "drive", motion="forward", duration_s=10)
+            await asyncio.to_thread(wait_for, lambda: judge.driving, "it drives")
+            laptop.slept_s += 3600.0
+            woke_at = time.monotonic()
+            await asyncio.to_thread(wait_for, lambda: not judge.driving, "it stands")
+            assert time.monotonic() < woke_at + 5.0, "long before the end of its drive"
+            safety = await asyncio.to_thread(wait_for, lambda: fleet.state("safety"), "its state")
+            assert not safety.HasField("lease")
+            gateway.stop()
+            await serving
+            assert not judge.driving
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            fleet.close()

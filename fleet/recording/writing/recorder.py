@@ -19,6 +19,7 @@ from typing import Any, Final
 import zenoh
 
 from fleet.recording.writing.backfill import Backfill
+from fleet.recording.writing.receive_clock import ReceiveClock
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
 from schemas.bus import Bus, messages_of, reply_value
@@ -110,7 +111,7 @@ class Recorder:
         self._options = options or Options()
         self._max_messages = max_messages
         self._max_bytes = max_bytes
-        self._now = wall_ns
+        self._now = ReceiveClock(wall_ns).ns
         self._notify = notify
         self._reported: set[str] = set()
         self._lock = threading.Lock()

@@ -260,3 +260,25 @@ def test_topics_that_are_recorded_match_the_subscriptions() -> None:
         )
         matching = [e for e in keys.recorded_keys("fleet") if zenoh.KeyExpr(e).includes(zenoh.KeyExpr(key))]
         assert len(matching) == int(topic.recorded), key
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_wall_clock_that_is_set_leaves_the_order_of_the_messages(endpoint: str, tmp_path: Path, step_s: int) -> None:
+    key, step_ns = "fleet/red/sensor/range", [0]
+    with Bus.open(endpoint) as own, Bus.open(endpoint) as cars:
+        recorder = Recorder(own, "fleet", tmp_path, wall_ns=lambda: time.time_ns() + step_ns[0])
+        session = recorder.start()
+        ranges = cars.publisher(key, TOPICS["sensor/range"], "red")
+        for number in range(40):
+            if number == 20:
+                heard(cars._session)
+                step_ns[0] = step_s * 1_000_000_000
+            ranges.put(pb.Range(range_m=1.0), time.time_ns())
+            time.sleep(0.01)  # the messages come in several batches
+        heard(cars._session)
+        recorder.close()
+    mine = [message for _, channel, message in stock(session / "0001.mcap") if channel.topic == key]
+    assert [message.sequence for message in mine] == list(range(1, 41)), "stock readers sort by log_time"
+    description = json.loads((session / "session.json").read_text())
+    assert description["closed"]
+    assert description["ended"] >= description["started"]
