@@ -32,7 +32,6 @@ from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
-from gateway.link.baud import is_text
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platform_name import AUTO
@@ -352,16 +351,14 @@ class CarGateway:
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
             self._publisher.profile = self._control.model.profile
-            if isinstance(event, Rejected) and is_text(event.raw):
-                self._health.on_rejected("text")
+            if isinstance(event, TextLine):
+                self._health.on_rejected("text")  # it shows a program, but not that of a car
                 continue
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.on_rejected(event.cause)
                 self._damaged += 1
                 continue
-            if isinstance(event, TextLine):
-                continue  # it shows a program, but not that of a car
             self._baud.on_frame()
             if not isinstance(event, Echo):
                 self._health.on_reading(event.at)

@@ -32,11 +32,6 @@ class BaudDoubt:
     words: str
 
 
-def is_text(raw: bytes) -> bool:
-    """Return True for whole lines of text without a mark of a frame, as some programs print them between frames."""
-    return _TEXT.issuperset(raw) and b"$" not in raw and b"#" not in raw
-
-
 class BaudWatch:
     """Watches the bytes of one connection until the first frame."""
 

@@ -59,7 +59,7 @@ class GatewayProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                env=os.environ | environment,
+                env={name: value for name, value in os.environ.items() if name != "COLUMNS"} | environment,  # of xdist
                 text=True,
             )
         self.pid = self.popen.pid

@@ -99,7 +99,7 @@ def test_a_line_of_text_between_frames_is_no_damage(tmp_path: Path) -> None:
         lines = REPORT + b"EXEC:F\r\n" + REPORT + b"speed 120\r\nok\r\n"
         peer.send(lines + REPORT + REPORT[1:] + lines + REPORT + bytes.fromhex("0180FF") + REPORT)
         wait_for(lambda: (link := started.state("link")) and link.rx_frames == 9, "all have come")
-        assert dict(started.state("link").rejects) == {"text": 4, "no_start": 2}, "a frame without its $ is damage"
+        assert dict(started.state("link").rejects) == {"text": 6, "no_start": 2}, "a frame without its $ is damage"
     finally:
         started.close()
         peer.close()

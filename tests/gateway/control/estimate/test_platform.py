@@ -124,5 +124,6 @@ def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platfo
                     auto.on_event(event)
         silent = platform != "raspberry_pi" and mode in parse_platform(platform).silent_modes
         running = mode is not Mode.MANUAL and platform != "raspberry_pi"
-        kind = "unknown" if silent else "raspberry_pi" if platform == "raspberry_pi" else "arduino"
-        assert auto.profile.name == kind + ("" if running else "+arm")
+        # Bytes of an stm32 are those of an arduino, except over a dark floor: its converter has 12 bits.
+        kinds = {"unknown"} if silent else {platform, "arduino"} if platform == "stm32" else {platform}
+        assert auto.profile.name in {kind + ("" if running else "+arm") for kind in kinds}

@@ -24,7 +24,7 @@ def paired(platform: str) -> Pair:
     ("platform", "settled", "first"),
     [
         ("arduino", "arduino", b"$4WD,MODE00#"),
-        ("stm32", "arduino", b"$4WD,MODE00#"),
+        ("stm32", "stm32", b"$0,0,0,0,0,0,0,0,0#"),
         ("raspberry_pi", "raspberry_pi", b"$0,0,0,0,0,0,0,0,0#"),
     ],
 )
