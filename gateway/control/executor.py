@@ -157,8 +157,11 @@ class Executor:
         running = self.stops.running
         if running is None or running.sequence.rank == SOFT.rank:
             return True
-        # A stop that precedes a mode is there for that mode, and for what was queued before it.
-        before = running.before is not None and pending.received_at <= running.before.received_at
+        # A stop that precedes a mode is there for that mode, and for what was queued before it. So is a mode that goes
+        # before the repeats: the commands that it waits for go with it.
+        change = self.queue.mode_change
+        newer = change if change is not None and change.received_at >= running.began_at else None
+        before = any(mode is not None and pending.received_at <= mode.received_at for mode in (running.before, newer))
         return pending.received_at >= running.began_at or before
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
