@@ -8,23 +8,13 @@ from collections.abc import Generator
 from math import inf
 from typing import Final
 
-from gateway.sim.model.firmware import (
-    COLOR_S,
-    WHISTLE_S,
-    CarBodyState,
-    Program,
-    Rng,
-    Wait,
-    motion,
-)
+from gateway.sim.model.firmware import COLOR_S, WHISTLE_S, Program, Wait, motion
 from gateway.sim.model.mode_car import ARDUINO_LIGHTS, ModeCar, to_int
-from gateway.sim.model.traits import CarTraits
 
 TX_BUFFER: Final = 64
 # A wedged car never clears its string, which grows until the RAM is full.
 STRING_LIMIT: Final = 512
 """Maximum length of the string. Further bytes are dropped."""
-ARDUINO_BOOT_S: Final = 0.5
 START_SPEED: Final = 150
 OPEN_S: Final = 2.0
 BEEP_S: Final = 0.1
@@ -33,46 +23,21 @@ BEEP_S: Final = 0.1
 class ArduinoCar(ModeCar):
     """A car with the vendor's Arduino program. Options: `arm`, `imu`."""
 
-    def __init__(
-        self,
-        body: CarBodyState,
-        rng: Rng,
-        *,
-        options: frozenset[str] = frozenset(),
-        traits: CarTraits | None = None,
-        now: float = 0.0,
-    ) -> None:
-        super().__init__(body, rng, options=options, traits=traits, now=now)
-        # The program counts turns of its loop, so this time stands still while the program blocks.
-        self.report_interval_s = self._traits.loop_s
-        """Loop time from one report to the next, without the ranging. About a second: cars differ."""
-        self._reset_variables()
-
     def _reset_variables(self) -> None:
-        """Set the program's variables to their values after a start."""
+        super()._reset_variables()
         self._string = ""
         self._arriving = ""
         """The frame that arrives, if a `$` restarts the string."""
-        self._started = False
-        self._complete = False
-        self._pressed = None
         self._speed = START_SPEED
-        self._color_position = 0
-        # Loop time until each frame of mode 0. The frames of the options come between the reports, so that none blocks.
+        # The program counts turns of its loop, so these times stand still while it blocks. The frames of the options
+        # come between the reports, so that none blocks.
         self._due: dict[str, float] = {}
+        """Loop time until each frame of mode 0."""
         if not self._traits.timer:
-            self._due["report"] = self._next_interval_s(self.report_interval_s)
+            self._due["report"] = self._next_interval_s(self._traits.loop_s)
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
-
-    def _reboot(self) -> Program:
-        # A reboot loses the mode, the motion, the speed (150 again), the light, the fan and both buffers.
-        # The servo and the arm keep their positions.
-        self._reset_variables()
-        yield Wait(self._now + ARDUINO_BOOT_S)
-        self._buffer.clear()  # the UART is off while it boots
-        yield from self._main()
 
     def _main(self) -> Program:
         if self._traits.timer:
@@ -207,7 +172,7 @@ class ArduinoCar(ModeCar):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = self._next_interval_s(self.report_interval_s)
+            self._due[what] = self._next_interval_s(self._traits.loop_s)
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:

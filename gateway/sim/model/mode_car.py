@@ -6,7 +6,7 @@
 import re
 from collections.abc import Generator
 from math import inf
-from typing import Final
+from typing import ClassVar, Final
 
 from gateway.sim.model.firmware import (
     COLOR_S,
@@ -23,6 +23,7 @@ from gateway.sim.model.firmware import (
 from gateway.sim.model.ir_remote import SIGNS, Button
 from gateway.sim.model.traits import CarTraits
 
+BOOT_S: Final = 0.5
 AVOIDANCE_RANGINGS: Final = 5
 SHARP_S: Final = 0.08
 FAR_CM: Final = 500.0
@@ -44,6 +45,11 @@ _JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d
 class ModeCar(Firmware):
     """A car with modes. A subclass has its main loop, obeys the frames and prints."""
 
+    TRAITS: ClassVar[CarTraits] = CarTraits()
+    """The traits of a car that is given none."""
+    BUFFER: ClassVar[int] = 64
+    """Size of the receive buffer, bytes."""
+
     def __init__(
         self,
         body: CarBodyState,
@@ -53,9 +59,24 @@ class ModeCar(Firmware):
         traits: CarTraits | None = None,
         now: float = 0.0,
     ) -> None:
-        super().__init__(body, rng, options=options, traits=traits, now=now)
+        super().__init__(body, rng, options=options, traits=traits or self.TRAITS, buffer=self.BUFFER, now=now)
         self._joints = [90] * 6
+        self._reset_variables()
+
+    def _reset_variables(self) -> None:
+        """Set the program's variables to their values after a start."""
+        self._started = False
+        self._complete = False
+        self._pressed = None
         self._color_position = 0
+
+    def _reboot(self) -> Program:
+        # A reboot loses the mode, the motion, the speed (that of a start again), the light, the fan and both buffers.
+        # The servo and the arm keep their positions.
+        self._reset_variables()
+        yield Wait(self._now + BOOT_S)
+        self._buffer.clear()  # the UART is off while it boots
+        yield from self._main()
 
     def _set_joints(self, text: str) -> bool:
         """Obey the frame of an arm; return True if the text is one and the car has an arm."""

@@ -5,10 +5,10 @@ measured: the slowest speed, the time of a turn of a silent mode, and the speeds
 Arduino program here.
 """
 
-from typing import Final
+from typing import ClassVar, Final
 
 from gateway.protocol.enums import Mode
-from gateway.sim.model.firmware import CarBodyState, Program, Rng, Wait, motion
+from gateway.sim.model.firmware import Program, Wait, motion
 from gateway.sim.model.mode_car import ModeCar, to_int
 from gateway.sim.model.traits import CarTraits
 
@@ -23,7 +23,6 @@ STM32_TRAITS: Final = CarTraits(
 """The traits of this program. `timer`, `close_s` and `last_frame_wins` are the program itself: it ignores others."""
 FRAME_BUFFER: Final = 80
 """Size of the buffer that the interrupt fills. Further bytes are dropped until the next `$`."""
-STM32_BOOT_S: Final = 0.5
 STM32_START_SPEED: Final = 200
 STM32_SPEED_STEP: Final = 100
 STM32_TOP_SPEED: Final = 1000
@@ -40,34 +39,16 @@ class _TurnEnded(Exception):
 class Stm32Car(ModeCar):
     """A car with the vendor's STM32 program. Options: `arm`, `imu`."""
 
-    def __init__(
-        self,
-        body: CarBodyState,
-        rng: Rng,
-        *,
-        options: frozenset[str] = frozenset(),
-        traits: CarTraits | None = None,
-        now: float = 0.0,
-    ) -> None:
-        super().__init__(body, rng, options=options, traits=traits or STM32_TRAITS, now=now)
-        self._limit = 4096  # the interrupt takes each byte at once: none is lost
-        self._reset_variables()
+    TRAITS: ClassVar[CarTraits] = STM32_TRAITS
+    BUFFER: ClassVar[int] = 4096
+    """The interrupt takes each byte at once: none is lost."""
 
     def _reset_variables(self) -> None:
+        super()._reset_variables()
         self._memory = ["\0"] * FRAME_BUFFER
         self._index = 0
-        self._started = False
-        self._complete = False
-        self._pressed = None
         self._speed = STM32_START_SPEED
-        self._color_position = 0
         self._is_report_due = False
-
-    def _reboot(self) -> Program:
-        self._reset_variables()
-        yield Wait(self._now + STM32_BOOT_S)
-        self._buffer.clear()
-        yield from self._main()
 
     def _main(self) -> Program:
         self._alarm_at = self._now + self._next_interval_s(self._traits.interval_s)
