@@ -20,7 +20,7 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen, encode
+from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platforms import StopStyle
 
 LATE_DRIVE_S: Final = 0.1
@@ -115,9 +115,9 @@ class Executor:
         if held is not None and not held.pending.sent and self._is_new(held.pending):
             self.stops.give_way(now)
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
-        change, running = queue.mode_change, self.stops.running
+        change = queue.mode_change
         # A command that was queued before the mode goes first: in the mode the car would ignore it.
-        stands = model.at_rest or (running is not None and running.sequence.rank > SOFT.rank)
+        stands = model.at_rest or self._full_stop_runs
         if change is not None and not (queue.one_shots and stands) and self._is_new(change):
             return self._open_mode(change, now)
         if queue.one_shots and now >= model.pacing.act_at(queue.one_shots[0].frames[0]):
@@ -134,15 +134,20 @@ class Executor:
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, but stop the car first: opening a mode while driving leaves the motors on."""
         assert isinstance(pending.command.what, SetMode)
-        model, running = self.model, self.stops.running
+        model = self.model
         # The full stop before the mode has gone out if it runs and gives way; its evidence would delay the mode.
-        has_stopped = running is not None and running.sequence.rank > SOFT.rank
-        if not (model.rest_is_sure or has_stopped):
+        if not (model.rest_is_sure or self._full_stop_runs):
             return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now, pending)
         if now < model.pacing.open_at(now, can_show=model.can_show):
             return None
         self.stops.give_way(now)
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+
+    @property
+    def _full_stop_runs(self) -> bool:
+        """Return True if a stop runs that is more than the end of a drive."""
+        running = self.stops.running
+        return running is not None and running.sequence.rank > SOFT.rank
 
     @property
     def _has_new_command(self) -> bool:
@@ -155,7 +160,7 @@ class Executor:
     def _is_new(self, pending: Pending) -> bool:
         """Return True if a command began after the running stop, or waits for that stop: only then it may go first."""
         running = self.stops.running
-        if running is None or running.sequence.rank == SOFT.rank:
+        if running is None or not self._full_stop_runs:
             return True
         # A stop that precedes a mode is there for that mode, and for what was queued before it. So is a mode that goes
         # before the repeats: the commands that it waits for go with it.
@@ -189,9 +194,7 @@ class Executor:
         self._source = source
         if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
             frame = self.model.believed.with_fan(frame)
-        return OutgoingFrame(
-            frame, encode(frame, self.model.profile.dialect), why, by.command.id if by is not None else ""
-        )
+        return OutgoingFrame(frame, self.model.profile.encode(frame), why, by.command.id if by is not None else "")
 
     # ------------------------------------------------------------------ frames written
 
@@ -361,7 +364,7 @@ class Executor:
         if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
             times.append(max(model.ready_at, free_at))
         if queue.mode_change is not None and self._is_new(queue.mode_change):
-            opens = model.rest_is_sure or (running is not None and running.sequence.rank > SOFT.rank)
+            opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
         if model.believed.repeat and stopped:

@@ -78,7 +78,7 @@ class Pacing:
 
     @property
     def _interval_s(self) -> float:
-        return self.learned.echo.median_s or self.profile.interval_s
+        return self.learned.interval_s(self.profile.interval_s)
 
     @property
     def awake_until(self) -> float:

@@ -8,14 +8,19 @@ from typing import Any, Final
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder
-from fleet.recording.tools.stop_findings import NOT_SHOWN_CODE, NOT_STOPPED_CODE, WATCHED_TOPICS, StopFindings, log_code
+from fleet.recording.tools.stop_findings import (
+    NOT_SHOWN_CODE,
+    NOT_STOPPED_CODE,
+    STOP_VERBS,
+    WATCHED_TOPICS,
+    StopFindings,
+    log_code,
+)
 from fleet.recording.tools.verify import SessionVerdict
 from schemas import keys
-from schemas.commands import STOPS
 from schemas.local_time import clock
 
 _REFUSED_PHASES: Final = ("rejected", "failed")
-_STOP_VERBS: Final = (*STOPS, "pause")
 
 
 @dataclass(slots=True)
@@ -55,7 +60,7 @@ class SessionCheckup:
         if topic == "event/log":
             self.broken[car] += log_code(message) == "link_lost"
         elif topic == "event/command":
-            is_stop = message.verb in _STOP_VERBS
+            is_stop = message.verb in STOP_VERBS
             if is_stop and (message.basis or message.phase == "failed"):
                 self.stops[message.basis or "failed"] += 1
             if message.phase in _REFUSED_PHASES and not is_stop:

@@ -19,7 +19,8 @@ NOT_SHOWN_CODE: Final = "not_shown"
 WATCHED_TOPICS: Final = ("event/command", "event/log", "state/link", "state/health")
 _SAME_STOP_NS: Final = 3_000_000_000
 """Maximum time between the records of one stop."""
-_STOP_VERBS: Final = frozenset({*STOPS, "pause"})
+STOP_VERBS: Final = frozenset({*STOPS, "pause"})
+"""Verbs of commands that stop a car."""
 _FAILED: Final = frozenset({"failed", "rejected", "expired"})
 _OPEN: Final = frozenset({"online", "quiet"})
 
@@ -74,7 +75,7 @@ class StopFindings:
             code = log_code(message)
             if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
                 self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
-        elif message.verb in _STOP_VERBS and message.phase in _FAILED:
+        elif message.verb in STOP_VERBS and message.phase in _FAILED:
             code = NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
             asked = f"{message.verb} by {message.sender or 'somebody'}"
             self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)

@@ -178,9 +178,17 @@ class Learned:
         self._delays.clear()
         self._blocks.clear()
 
+    def interval_s(self, expected_s: float) -> float:
+        """Return the interval of the reports with an echo: as seen, or else as expected."""
+        return self.echo.median_s if self.echo.is_known else expected_s
+
     def block_s(self, kind: Blocking, expected_s: float) -> float:
         """Return by how much a frame of this kind delays the next report: as seen, or else as expected."""
         return self._blocks.get(kind, expected_s)
+
+    def close_s(self, expected_s: float) -> float:
+        """Return by how much `MODE00` delays the next report: as seen, or else as expected."""
+        return self.block_s(Blocking.MODE_CLOSE, expected_s)
 
     @property
     def blocks(self) -> Mapping[Blocking, float]:

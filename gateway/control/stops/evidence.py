@@ -296,7 +296,7 @@ class StopEvidence:
     @property
     def close_s(self) -> float:
         """Return by how much `MODE00` delays this car's next report, s."""
-        return self.learned.block_s(Blocking.MODE_CLOSE, self.profile.close_s)
+        return self.learned.close_s(self.profile.close_s)
 
     @property
     def _rhythm(self) -> Rhythm:
@@ -304,12 +304,12 @@ class StopEvidence:
 
     @property
     def _interval_s(self) -> float:
-        return self._rhythm.median_s or self.profile.interval_s
+        return self.learned.interval_s(self.profile.interval_s)
 
     @property
     def settled_s(self) -> float:
         """Return the minimum silence before a mode-0 report that counts."""
-        return min(SETTLED_S, SETTLED_SHARE * (self._rhythm.median_s or FASTEST_S))
+        return min(SETTLED_S, SETTLED_SHARE * self.learned.interval_s(FASTEST_S))
 
     @property
     def _left_s(self) -> float:
@@ -419,7 +419,7 @@ class StopEvidence:
         if quiet_s < self.settled_s:
             self._learn_faster(event, quiet_s)
             self._before = self._before_no_echo = None
-            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * (self._rhythm.median_s or FASTEST_S)):
+            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * self.learned.interval_s(FASTEST_S)):
                 self._drop_pauses()
             return Finding.NOTHING
         self._fast_before = bool(event.range_cm)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import Pending
-from gateway.control.estimate.learned import Blocking, Learned
+from gateway.control.estimate.learned import Learned
 from gateway.control.events import FrameOrigin
 from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import sequences
@@ -53,8 +53,7 @@ def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
 
 def evidence_s(profile: Profile, learned: Learned) -> float:
     """Return the timeout for the evidence of a stop in addition to its worst case, s."""
-    close_s = learned.block_s(Blocking.MODE_CLOSE, profile.close_s)
-    return max(EVIDENCE_TIMEOUT_S, EVIDENCE_INTERVALS * (learned.echo.median_s + close_s))
+    return max(EVIDENCE_TIMEOUT_S, EVIDENCE_INTERVALS * (learned.echo.median_s + learned.close_s(profile.close_s)))
 
 
 def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
@@ -63,9 +62,8 @@ def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> 
     `slowest`: its rhythm is not known, and it may be as slow as any.
     """
     # Without an echo the car ranges before it reads the frame, is blocked by it, and ranges again before it reports.
-    interval_s = learned.echo.median_s or (SLOWEST_S if slowest else profile.interval_s)
-    close_s = learned.block_s(Blocking.MODE_CLOSE, profile.close_s)
-    return 2 * profile.ranging_s + close_s + interval_s + REPORT_MARGIN_S
+    interval_s = learned.interval_s(SLOWEST_S if slowest else profile.interval_s)
+    return 2 * profile.ranging_s + learned.close_s(profile.close_s) + interval_s + REPORT_MARGIN_S
 
 
 @dataclass(frozen=True, slots=True)
