@@ -11,6 +11,7 @@ from gateway.control.stops import evidence
 from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol import decoder
+from gateway.protocol.platforms import Profile
 
 Patch = Callable[[object, str, Any], None]
 """`pytest.MonkeyPatch.setattr`."""
@@ -34,7 +35,7 @@ def _one_pause(patch: Patch) -> None:
 
 
 def _pauses_of_any_length(patch: Patch) -> None:
-    patch(evidence, "MATCH_S", 9.0)
+    patch(evidence, "PAUSES_IN_DOUBT", evidence.PAUSES)
 
 
 def _damaged_frames_count(patch: Patch) -> None:
@@ -47,7 +48,7 @@ def _frames_continue_after_a_silence(patch: Patch) -> None:
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
-    patch(evidence, "LEFT_S", 20.0)
+    patch(StopEvidence, "_left_s", 20.0)
 
 
 def _any_frame_before_it(patch: Patch) -> None:
@@ -70,8 +71,7 @@ def _silent_mode_after_any_rest(patch: Patch) -> None:
 
 
 def _silent_mode_without_its_silence(patch: Patch) -> None:
-    patch(evidence, "OPENING_SILENCE_S", 0.0)
-    patch(evidence, "OPENED_S", -1.0)
+    patch(Profile, "shortest_opening_s", float("-inf"))
 
 
 def _no_renewal(patch: Patch) -> None:
