@@ -153,7 +153,8 @@ class Progress:
         wait_s = {
             Until.SENT: COMMAND_QUEUE_TIMEOUT_S,
             Until.STOPPED: self._worst_case_s + STOP_EVIDENCE_S,
-            Until.OVER: self._duration_s,
+            # The duration counts from the frame, which may have to wait for a stop.
+            Until.OVER: self._duration_s + (0.0 if self._sent_event else COMMAND_QUEUE_TIMEOUT_S),
         }[self._until]
         return self._timeout_from + wait_s + OUTCOME_MARGIN_S
 
@@ -174,6 +175,8 @@ class Progress:
 
     def on_event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float, basis: str = "") -> None:
         """Handle one `event/command`. Only the last event of a stop or a drive has a basis."""
+        if phase == SENT and self._queued and not self._sent_event and self._until is Until.OVER:
+            self._timeout_from = at
         self._sent_event = self._sent_event or phase == SENT
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
         self._basis = basis

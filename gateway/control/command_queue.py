@@ -25,6 +25,9 @@ class HeldMotion:
     motion: Motion
     pending: Pending
     expires_at: float
+    """When it ends. While it waits for the car: when it is given up, unless a stream renews it."""
+    duration_s: float = 0.0
+    """How long it lasts from its frame on; 0 of a stream, whose samples are valid for a time from their arrival."""
     began_at: float | None = None
     """When its frame was written; None if it waits."""
     range_cm: float | None = None
@@ -34,6 +37,17 @@ class HeldMotion:
     def sender(self) -> Sender:
         """Return the sender of the drive."""
         return self.pending.command.sender
+
+    @property
+    def ends_at(self) -> float:
+        """Return the latest time that it ends, also if it still waits for the car."""
+        return self.expires_at + (self.duration_s if self.began_at is None else 0.0)
+
+    def begin(self, now: float, range_cm: float | None) -> None:
+        """Count the duration from now: the frame is written."""
+        self.began_at, self.range_cm = now, range_cm
+        if self.duration_s:
+            self.expires_at = now + self.duration_s
 
 
 @dataclass(slots=True)

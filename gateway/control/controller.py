@@ -7,15 +7,14 @@ than one frame in flight.
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import assert_never
+from typing import Final, assert_never
 
 from gateway.control import arbiter
 from gateway.control.car_model import CarModel
 from gateway.control.car_monitor import CarMonitor
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.command_queue import HeldMotion
+from gateway.control.command_queue import MAX_QUEUE_TIME_S, HeldMotion
 from gateway.control.commands import (
-    Action,
     Answer,
     Command,
     Drive,
@@ -38,7 +37,7 @@ from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
-from gateway.control.executor import Executor
+from gateway.control.executor import LATE_DRIVE_S, Executor
 from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
@@ -47,6 +46,9 @@ from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
+
+START_MARGIN_S: Final = 1.0
+"""How much longer than announced, and than its own duration, a drive waits for the car before it expires."""
 
 
 class Controller:
@@ -103,7 +105,7 @@ class Controller:
 
     def expires_in_s(self, now: float) -> float | None:
         """Return the remaining time of the held motion; None if none is held."""
-        return max(0.0, self._queue.held.expires_at - now) if self._queue.held else None
+        return max(0.0, self._queue.held.ends_at - now) if self._queue.held else None
 
     @property
     def asked(self) -> Mode | None:
@@ -218,7 +220,7 @@ class Controller:
         if halted:
             words = f"{self.car} was just stopped. Send no drive command for {STREAM_PAUSE_S:g} s, then drive again."
             return self._reject(pending, Reason.HELD, words, now)
-        busy = self._too_busy(what, now)
+        busy = self._too_busy(command, now)
         if busy:  # before the lease and the hold: a refused command changes neither
             return self._reject(pending, Reason.EXPIRED, busy, now)
         if isinstance(what, Pause):
@@ -466,8 +468,8 @@ class Controller:
         """Grant the lease for the duration of the command. Log if it was taken from another sender."""
         sender, before = command.sender, self.safety.lease_at(now)
         match command.what:
-            case Drive(duration_s=lasts_s):
-                pass
+            case Drive(duration_s=duration_s):
+                lasts_s = max(self.stops.free_at(now) - now, 0.0) + duration_s
             case SetMode(mode):  # until the mode is open
                 opening_s = 0.0 if mode is Mode.MANUAL else self.model.profile.block_s(ModeOpen(mode))
                 lasts_s = max(self.stops.free_at(now) - now, 0.0) + opening_s
@@ -495,25 +497,28 @@ class Controller:
             self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
-    def _too_busy(self, what: Action, now: float) -> str:
-        """Return why a drive would expire before its frame could go out; empty if it would not."""
-        free_at = self.stops.free_at(now)
-        if not isinstance(what, Drive) or what.motion is Motion.STOP or now + what.duration_s > free_at:
+    def _too_busy(self, command: Command, now: float) -> str:
+        """Return why a sample of a stream would expire before its frame could go out; empty if it would not.
+
+        Any other drive waits, and counts its duration from its frame on.
+        """
+        free_at, what = self.stops.free_at(now), command.what
+        if not command.streamed or not isinstance(what, Drive) or what.motion is Motion.STOP:
+            return ""
+        if now + what.duration_s > free_at:
             return ""
         busy_s = free_at - now
-        return (
-            f"{self.car} is busy for another {busy_s:.1f} s, longer than the requested drive ({what.duration_s:g} s). "
-            "Try again later."
-        )
+        return f"{self.car} is busy for another {busy_s:.1f} s. The next samples of this stream drive it then."
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
-            return self._prolong_drive(held, pending, now + drive.duration_s, now)
+            return self._prolong_drive(held, pending, drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._queue.held = HeldMotion(drive.motion, pending, now + drive.duration_s)
+        self._queue.held = HeldMotion(drive.motion, pending, *self._times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
+            self._queue.held.begin(now, self.model.range_cm)
             self._log.record_sent(pending, now, "the running drive was extended")
             return Answer(Phase.SENT, words="the running drive was extended")
         running = self.stops.running
@@ -522,11 +527,28 @@ class Controller:
             self.stops.running = None
             for other in running.commands:
                 self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
-        return self._queued(pending, now)
+        return self._queued(pending, now, self._wait(pending, now))
 
-    def _prolong_drive(self, held: HeldMotion, pending: Pending, expires_at: float, now: float) -> Answer:
+    def _times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
+        """Return when a drive expires that waits for its frame, and the duration that counts from that frame."""
+        if pending.command.streamed:
+            return now + duration_s, 0.0
+        wait_s = max(self.stops.free_at(now) - now, duration_s) + START_MARGIN_S
+        return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
+
+    def _wait(self, pending: Pending, now: float) -> str:
+        """Return how long a drive waits for its frame, in words; empty if it does not."""
+        busy_s = self.stops.free_at(now) - now
+        if pending.command.streamed or busy_s < LATE_DRIVE_S:
+            return ""
+        what = "a stop" if self.stops.running is not None else "a command"
+        return f"begins in {busy_s:.1f} s at most: {self.car} is busy with {what}"
+
+    def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
         """Extend a held motion without another frame: its sender has sent the same drive again."""
-        held.expires_at = expires_at
+        held.expires_at, held.duration_s = self._times(pending, duration_s, now)
+        if held.pending.sent:
+            held.expires_at = now + duration_s
         held.pending.count += 1
         if pending.command.streamed:
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
@@ -541,7 +563,7 @@ class Controller:
         )
         pending.count = held.pending.count
         held.pending = pending
-        return self._queued(pending, now)
+        return self._queued(pending, now, self._wait(pending, now))
 
     def _release(self, pending: Pending, now: float) -> Answer:
         sender = pending.command.sender.name
@@ -581,8 +603,8 @@ class Controller:
             self._log.record_sent(pending, now, words, reason)
         return Answer(Phase.SENT, reason, words)
 
-    def _queued(self, pending: Pending, now: float) -> Answer:
-        words = "" if self.model.is_heard else self._silent(now)
+    def _queued(self, pending: Pending, now: float, wait: str = "") -> Answer:
+        words = wait if self.model.is_heard else "; ".join(filter(None, (wait, self._silent(now))))
         self._log.record(pending, Phase.QUEUED, now, words=words)
         return Answer(Phase.QUEUED, words=words)
 

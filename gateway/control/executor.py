@@ -24,7 +24,7 @@ from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platforms import StopStyle
 
 LATE_DRIVE_S: Final = 0.1
-"""Report a drive as shortened if its frame goes out later than this; its duration counts from the request."""
+"""Report that a drive has waited if its frame goes out later than this."""
 
 
 class Executor:
@@ -214,7 +214,7 @@ class Executor:
             case StopInProgress():
                 self._step_written(source, now)
             case HeldMotion():
-                source.began_at, source.range_cm = now, model.range_cm
+                source.begin(now, model.range_cm)
                 self._log.record_sent(source.pending, now)
             case Pending() if source is self.queue.mode_change:
                 self.queue.mode_change = None
@@ -332,11 +332,12 @@ class Executor:
             elif held.pending.sent:
                 words = ""
                 if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:
-                    drove_s, asked_s = now - held.began_at, held.expires_at - held.pending.received_at
-                    words = f"only {drove_s:.2f} s of {asked_s:.2g} s: {car} was still busy with the previous command"
+                    waited_s = held.began_at - held.pending.received_at
+                    words = f"began after {waited_s:.1f} s: {car} was busy"
                 self.release(Phase.COMPLETE, None, words, now)
             else:
-                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for the whole duration of the drive", now)
+                waited_s = now - held.pending.received_at
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for {waited_s:.1f} s", now)
         self.queue.expire(now)
 
     def next_at(self, now: float) -> float:

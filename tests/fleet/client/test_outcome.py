@@ -213,9 +213,11 @@ def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
 
 def test_a_drive_whose_records_come_late_is_not_taken_for_one_that_only_prolonged_another() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
-    assert progress.deadline == 107.0
-    for at, phase in enumerate(("queued", "sent", "complete"), start=104):
+    assert progress.deadline == 117.0, "it may wait for a stop"
+    for at, phase in enumerate(("queued", "sent"), start=104):
         progress.on_event(phase, "", "", 0.0, at)
+    assert progress.deadline == 112.0, "its duration counts from its frame"
+    progress.on_event("complete", "", "", 0.0, 106.0)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (True, "complete")
 

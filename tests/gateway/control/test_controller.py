@@ -139,7 +139,7 @@ def test_the_same_motion_held_on_is_not_written_again(desk: Workbench) -> None:
     assert desk.frames == [RUN, RUN]
     desk.run(3.0)
     assert desk.frames == [RUN, RUN, STOP, STOP]
-    assert desk.end("hers") == (COMPLETE, None)
+    assert desk.end("hers") == (SENT, None)
 
 
 def test_the_newest_motion_wins_and_only_it_is_written(desk: Workbench) -> None:
@@ -219,16 +219,22 @@ def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
     assert (desk.frames, desk.control.model.basis) == ([], Basis.SHOWN)
 
 
-def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Workbench) -> None:
+def test_a_drive_that_had_to_wait_lasts_as_long_as_asked_and_says_that_it_waited(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.MANUAL))
     desk.run(0.1)
     desk.ask(Drive(Motion.BACK, 4.5), identity="it")
     desk.run(8.0)
     (words,) = [record.words for record in desk.records if record.phase is SENT and record.basis]
-    assert re.fullmatch(
-        r"only [234]\.\d\d s of 4\.5 s: red was still busy with the previous command; sent for [34]\.\d s",
-        words,
-    )
+    assert re.fullmatch(r"began after 1\.\d s: red was busy; sent for 4\.5 s", words)
+
+
+def test_a_waiting_drive_that_is_asked_again_lasts_as_asked_last(desk: Workbench) -> None:
+    desk.ask(WHISTLE)
+    for duration_s in (3.0, 1.0):
+        assert desk.ask(Drive(Motion.BACK, duration_s), identity=f"for {duration_s}").status is QUEUED
+    desk.run(3.0)
+    assert desk.frames[1:] == [BACK, STOP, STOP]
+    assert [each.words for each in desk.records if each.basis][-1].endswith("sent for 1.0 s")
 
 
 def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Workbench) -> None:
@@ -242,16 +248,28 @@ def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Workbench) -> None:
     assert desk.frames[3:] == [STOP, STOP]
 
 
-def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Workbench) -> None:
+@pytest.mark.parametrize("duration_s", [0.1, 0.5, 9.0])
+def test_a_drive_within_a_full_stop_waits_for_its_first_frames(desk: Workbench, duration_s: float) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop())
-    short = desk.ask(Drive(Motion.BACK, 0.5))
-    assert (short.status, short.reason) == (Phase.REJECTED, Reason.EXPIRED)
-    assert short.words == "red is busy for another 1.2 s, longer than the requested drive (0.5 s). Try again later."
-    assert desk.ask(Drive(Motion.BACK, 9.0), identity="it").status is QUEUED
+    answer = desk.ask(Drive(Motion.BACK, duration_s), identity="it")
+    assert (answer.status, answer.words) == (QUEUED, "begins in 1.2 s at most: red is busy with a stop")
+    assert desk.control.expires_in_s(desk.now) >= duration_s + 1.0
     desk.until(lambda: SENT in desk.life("it"))
     assert desk.frames == [RUN, MODE00, STOP, BACK], "after the first frames of the stop, not after its evidence"
+    began = desk.now
+    desk.until(lambda: desk.life("it").count(SENT) == 2)
+    assert desk.now - began == pytest.approx(duration_s, abs=0.06)
+
+
+def test_a_sample_of_a_stream_does_not_wait(desk: Workbench) -> None:
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.ask(Stop())
+    desk.run(0.55)
+    short = desk.ask(Drive(Motion.BACK, 0.5), streamed=True)
+    assert (short.status, short.reason) == (Phase.REJECTED, Reason.EXPIRED)
 
 
 def test_a_drive_released_by_hand(desk: Workbench) -> None:
@@ -335,14 +353,13 @@ def test_one_shots_queue_so_many_and_no_more_each_once(desk: Workbench) -> None:
     assert [data[15:16] + data[7:8] for data in desk.frames] == [b"01", b"10"] * 4 + [b"01"]
 
 
-def test_a_drive_that_would_be_over_before_a_recovery_is_is_refused_at_once() -> None:
+def test_a_drive_waits_for_the_recovery_at_the_connect() -> None:
     desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()
-    desk.ask(Drive(Motion.FORWARD, 8.0), identity="it")
-    assert desk.life("it") == [ASKED, Phase.REJECTED]
-    assert desk.end("it") == (Phase.REJECTED, Reason.EXPIRED)
-    assert "red is busy for" in desk.records[-1].words
+    assert desk.ask(Drive(Motion.FORWARD, 0.5), identity="it").words.startswith("begins in ")
+    desk.run(MAX_QUEUE_TIME_S + 0.1, reports=False)
+    assert desk.life("it") == [ASKED, QUEUED, Phase.EXPIRED], "it is not started long after it was asked for"
 
 
 @pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING)], ids=str)
