@@ -22,7 +22,8 @@ _FAILED_PHASES: Final = frozenset({"superseded", "expired", "failed", "rejected"
 
 OUTCOME_MARGIN_S: Final = 5.0
 """Margin of the timeouts for a command's last event."""
-STOP_EVIDENCE_S: Final = 12.0  # gateway.control.stops.stopping: time for a car to show a stop after its worst case
+STOP_EVIDENCE_S: Final = 18.0
+"""Longest time for a car to show a stop after its worst case; gateway.control.stops.stopping ends it before."""
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus: it tries twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0

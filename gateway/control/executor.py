@@ -96,6 +96,8 @@ class Executor:
             return None
         if running is not None:
             stops.fail_late(running, now)
+            if stops.running is not running:
+                return None
             # A new command goes before the repeats of a stop, but never before its first frames. While it waits for the
             # car, no repeat may start: each would block the car again.
             if not (self._has_new_command and self.accepts_commands(now)):

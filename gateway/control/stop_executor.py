@@ -264,6 +264,10 @@ class StopExecutor:
     def fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence. The stop goes on."""
         car = self.model.name
+        is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
+        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
+            self._finish_unknown(running, now)
+            return
         words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. The gateway keeps stopping it."
         waiting: list[Pending] = []
         for pending in running.commands:
@@ -274,10 +278,7 @@ class StopExecutor:
         running.commands[:] = waiting
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
-            is_new = self.model.learned.shows is Shows.UNKNOWN and running.report_at > running.began_at
-            if is_new and self.model.is_heard:
-                self._finish_unknown(running, now)
-            elif self.model.mode.heard_at > running.began_at:
+            if self.model.mode.heard_at > running.began_at:
                 self.model.evidence.reacted_at = None
                 self.model.learned.doubted = self.model.learned.shows is Shows.YES
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
@@ -286,6 +287,11 @@ class StopExecutor:
                 words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it."
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
+
+    def _is_new(self, running: StopInProgress) -> bool:
+        """Return True if the car reports in mode 0 since the stop, and was never seen to react to a frame."""
+        is_unknown = self.model.learned.shows is Shows.UNKNOWN
+        return is_unknown and running.report_at > running.began_at and self.model.is_heard
 
     def _finish_unknown(self, running: StopInProgress, now: float) -> None:
         """End a stop of a car that reports in mode 0, and that was never seen to react to a frame: as sent."""

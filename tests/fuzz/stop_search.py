@@ -763,9 +763,12 @@ class Episode:
 
     @property
     def _ends_s(self) -> float:
-        """Return the maximum time from the request of a stop to its end."""
+        """Return the maximum time from the request of a stop to its end.
+
+        The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block.
+        """
         traits = self.plan.traits
-        return 5.5 + max(12.0, 4 * (traits.interval_s + traits.spread_s + traits.close_s + 0.1))
+        return 5.5 + max(12.0, 4 * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1))
 
     @property
     def _shows(self) -> bool:

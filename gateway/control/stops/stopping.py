@@ -25,8 +25,11 @@ EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
 EVIDENCE_INTERVALS: Final = 4
 """Minimum of that timeout, in intervals with a pause: two pauses, the report before, and the silence after them."""
+MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
+"""Maximum of that timeout: those intervals of the slowest car, one every `SLOWEST_S` with the longest `MODE00`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
-"""Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer."""
+"""Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer, 23 s at the slowest
+car."""
 # The silence is longer than any block outside avoidance, so the car reads the next frame alone. With growth to 6.5 s
 # the car reads one of two tries within 15 s of the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
@@ -53,7 +56,8 @@ def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
 
 def evidence_s(profile: Profile, learned: Learned) -> float:
     """Return the timeout for the evidence of a stop in addition to its worst case, s."""
-    return max(EVIDENCE_TIMEOUT_S, EVIDENCE_INTERVALS * (learned.echo.median_s + learned.close_s(profile.close_s)))
+    intervals_s = EVIDENCE_INTERVALS * (learned.echo.median_s + learned.close_s(profile.close_s))
+    return min(max(EVIDENCE_TIMEOUT_S, intervals_s), MAX_EVIDENCE_TIMEOUT_S)
 
 
 def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
