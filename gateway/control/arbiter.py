@@ -193,7 +193,8 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
             return words
         case FrameAction():
             words = next((refusal for frame in what.frames if (refusal := profile.refusal(frame))), None)
-            if words is None and isinstance(what, Fan) and what.on is not None and context.fan is None:
+            is_unknown = context.fan is None and not profile.fan_is_level
+            if words is None and isinstance(what, Fan) and what.on is not None and is_unknown:
                 return (
                     f"{context.car}'s fan state is unknown, so on/off is not possible. "
                     f"Toggle it: `fleet fan {context.car}`."

@@ -112,6 +112,16 @@ class CarModel:
                 return self.profile.has_readings and self.learned.shows is not Shows.NO
 
     @property
+    def shows_fan(self) -> bool:
+        """Return True if a reading shows that the fan is off.
+
+        A car that reports by a timer sends readings with the fan on, too. An arduino that was only detected may be one,
+        until it has shown that its reports wait for its loop.
+        """
+        is_sure = not self.auto or self.learned.shows is Shows.YES
+        return self.profile.kind is Platform.ARDUINO and is_sure and not self.profile.fan_is_level
+
+    @property
     def is_deaf(self) -> bool:
         """Return True if the car could have shown a stop, and has not reacted to the last one."""
         shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME

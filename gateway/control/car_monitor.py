@@ -98,8 +98,10 @@ class CarMonitor:
             model.range_cm, model.range_at = event.range_cm or None, event.at
         if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
             self._update_battery(event.voltage_v, now)
-        if now > model.believed.fan_at + FAN_SETTLED_S and model.profile.fan_silences:
-            model.believed.fan = False  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
+        if now > model.believed.fan_at + FAN_SETTLED_S:
+            model.believed.fan_toggled = False
+            if model.shows_fan:  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
+                model.believed.fan = False
 
     def _log_delivery(self, finding: Finding, now: float) -> None:
         """Log once that a car which has shown its stops did not get one, and once that it gets them again."""
@@ -179,7 +181,7 @@ class CarMonitor:
 
     def _check_silence(self, now: float) -> None:
         model = self.model
-        fan = bool(model.believed.fan)
+        fan = model.believed.fan_may_run
         limit_s = model.mode.silence_limit(fan=fan)
         # During a stop silence shows nothing of the mode. An expected silence must still restart the clock.
         if self._stops.running is None or limit_s is None:

@@ -235,7 +235,7 @@ class StopExecutor:
                 return StopCase.WRONG_PLATFORM
             case _:
                 pass
-        if is_time_up and model.believed.fan and model.profile.fan_silences:
+        if is_time_up and model.believed.fan_may_run and model.profile.fan_silences:
             return StopCase.FAN
         if running.case in (StopCase.RASPBERRY_PI, StopCase.UNKNOWN_PLATFORM):
             return None

@@ -23,6 +23,8 @@ class StateEstimate:
     fan: bool | None = None
     fan_at: float = float("-inf")
     """When the fan was last toggled."""
+    fan_toggled: bool = False
+    """True if it was toggled, and no reading came since it had settled."""
     servo_deg: int | None = None
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
     speed: float = field(init=False)
@@ -45,6 +47,7 @@ class StateEstimate:
                 elif frame.fan:
                     self.fan = None if self.fan is None else not self.fan
                     self.fan_at = now
+                    self.fan_toggled = True
             case ModeClose():
                 self.motion = Motion.STOP
             case Ptz(deg):
@@ -53,6 +56,11 @@ class StateEstimate:
                 self.led = frame
             case _:
                 pass
+
+    @property
+    def fan_may_run(self) -> bool:
+        """Return True if the fan runs, or may run: its state is unknown, and it was toggled after the last reading."""
+        return self.fan is True or (self.fan is None and self.fan_toggled)
 
     def with_motion(self, frame: Frame) -> Frame:
         """Return the frame with the current motion, which every general frame carries."""

@@ -18,9 +18,7 @@ EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
-_MEASURED_READINGS: Final = (
-    "mode-0 readings with decimals in CSB, or without the constants PV8.4 and GS0 of a raspberry_pi car"
-)
+_MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
 _CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
 _WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
 _WITH_MODES: Final = "arduino (or stm32: their bytes are mostly the same)"
@@ -160,10 +158,13 @@ class PlatformDetector:
         if len(candidate_modes(event)) > 1:
             return
         in_manual = only_candidate(event) is Mode.MANUAL
-        constants = b",PV8.4,GS0," in event.raw and b"." not in event.raw.partition(b",PV")[0]
+        # Whole centimeters with other values than these constants may come from a Raspberry Pi that measures its
+        # battery, or from an stm32. A mode frame ends the program of the first, so such a car stays unknown.
+        decimals = b"." in event.raw.partition(b",PV")[0]
+        constants = b",PV8.4,GS0," in event.raw and not decimals
         shown = {
             _MODE_READINGS: not in_manual,
-            _MEASURED_READINGS: in_manual and not constants,
+            _MEASURED_READINGS: in_manual and decimals,
             _CONSTANT_READINGS: in_manual and constants,
             _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
         }

@@ -33,6 +33,7 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
+from gateway.sim.model.traits import CarTraits
 from tests.gateway.control.workbench import (
     BACK,
     COORDINATOR,
@@ -255,7 +256,7 @@ def test_a_drive_within_a_full_stop_waits_for_its_first_frames(desk: Workbench, 
     desk.ask(Stop())
     answer = desk.ask(Drive(Motion.BACK, duration_s), identity="it")
     assert (answer.status, answer.words) == (QUEUED, "begins in 1.2 s at most: red is busy with a stop")
-    assert desk.control.expires_in_s(desk.now) >= duration_s + 1.0
+    assert (desk.control.expires_in_s(desk.now) or 0.0) >= duration_s + 1.0
     desk.until(lambda: SENT in desk.life("it"))
     assert desk.frames == [RUN, MODE00, STOP, BACK], "after the first frames of the stop, not after its evidence"
     began = desk.now
@@ -795,7 +796,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         assert set(desk.frames[before:]) <= stops, seed
         ends = [each for each in desk.records if each.command.id == "the-stop"]
         if (
-            desk.car.fan and not desk.control.model.believed.fan
+            desk.car.fan and not desk.control.model.believed.fan_may_run
         ):  # the fan ran when the link was lost, so control does not know why the car is silent
             assert (ends[-1].phase, ends[-1].reason) == (Phase.FAILED, Reason.NOT_SHOWN), seed
             assert desk.control.model.motors == "unknown", seed
@@ -837,6 +838,30 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
         pair.ask(ChangeSpeed(step))
         pair.run(0.5)
         assert pair.car.truth.speed == pair.control.model.believed.speed
+
+
+def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> None:
+    pair = Pair("arduino", told="arduino+fan_level", traits=CarTraits(fan_level=True), start_s=2.0).ready()
+    pair.control.model.believed.fan = None  # as after a connect: a level needs no known state
+    assert pair.ask(Fan(on=True)).status is QUEUED
+    for what in (OneShot(General(Motion.STOP, light=Light.RED)), Drive(Motion.FORWARD, 0.5)):
+        pair.run(4.0)
+        pair.ask(what)
+        pair.run(4.0)
+        assert (pair.car.truth.fan, pair.control.model.believed.fan) == (True, True)
+    pair.ask(Fan(on=False))
+    pair.run(4.0)
+    assert (pair.car.truth.fan, pair.control.model.believed.fan) == (False, False)
+
+
+def test_readings_of_a_car_that_reports_by_a_timer_do_not_show_its_fan() -> None:
+    pair = Pair("stm32", start_s=2.0).ready()
+    pair.ask(Fan())
+    pair.run(6.0)
+    assert pair.car.truth.fan
+    assert pair.control.model.believed.fan is None
+    refused = pair.ask(Fan(on=True))
+    assert (refused.status, pair.car.truth.fan) == (Phase.REJECTED, True), "it would turn the fan off"
 
 
 @pytest.mark.parametrize("mode", [Mode.COLOR_LED, Mode.OBSTACLE_AVOIDANCE, Mode.TRACKING])
