@@ -187,7 +187,10 @@ def _silent_car(e: CarEvidence) -> str:
         return ""
     link = e.of("state/link")
     since = f"for {link.last_rx_s:.0f} s" if link.HasField("last_rx_s") else "since its link opened"
-    return f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
+    words = f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
+    if link.rx_frames:
+        return words
+    return f"{words} If it drives and never sends readings: `platform: raspberry_pi+no_readings` in the fleet file."
 
 
 def _shared(e: CarEvidence) -> str:

@@ -133,6 +133,13 @@ class CarModel:
         return stopping.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
 
     @property
+    def silent_program(self) -> str:
+        """Return what to do if the car drives and never sends readings; empty if it has sent one."""
+        if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
+            return ""
+        return " If it drives and never sends readings, say so: `platform: raspberry_pi+no_readings` in the fleet file."
+
+    @property
     def is_heard(self) -> bool:
         """Return False if the car is silent for longer than any normal silence."""
         return self.trust.state is not CarTrust.UNHEARD

@@ -195,7 +195,7 @@ class CarMonitor:
         self._silent_since = model.mode.heard_at
         words = (
             f"{model.name} may be moving: no reading for {silent_s:.1f} s. Is it on, in range, its fan off? "
-            "The gateway keeps stopping it."
+            f"The gateway keeps stopping it.{model.silent_program}"
         )
         self._log.log(Level.WARNING, "unheard", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)

@@ -66,7 +66,7 @@ class Executor:
         self.stops.link_down(reason, now, cause=cause)
         self.queue.drop(Phase.FAILED, cause, reason, now)
         model.mode.forget()
-        model.believed.fan = None
+        model.believed.fan, model.believed.fan_toggled = None, False
 
     # ------------------------------------------------------------------ frames out
 

@@ -268,7 +268,9 @@ class StopExecutor:
         if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
             self._finish_unknown(running, now)
             return
+        hint = self.model.silent_program
         words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. The gateway keeps stopping it."
+        words += hint
         waiting: list[Pending] = []
         for pending in running.commands:
             if now < pending.received_at + running.timeout_s:
@@ -284,7 +286,7 @@ class StopExecutor:
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:
-                words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it."
+                words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it.{hint}"
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 

@@ -16,7 +16,13 @@ PARTS = {"__init__", "__main__", "measured", "record_ours", "stage", "test_round
 """Modules that are not benchmarks."""
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
+PROCESSES = {"fleet", "floods", "load"}
+"""Benchmarks that start dozens of processes: too much for the test suite."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=pytest.mark.soak if each in PROCESSES else ()) for each in BENCHMARKS]
+)
 def test_a_small_round(name: str) -> None:
     rows: list[Measured] = importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(SMALL)
     assert rows

@@ -840,6 +840,21 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
         assert pair.car.truth.speed == pair.control.model.believed.speed
 
 
+@pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("raspberry_pi", False), ("raspberry_pi", True)])
+def test_a_car_that_never_sends_a_reading_is_told_how_to_say_so(platform: str, *, heard: bool) -> None:
+    desk = Workbench(platform)
+    desk.control.link_up(desk.now)
+    if heard:
+        desk.run(3.0)
+    desk.ask(Stop(), PERSON, identity="it")
+    desk.run(40.0, reports=False)
+    words = [each.words for each in (*desk.logs, *desk.records) if "may still be" in each.words]
+    words += [each.words for each in desk.records if each.phase is Phase.FAILED]
+    words += [each.words for each in desk.logs if getattr(each, "code", "") == "unheard"]
+    assert words
+    assert all(("+no_readings" in each) is not heard for each in words), words
+
+
 def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> None:
     pair = Pair("arduino", told="arduino+fan_level", traits=CarTraits(fan_level=True), start_s=2.0).ready()
     pair.control.model.believed.fan = None  # as after a connect: a level needs no known state
