@@ -10,6 +10,7 @@ from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
 from gateway.control.commands import Fan, Phase, Reason, SetMode
 from gateway.control.estimate.learned import blocking_kind
+from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, TrustEvent
 from gateway.control.events import FrameOrigin, OutgoingFrame
 from gateway.control.pacing import FLIGHT_S
@@ -21,6 +22,7 @@ from gateway.control.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 
 LATE_DRIVE_S: Final = 0.1
@@ -310,9 +312,19 @@ class Executor:
             words = "; ".join(filter(None, (words, sent, moved)))
             self.queue.close_held(Phase.COMPLETE, None, words, now, basis=Basis.SHOWN, evidence=(moved,))
             return
-        doubt = f"{model.name} may not have moved: it has not reacted to the last stop" if model.is_deaf else ""
+        doubt = f"{model.name} may not have moved: {self._doubt_of_drive}" if self._doubt_of_drive else ""
         words = "; ".join(filter(None, (words, sent, doubt)))
         self.queue.close_held(Phase.SENT, None, words, now, basis=Basis.SENT)
+
+    @property
+    def _doubt_of_drive(self) -> str:
+        """Return why the car may have ignored a drive; empty if there is no reason to think so."""
+        model = self.model
+        if model.is_deaf:
+            return "it has not reacted to the last stop"
+        if model.profile.kind is Platform.UNKNOWN and model.mode.verdict is not Verdict.CONFIRMED:
+            return "no reading shows its mode, and in some modes it ignores drives. Name its platform to leave them"
+        return ""
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         """End the held motion with a soft stop, unless the car is at rest."""

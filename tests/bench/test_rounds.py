@@ -21,7 +21,7 @@ PROCESSES = {"fleet", "floods", "load"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=pytest.mark.soak if each in PROCESSES else ()) for each in BENCHMARKS]
+    "name", [pytest.param(each, marks=[pytest.mark.soak] if each in PROCESSES else []) for each in BENCHMARKS]
 )
 def test_a_small_round(name: str) -> None:
     rows: list[Measured] = importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(SMALL)

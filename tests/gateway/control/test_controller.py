@@ -848,11 +848,22 @@ def test_a_car_that_never_sends_a_reading_is_told_how_to_say_so(platform: str, *
         desk.run(3.0)
     desk.ask(Stop(), PERSON, identity="it")
     desk.run(40.0, reports=False)
-    words = [each.words for each in (*desk.logs, *desk.records) if "may still be" in each.words]
-    words += [each.words for each in desk.records if each.phase is Phase.FAILED]
-    words += [each.words for each in desk.logs if getattr(each, "code", "") == "unheard"]
+    words = [each.words for each in desk.records if each.phase is Phase.FAILED]
+    words += [each.words for each in desk.logs if each.code == "unheard"]
     assert words
     assert all(("+no_readings" in each) is not heard for each in words), words
+
+
+@pytest.mark.parametrize(("heard", "doubted"), [(True, False), (False, True)])
+def test_a_drive_of_an_unknown_car_whose_mode_nothing_shows_says_so(*, heard: bool, doubted: bool) -> None:
+    desk = Workbench("unknown")
+    desk.control.link_up(desk.now)
+    desk.run(12.0, reports=heard)
+    desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, identity="it")
+    desk.run(3.0, reports=heard)
+    assert desk.end("it") == (SENT, None)
+    words = [each.words for each in desk.records if each.command.id == "it"][-1]
+    assert ("Name its platform" in words) is doubted, words
 
 
 def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> None:
