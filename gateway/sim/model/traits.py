@@ -18,7 +18,7 @@ ECHO_RANGING_S: Final = 0.011
 class CarTraits:
     """The parameters of one car. The defaults are those of the simulated Arduino car."""
 
-    interval_s: float = 0.911
+    interval_s: float = 1.254
     """Time from one mode-0 report to the next on the wire, with an echo. Without one, the ranging makes it longer."""
     spread_s: float = 0.0
     """Maximum by which each interval differs from `interval_s`, either way."""

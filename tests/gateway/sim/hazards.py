@@ -385,7 +385,7 @@ async def pi_lone_hash(car: Stranger) -> None:
 async def pi_hang_up(car: Stranger) -> None:
     await drive(car)
     await car.hang_up()
-    await car.until(lambda truth: not truth.alive, within=1.2)
+    await car.until(lambda truth: not truth.alive, within=1.3)
     assert await car.refused()
     await car.wait(0.5)
     assert car.truth.driving

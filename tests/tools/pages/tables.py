@@ -77,7 +77,8 @@ _STATES = {
     "opening": "a mode is being opened (the longest)",
     "link just restored": "the link has just come back, after half of any frame",
     "raspberry_pi": "a Raspberry Pi car (the longest)",
-    "unknown platform": "a car whose platform is not known (the longest)",
+    "stm32": "an stm32 car (the longest)",
+    "unknown": "a car whose platform is not known, in mode 0 (the longest)",
 }
 """Name of each state of the distribution on the page. Of several rows with this beginning, the longest time counts."""
 
@@ -90,7 +91,7 @@ def stops() -> list[dict[str, str]]:
 
 def _rows(name: str) -> list[dict[str, str]]:
     """Return the rows of this state, or of the group of states that begins with this name."""
-    grouped = name in ("opening", "raspberry_pi", "unknown platform")
+    grouped = name in ("opening", "raspberry_pi", "stm32", "unknown")
     named = [row for row in stops() if row["state"] == name]
     begun = [row for row in stops() if row["state"].startswith(name)]
     return [row for row in begun if not row["state"].endswith(("restored", "under way"))] if grouped else named
@@ -99,6 +100,7 @@ def _rows(name: str) -> list[dict[str, str]]:
 def _longest(name: str, column: str) -> float:
     """Return the longest time of a column in the rows of this name, 0 if no row has a time."""
     times = [float(row[column]) for row in _rows(name)]
+    assert times, f"no row of {STOPS.name} is in the state {name}"
     return max((each for each in times if each != float("inf")), default=0.0)
 
 

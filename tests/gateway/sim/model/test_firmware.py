@@ -13,6 +13,8 @@ from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import CarBodyState, Pose, Truth
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import RaspberryPiCar
+from gateway.sim.model.stm32 import STM32_TRAITS
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from tests.gateway.sim.strangers import (
     FAN,
@@ -148,12 +150,13 @@ PI_FULL = rb"\$4WD,CSB(\d+),PV8\.4,GS0,LF[01]{4},HW[01]{2},GM[01]{2}#"
         ("raspberry_pi", True, PI_FULL),
     ],
 )
-async def test_mode_0_reports_about_once_a_second(platform: str, tcp: bool, frame: bytes) -> None:
+async def test_mode_0_reports_at_the_interval_of_its_program(platform: str, tcp: bool, frame: bytes) -> None:
     car = virtual(platform, tcp=tcp)
     data = await frames(car, 30)
     found = list(re.finditer(frame, data))
     assert sum(len(match[0]) for match in found) == pytest.approx(len(data), abs=60)
-    assert 27 <= len(found) <= 33
+    interval_s = STM32_TRAITS.interval_s if platform == "stm32" else CarTraits().interval_s
+    assert len(found) == pytest.approx(30 / interval_s, abs=1.5)
     assert all(2 <= float(match[1]) <= 500 for match in found)
 
 
