@@ -16,8 +16,8 @@ PARTS = {"__init__", "__main__", "measured", "record_ours", "stage", "test_round
 """Modules that are not benchmarks."""
 
 
-PROCESSES = {"fleet", "floods", "load"}
-"""Benchmarks that start dozens of processes: too much for the test suite."""
+PROCESSES = {"commands", "fleet", "floods", "load", "readings"}
+"""Benchmarks that start many processes: too much for the test suite."""
 
 
 @pytest.mark.parametrize(
