@@ -148,7 +148,7 @@ class Controller:
             return f"its link: {model.link_reason}"
         if running is None or self._executor.accepts_commands(now):
             return ""
-        left_s = max(0.0, self.stops.free_at(now) - now)
+        left_s = self._busy_s(now)
         what = "its first stop" if not model.known else "a stop"
         return f"{what}, for {left_s:.1f} s at most"
 
@@ -469,10 +469,10 @@ class Controller:
         sender, before = command.sender, self.safety.lease_at(now)
         match command.what:
             case Drive(duration_s=duration_s):
-                lasts_s = max(self.stops.free_at(now) - now, 0.0) + duration_s
+                lasts_s = self._busy_s(now) + duration_s
             case SetMode(mode):  # until the mode is open
                 opening_s = 0.0 if mode is Mode.MANUAL else self.model.profile.block_s(ModeOpen(mode))
-                lasts_s = max(self.stops.free_at(now) - now, 0.0) + opening_s
+                lasts_s = self._busy_s(now) + opening_s
             case _:  # other commands do not shorten the lease of a drive
                 lasts_s = (self.expires_in_s(now) or 0.0) if self.owner == sender.name else 0.0
         self.safety.grant(sender, now + lasts_s)
@@ -497,17 +497,21 @@ class Controller:
             self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
+    def _busy_s(self, now: float) -> float:
+        """Return how long a motion would wait for the car, as far as that is known, s."""
+        return max(self.stops.free_at(now) - now, 0.0)
+
     def _too_busy(self, command: Command, now: float) -> str:
         """Return why a sample of a stream would expire before its frame could go out; empty if it would not.
 
         Any other drive waits, and counts its duration from its frame on.
         """
-        free_at, what = self.stops.free_at(now), command.what
+        what = command.what
         if not command.streamed or not isinstance(what, Drive) or what.motion is Motion.STOP:
             return ""
-        if now + what.duration_s > free_at:
+        busy_s = self._busy_s(now)
+        if what.duration_s > busy_s:
             return ""
-        busy_s = free_at - now
         return f"{self.car} is busy for another {busy_s:.1f} s. The next samples of this stream drive it then."
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
@@ -533,22 +537,22 @@ class Controller:
         """Return when a drive expires that waits for its frame, and the duration that counts from that frame."""
         if pending.command.streamed:
             return now + duration_s, 0.0
-        wait_s = max(self.stops.free_at(now) - now, duration_s) + START_MARGIN_S
+        wait_s = max(self._busy_s(now), duration_s) + START_MARGIN_S
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:
         """Return how long a drive waits for its frame, in words; empty if it does not."""
-        busy_s = self.stops.free_at(now) - now
-        if pending.command.streamed or busy_s < LATE_DRIVE_S:
+        if pending.command.streamed or (busy_s := self._busy_s(now)) < LATE_DRIVE_S:
             return ""
         what = "a stop" if self.stops.running is not None else "a command"
         return f"begins in {busy_s:.1f} s at most: {self.car} is busy with {what}"
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
         """Extend a held motion without another frame: its sender has sent the same drive again."""
-        held.expires_at, held.duration_s = self._times(pending, duration_s, now)
         if held.pending.sent:
             held.expires_at = now + duration_s
+        else:
+            held.expires_at, held.duration_s = self._times(pending, duration_s, now)
         held.pending.count += 1
         if pending.command.streamed:
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)

@@ -268,9 +268,8 @@ class StopExecutor:
         if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
             self._finish_unknown(running, now)
             return
-        hint = self.model.silent_program
-        words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. The gateway keeps stopping it."
-        words += hint
+        goes_on = f"The gateway keeps stopping it.{self.model.silent_program}"
+        words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. {goes_on}"
         waiting: list[Pending] = []
         for pending in running.commands:
             if now < pending.received_at + running.timeout_s:
@@ -286,7 +285,7 @@ class StopExecutor:
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:
-                words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it.{hint}"
+                words = f"{car} may still be moving: silent since the stop began. {goes_on}"
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 

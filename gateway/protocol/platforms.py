@@ -333,21 +333,21 @@ class Profile:
         if candidates != (Mode.MANUAL,):
             return tuple(found)
         if self.kind is Platform.RASPBERRY_PI:
-            if not _whole_cm(event):
+            if not whole_cm(event):
                 found.append("decimals in CSB; a raspberry_pi car sends whole centimeters")
             if event.voltage_v not in {None, _PI_VOLTAGE_V}:
                 found.append("PV is not 8.4, the constant of a raspberry_pi car")
             if event.grayscale not in {None, _PI_GRAYSCALE}:
                 found.append("GS is not 0, the constant of a raspberry_pi car")
             return tuple(found)
-        if _pi_constants(event):
+        if pi_constants(event):
             found.append("PV8.4 and GS0, the constants of a raspberry_pi car")
-        if self.kind is Platform.ARDUINO and _whole_cm(event):
+        if self.kind is Platform.ARDUINO and whole_cm(event):
             found.append("whole centimeters in CSB; an arduino car sends decimals in mode 0")
         return tuple(found)
 
     def _may_be_constant(self, event: Sensors) -> bool:
-        return self.kind is not Platform.UNKNOWN or (_whole_cm(event) and _pi_constants(event))
+        return self.kind is not Platform.UNKNOWN or (whole_cm(event) and pi_constants(event))
 
     def _general_refusal(self, frame: General) -> str | None:
         if frame.sing:
@@ -441,7 +441,8 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
             )
 
 
-def _whole_cm(event: Sensors) -> bool:
+def whole_cm(event: Sensors) -> bool:
+    """Return True if the distance has no decimals."""
     return b"." not in event.raw.partition(b",PV")[0]
 
 
@@ -449,5 +450,6 @@ def _stm32_constants(event: Sensors) -> bool:
     return b",GS0,LF0000,HW00,GM00" in event.raw
 
 
-def _pi_constants(event: Sensors) -> bool:
+def pi_constants(event: Sensors) -> bool:
+    """Return True if voltage and grayscale are the constants of a raspberry_pi car."""
     return b",PV8.4,GS0," in event.raw

@@ -11,7 +11,7 @@ from gateway.protocol.enums import Mode
 from gateway.protocol.events import ArmReading, Event, ImuReading, TextLine
 from gateway.protocol.modes import candidate_modes, only_candidate
 from gateway.protocol.platform_name import Platform
-from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform
+from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
 from gateway.protocol.sensors import Sensors
 
 EVIDENCE_FRAMES: Final = 3
@@ -160,12 +160,11 @@ class PlatformDetector:
         in_manual = only_candidate(event) is Mode.MANUAL
         # Whole centimeters with other values than these constants may come from a Raspberry Pi that measures its
         # battery, or from an stm32. A mode frame ends the program of the first, so such a car stays unknown.
-        decimals = b"." in event.raw.partition(b",PV")[0]
-        constants = b",PV8.4,GS0," in event.raw and not decimals
+        whole = whole_cm(event)
         shown = {
             _MODE_READINGS: not in_manual,
-            _MEASURED_READINGS: in_manual and decimals,
-            _CONSTANT_READINGS: in_manual and constants,
+            _MEASURED_READINGS: in_manual and not whole,
+            _CONSTANT_READINGS: in_manual and whole and pi_constants(event),
             _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
         }
         for words, seen in self._seen.items():
