@@ -341,7 +341,13 @@ class CarGateway:
         self._flood_until = now + FLOOD_LOG_PAUSE_S
 
     def _new_decoder(self) -> Decoder:
-        return Decoder(head=self._settings.profile.dialect.head)
+        return Decoder(head=self._control.model.profile.dialect.head)
+
+    def _use_profile(self, profile: Profile) -> None:
+        """Read and publish by the profile in force: the car's readings may have shown another one."""
+        if profile is not self._publisher.profile:
+            self._publisher.profile = profile
+            self._decoder.use_head(profile.dialect.head)
 
     def _on_events(self, events: list[Event]) -> None:
         """Publish the measurements of the events, then update the state of the car with them."""
@@ -350,7 +356,7 @@ class CarGateway:
             if not self._publisher.publish_event(event, confirmed, loaded=self._control.model.motors != "off"):
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
-            self._publisher.profile = self._control.model.profile
+            self._use_profile(self._control.model.profile)
             if isinstance(event, TextLine):
                 self._health.on_rejected("text")  # it shows a program, but not that of a car
                 continue

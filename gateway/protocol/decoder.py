@@ -64,15 +64,19 @@ class Decoder:
         if not _MIN_FRAME <= max_frame <= MAX_FRAME:
             raise ValueError(f"max_frame: {max_frame}, allowed are {_MIN_FRAME}..{MAX_FRAME}")
         self._max = max_frame
-        self._head, self._head_bytes = head, head.encode()
-        self._matcher = sensors_matcher(head)
-        self._match_ended = self._matcher.match_ended
+        self.use_head(head)
         self._buffer = bytearray()  # a frame from its `$` on, or junk from its first byte that is not a separator
         self._last = 0.0  # time of the last byte in the buffer
         self._silence_s = inf  # silence after the last byte that would complete an event
         self._late_end = False  # True if silence ended the last frame: its `#` may still come
         self._is_mid_line = False  # True if an earlier event has the begin of this line
         self._sent: dict[bytes, float] = {}
+
+    def use_head(self, head: str) -> None:
+        """Take this as the first word of the frames from now on."""
+        self._head, self._head_bytes = head, head.encode()
+        self._matcher = sensors_matcher(head)
+        self._match_ended = self._matcher.match_ended
 
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events that these bytes complete. `now`: their time of arrival in seconds, any fixed origin."""

@@ -2,21 +2,36 @@
 
 import asyncio
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gateway.bus.service import CarService
-from gateway.car import CarGateway, Settings
-from gateway.link import parse_url
-from gateway.protocol.platforms import parse_platform
+import pytest
+
 from schemas import bus
+from tests.support.gateway_here import served
 from tests.support.ports import free_endpoint
 from tests.support.processes import MODE00, REPORT, REPORT_S, FleetProcesses, TcpCar, wait_for
 
 
-async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Path) -> None:
+@pytest.fixture
+def car() -> Iterator[TcpCar]:
+    car = TcpCar()
+    yield car
+    car.close()
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    yield fleet
+    fleet.close()
+
+
+async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(
+    fleet: FleetProcesses, car: TcpCar, tmp_path: Path
+) -> None:
     """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports looks like a pause."""
-    fleet, car = FleetProcesses(free_endpoint(), tmp_path), TcpCar()
     shown: list[int] = []
 
     def listen(sample: bus.Sample) -> None:
@@ -28,31 +43,18 @@ async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Pat
         await asyncio.to_thread(wait_for, lambda: car.received.count(MODE00) >= count, f"{count} MODE00 have come")
 
     fleet.bus.subscribe("fleet/red/state/safety", listen)
-    with bus.Bus.open(fleet.endpoint) as opened:
-        settings = Settings(
-            "red", parse_url(car.link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
-            retry=True,
-        )  # fmt: skip
-        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"))
-        serving = asyncio.ensure_future(gateway.run())
-        try:
-            await until_closed(1)
-            car.obey()
-            await until_closed(3)  # after the first pause the gateway writes the next MODE00 at once
-            time.sleep(REPORT_S)  # noqa: ASYNC251 - the loop stalls
-            car.send(REPORT)  # as if the car had not received MODE00
-            time.sleep(2.2 - REPORT_S)  # noqa: ASYNC251
-            await asyncio.to_thread(wait_for, lambda: shown or car.received.count(MODE00) > 3, "it goes on")
-            assert not shown, "one pause is no evidence"
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            car.close()
-            fleet.close()
+    async with served(fleet, car.link, tmp_path):
+        await until_closed(1)
+        car.obey()
+        await until_closed(3)  # after the first pause the gateway writes the next MODE00 at once
+        time.sleep(REPORT_S)  # noqa: ASYNC251 - the loop stalls
+        car.send(REPORT)  # as if the car had not received MODE00
+        time.sleep(2.2 - REPORT_S)  # noqa: ASYNC251
+        await asyncio.to_thread(wait_for, lambda: shown or car.received.count(MODE00) > 3, "it goes on")
+        assert not shown, "one pause is no evidence"
 
 
-async def test_a_line_of_text_is_no_reading_and_no_damage(tmp_path: Path) -> None:
-    fleet, car = FleetProcesses(free_endpoint(), tmp_path), TcpCar()
+async def test_a_line_of_text_is_no_reading_and_no_damage(fleet: FleetProcesses, car: TcpCar, tmp_path: Path) -> None:
     verdicts: list[str] = []
     links: list[Any] = []
 
@@ -62,24 +64,26 @@ async def test_a_line_of_text_is_no_reading_and_no_damage(tmp_path: Path) -> Non
 
     fleet.bus.subscribe("fleet/red/frame/rx", listen)
     fleet.bus.subscribe("fleet/red/state/link", lambda sample: links.append(sample.message()))
-    with bus.Bus.open(fleet.endpoint) as opened:
-        settings = Settings(
-            "red", parse_url(car.link), parse_platform("arduino+text"), auto=False, fleet="fleet", state_dir=tmp_path,
-            retry=True,
-        )  # fmt: skip
-        serving = asyncio.ensure_future(CarGateway(settings, opened, CarService(opened, "fleet", "red")).run())
-        try:
-            await asyncio.to_thread(wait_for, lambda: car.received.count(MODE00) >= 1, "it has connected")
-            for count in range(1, 4):
-                car.send(b"EXEC:F\r\n")
-                await asyncio.to_thread(wait_for, lambda count=count: len(verdicts) >= count, "the line has come")
-            links.clear()
-            await asyncio.to_thread(wait_for, lambda: links, "the state of the link")
-            assert verdicts == ["text"] * 3
-            assert dict(links[-1].rejects) == {"text": 3}
-            assert links[-1].state != "online"
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            car.close()
-            fleet.close()
+    async with served(fleet, car.link, tmp_path, platform="arduino+text"):
+        await asyncio.to_thread(wait_for, lambda: car.received.count(MODE00) >= 1, "it has connected")
+        for count in range(1, 4):
+            car.send(b"EXEC:F\r\n")
+            await asyncio.to_thread(wait_for, lambda count=count: len(verdicts) >= count, "the line has come")
+        links.clear()
+        await asyncio.to_thread(wait_for, lambda: links, "the state of the link")
+        assert verdicts == ["text"] * 3
+        assert dict(links[-1].rejects) == {"text": 3}
+        assert links[-1].state != "online"
+
+
+async def test_readings_with_another_head_are_read_as_soon_as_it_is_known(
+    fleet: FleetProcesses, car: TcpCar, tmp_path: Path
+) -> None:
+    ranges: list[Any] = []
+    fleet.bus.subscribe("fleet/red/sensor/range", lambda sample: ranges.append(sample.message()))
+    async with served(fleet, car.link, tmp_path, platform="auto"):
+        await asyncio.to_thread(wait_for, lambda: car.received, "it has connected")
+        car.obey(REPORT.replace(b"4WD", b"BALA"))
+        await asyncio.to_thread(wait_for, lambda: b"$BALA,MODE00#" in car.received, "a stop with its own head")
+        await asyncio.to_thread(wait_for, lambda: ranges, "a reading")
+        await asyncio.to_thread(wait_for, lambda: fleet.state("health").platform == "arduino+head=BALA", "its platform")

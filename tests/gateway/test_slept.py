@@ -7,12 +7,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from gateway.bus.service import CarService
-from gateway.car import CarGateway, Settings
-from gateway.link import parse_url
-from gateway.protocol.platforms import parse_platform
 from schemas import bus
 from schemas.process.suspend import SleepWatch
+from tests.support.gateway_here import served
 from tests.support.judge import Judge
 from tests.support.ports import free_endpoint
 from tests.support.processes import MODE00, FleetProcesses, TcpCar, wait_for
@@ -30,7 +27,7 @@ class SleepingLaptop:
 
 
 @contextlib.asynccontextmanager
-async def served(tmp_path: Path, computer: SleepingLaptop) -> AsyncIterator[tuple[FleetProcesses, TcpCar, list[str]]]:
+async def standing(tmp_path: Path, computer: SleepingLaptop) -> AsyncIterator[tuple[FleetProcesses, TcpCar, list[str]]]:
     """Serve a car that has shown that it stands. Yield its fleet, the car, and the codes of its log."""
     fleet, car, codes = FleetProcesses(free_endpoint(), tmp_path), TcpCar(), list[str]()
 
@@ -39,28 +36,20 @@ async def served(tmp_path: Path, computer: SleepingLaptop) -> AsyncIterator[tupl
         codes.append(entry.name.removeprefix("red "))
 
     fleet.bus.subscribe("fleet/red/event/log", listen)
-    with bus.Bus.open(fleet.endpoint) as opened:
-        settings = Settings(
-            "red", parse_url(car.link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
-            retry=True,
-        )  # fmt: skip
-        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"), computer.watch)
-        serving = asyncio.ensure_future(gateway.run())
-        try:
+    try:
+        async with served(fleet, car.link, tmp_path, watch=computer.watch):
             await asyncio.to_thread(wait_for, lambda: MODE00 in car.received, "it is stopped at the connect")
             car.obey()
             await asyncio.to_thread(wait_for, lambda: "recovered" in codes, "it stands")
             yield fleet, car, codes
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            car.close()
-            fleet.close()
+    finally:
+        car.close()
+        fleet.close()
 
 
 async def test_a_car_that_drove_through_a_sleep_is_stopped_before_anything_else(tmp_path: Path) -> None:
     computer = SleepingLaptop()
-    async with served(tmp_path, computer) as (fleet, car, codes):
+    async with standing(tmp_path, computer) as (fleet, car, codes):
         driven = await asyncio.to_thread(fleet.ask, "drive", motion="forward", duration_s=10)
         assert driven["status"] in ("queued", "sent")
         await asyncio.to_thread(wait_for, lambda: RUN in car.received, "it drives")
@@ -78,7 +67,7 @@ async def test_a_car_that_drove_through_a_sleep_is_stopped_before_anything_else(
 
 async def test_a_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path) -> None:
     computer = SleepingLaptop()
-    async with served(tmp_path, computer) as (_, _, codes):
+    async with standing(tmp_path, computer) as (_, _, codes):
         computer.slept_s += 60.0
         await asyncio.to_thread(wait_for, lambda: "slept" in codes, "it says that it slept")
         assert codes.count("slept") == 1
@@ -90,14 +79,8 @@ async def test_the_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     judge = Judge.follow(fleet.bus)
     _, (link,) = await asyncio.to_thread(fleet.simulate, "red:arduino:tcp", truth=True)
-    with bus.Bus.open(fleet.endpoint) as opened:
-        settings = Settings(
-            "red", parse_url(link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
-            retry=True,
-        )  # fmt: skip
-        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"), laptop.watch)
-        serving = asyncio.ensure_future(gateway.run())
-        try:
+    try:
+        async with served(fleet, link, tmp_path, watch=laptop.watch) as (gateway, serving):
             await asyncio.to_thread(fleet.ready)
             await asyncio.to_thread(fleet.ask, "drive", motion="forward", duration_s=10)
             await asyncio.to_thread(wait_for, lambda: judge.driving, "it drives")
@@ -110,7 +93,5 @@ async def test_the_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -
             gateway.stop()
             await serving
             assert not judge.driving
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            fleet.close()
+    finally:
+        fleet.close()

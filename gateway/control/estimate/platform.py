@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.protocol.enums import Mode
-from gateway.protocol.events import ArmReading, Event, ImuReading, TextLine
+from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.modes import candidate_modes, only_candidate
-from gateway.protocol.platform_name import Platform
+from gateway.protocol.platform_name import HEAD, Platform
 from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
-from gateway.protocol.sensors import Sensors
+from gateway.protocol.sensors import Sensors, head_of
 
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
@@ -71,6 +71,9 @@ class PlatformDetector:
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
+    _head: str = ""
+    _heads: int = 0
+    """The first word of the last sensors frames if it is none of this profile, and their number."""
 
     def __post_init__(self) -> None:
         self.profile = self.configured
@@ -103,6 +106,7 @@ class PlatformDetector:
         """Update the evidence, and with `auto` the profile. Return new contradictions, in words."""
         match event:
             case Sensors():
+                self._heads = 0
                 self._open_mode.update(shown=Mode.MANUAL not in candidate_modes(event))
                 new = self._check_profile(event)
                 if self.auto:
@@ -114,6 +118,8 @@ class PlatformDetector:
             case TextLine():
                 self._count_variant("text")
                 return ()
+            case Rejected(raw):
+                return self._count_head(head_of(raw))
             case _:
                 return ()
         return new
@@ -153,6 +159,24 @@ class PlatformDetector:
         self._against[words] = _PlatformEvidence(holds=True)
         return (words,)
 
+    def _count_head(self, head: str | None) -> tuple[str, ...]:
+        """Count one sensors frame that begins with another word than those of this profile."""
+        if head is None or head == self.profile.dialect.head:
+            return ()
+        self._heads = self._heads + 1 if head == self._head else 1
+        self._head = head
+        if self._heads != EVIDENCE_FRAMES:
+            return ()
+        option = f"{HEAD}={head}"
+        if self.auto:
+            self._options = self._without_head(self._options) | {option}
+            self._apply_evidence()
+            return ()
+        kind = "+".join((self.profile.kind, *sorted(self._without_head(self.profile.options) | {option})))
+        words = f"readings that begin with {head}: none of them can be read. Is it {kind}?"
+        self._against[words] = _PlatformEvidence(holds=True)
+        return (words,)
+
     def _detect(self, event: Sensors) -> None:
         """Detect the platform from the first evidence."""
         if len(candidate_modes(event)) > 1:
@@ -183,10 +207,17 @@ class PlatformDetector:
         else:
             modes = Platform.STM32 if self._is_wide else Platform.ARDUINO
             kind = modes if self._with_modes else Platform.RASPBERRY_PI
-        profile = parse_platform("+".join((kind, *sorted(self._options | self.configured.options))))
+        options = self._options | self.configured.options
+        if any(each.startswith(HEAD) for each in self._options):  # the bytes know the head better
+            options = self._options | self._without_head(self.configured.options)
+        profile = parse_platform("+".join((kind, *sorted(options))))
         if profile.name != self.profile.name:
             self.profile = profile
             self._against.clear()
+
+    @staticmethod
+    def _without_head(options: frozenset[str]) -> frozenset[str]:
+        return frozenset(each for each in options if not each.startswith(HEAD))
 
     def _why(self) -> tuple[str, ...]:
         if not self.auto:

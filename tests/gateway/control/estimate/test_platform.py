@@ -97,6 +97,39 @@ def test_auto_adds_the_options_that_it_hears() -> None:
     assert truth.profile.name == "arduino+arm"
 
 
+def hear_raw(truth: PlatformDetector, *heads: str) -> list[str]:
+    """Hear sensors frames with these first words, as a decoder of the profile's head reads them."""
+    decoder = Decoder(head=truth.profile.dialect.head)
+    frames = [ARDUINO.replace("4WD", head).encode() for head in heads]
+    return [words for frame in frames for event in decoder.feed(frame, 1.0) for words in truth.on_event(event)]
+
+
+def test_auto_takes_another_head_from_three_readings() -> None:
+    truth = PlatformDetector(parse_platform("unknown+text"), auto=True)
+    hear_raw(truth, "BALA", "BALA", "4WD", "BALA", "BALA", "CART", "BALA", "BALA")
+    assert truth.profile.name == "unknown+text", "never three running"
+    assert hear_raw(truth, "BALA") == []
+    assert truth.profile.name == "unknown+head=BALA+text"
+    hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES)
+    assert truth.profile.name == "arduino+head=BALA+text"
+    hear_raw(truth, *["4WD"] * EVIDENCE_FRAMES)
+    assert truth.profile.dialect.head == "4WD", "another program on the same link"
+
+
+def test_the_bytes_know_the_head_better_than_an_option() -> None:
+    truth = PlatformDetector(parse_platform("unknown+head=CART"), auto=True)
+    hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES)
+    assert truth.profile.name == "unknown+head=BALA"
+
+
+def test_another_head_than_the_named_one_is_said_once() -> None:
+    truth = PlatformDetector(parse_platform("arduino+arm+head=CART"))
+    (words,) = hear_raw(truth, *["BALA"] * 9)
+    assert "arduino+arm+head=BALA" in words
+    assert truth.profile.name == "arduino+arm+head=CART"
+    assert truth.contradictions == (words,)
+
+
 def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
     truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, *[ARDUINO] * EVIDENCE_FRAMES)
