@@ -28,6 +28,7 @@ _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_
 """Counts in `rejects` of a link that are no rejected frames."""
 FAILED_PHASES: Final = ("rejected", "failed", "expired")
 """Phases of a command that was not carried out."""
+_CARRIED_OUT: Final = ("sent", "effect_seen", "complete")
 _NO_TROUBLE: Final = ("superseded", "duplicate")
 """Reasons of commands that ended early as somebody intended."""
 
@@ -291,6 +292,11 @@ def _refused(e: CarEvidence) -> str:
     if not e.failed:
         return ""
     age, event = e.failed[-1]
+    mode = e.of("state/mode")
+    is_over = event.reason == "wrong_mode" and mode is not None and mode.asked == "manual"
+    # Or the car has done since then what was refused.
+    if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
+        return ""
     return f"{event.sender}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
 
 

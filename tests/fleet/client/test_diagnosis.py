@@ -71,7 +71,7 @@ ODD: dict[str, CarEvidence] = {
     "flooded": with_states(link=pb.Link(state="online", rx_frames=90, tx_airtime=0.95)),
     "held": with_states(safety=pb.Safety(motors="off", trust="stopped", hold=pb.Hold(by="mia"))),
     "plan_stopped": evidence(coordinated=True, assignment=pb.Assignment(stopped_by="mia")),
-    "refused": evidence(commands=[refused("wrong_mode", words="red ignores drive commands.")]),
+    "refused": evidence(commands=[refused("queue_full", words="red ignores drive commands.")]),
     "not_recorded": evidence(recording=pb.Recording(state="full", error="50 MB are free")),
     "recorder_drops": evidence(recording=pb.Recording(state="recording", drops={"fleet/red/sensor/line": 7})),
 }
@@ -94,11 +94,26 @@ def test_each_condition_has_its_cause_and_what_to_type(code: str) -> None:
     assert "{" not in found[0].todo
 
 
+@pytest.mark.parametrize(
+    ("mode", "later", "codes"),
+    [
+        ("tracking", [], ["refused"]),
+        ("manual", [], []),
+        ("tracking", [(1.0, pb.CommandEvent(verb="drive", phase="sent"))], []),
+        ("tracking", [(1.0, pb.CommandEvent(verb="led", phase="sent"))], ["refused"]),
+        ("tracking", [(1.0, pb.CommandEvent(verb="drive", phase="superseded"))], ["refused"]),
+    ],
+)
+def test_a_refusal_whose_cause_is_gone_is_no_finding(mode: str, later: list[Any], codes: list[str]) -> None:
+    now = with_states(mode=pb.Mode(asked=mode, inferred=mode, verdict="assumed"))
+    assert [each.code for each in diagnose(replace(now, commands=[refused("wrong_mode"), *later]))] == codes
+
+
 def test_the_likely_cause_comes_first_and_a_known_refusal_is_not_said_twice() -> None:
     lost = with_states(link=pb.Link(state="lost", reason="unplugged"), safety=ODD["held"].of("state/safety"))
     found = diagnose(replace(lost, commands=[refused("link_down")]))
     assert [each.code for each in found] == ["link_down", "held"]
-    other = diagnose(replace(lost, commands=[refused("wrong_mode")]))
+    other = diagnose(replace(lost, commands=[refused("battery_low")]))
     assert [each.code for each in other] == ["link_down", "held", "refused"]
 
 
