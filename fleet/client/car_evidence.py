@@ -9,6 +9,7 @@ from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
 from fleet.client.reading import MAX_STAMP_AHEAD_S
 from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
+from schemas.gen import fleet_v1_pb2 as pb
 
 _EVENT = topics.TOPICS["event/command"]
 
@@ -16,9 +17,10 @@ _EVENT = topics.TOPICS["event/command"]
 def collect(client: Fleet) -> dict[str, CarEvidence]:
     """Return the evidence of every car that is on the bus or that a supervisor starts a gateway for, by name."""
     present = client.cars()
+    supervisions = ask_status(client.bus, client.name)
     processes = {
         each.name: each
-        for status in ask_status(client.bus, client.name)
+        for status in supervisions
         for each in status.processes
         if each.kind == "gateway" and each.state != "ended"
     }
@@ -29,6 +31,8 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
                 states.setdefault(key.car, {})[key.topic] = reading.value
     commands = _commands(client)
     recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
+    if recording is None and (lost := [each.unrecorded for each in supervisions if each.unrecorded]):
+        recording = pb.Recording(state="failed", error=lost[0])
     assignment = next((each.value for each in client.get(f"{client.name}/{keys.COORDINATOR}/assignment")), None)
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {

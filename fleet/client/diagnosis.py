@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
+from fleet.client.services import why_unrecorded
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import person_of
 from schemas.local_time import clock
@@ -301,9 +302,8 @@ def _refused(e: CarEvidence) -> str:
 
 
 def _unrecorded(e: CarEvidence) -> str:
-    if e.recording is None or e.recording.state not in ("full", "failed"):
-        return ""
-    return f"The recorder is {e.recording.state}: {e.recording.error or e.recording.warning or 'see its log'}."
+    why = why_unrecorded(e.recording) if e.recording is not None else ""
+    return f"Nothing is recorded: {why}." if why else ""
 
 
 def _drops(e: CarEvidence) -> str:

@@ -30,6 +30,13 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     return None
 
 
+def why_unrecorded(status: Any) -> str:
+    """Return why the recorder of this fleet.v1.Recording writes nothing now. Empty if it records, or was stopped."""
+    if status.state not in ("full", "failed"):
+        return ""
+    return status.error or status.warning or f"the recorder is {status.state}"
+
+
 def ask_coordinator(client: Fleet, verb: str, plan_text: str = "", sender: str = "") -> Any:
     """Send a request to the coordinator. Return the first answer as of `send_command`, None if there is none.
 

@@ -50,7 +50,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
         if as_json:
             click.echo(messages.to_json(each))
             continue
-        where = f"recording to {each.session}" if each.session else "not recording"
+        where = f"recording to {each.session}" if each.session and not each.unrecorded else "not recording"
         what = each.fleet_file or "simulated cars"
         click.echo(
             f"{keys.describe_fleet(fleet)} ({what}): {each.state} for {timedelta(seconds=int(each.uptime_s))}, {where}"
@@ -63,7 +63,11 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
         with open_client(connect, fleet) as client:
             show_cars(client)
         for name, why in each.missing.items():
+            if name == keys.RECORDER and each.unrecorded:
+                continue
             click.echo(f"not ready: {name.lstrip('@')} ({why})")
+        if each.unrecorded:
+            click.echo(f"not recorded: {each.unrecorded}")
 
 
 def _describe_process(process: Any) -> str:
@@ -92,17 +96,20 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     results = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == "ended"
     bad = sorted(car for car, words in results.items() if is_bad_rest(words))
+    unrecorded = last.unrecorded if last is not None else ""
     if as_json:
-        click.echo(json.dumps({"ended": ended, "cars": results}))
+        click.echo(json.dumps({"ended": ended, "cars": results, "unrecorded": unrecorded}))
     else:
         for car, words in sorted(results.items()):
             click.echo(f"{car}: {words}", err=car in bad)
+        if unrecorded:
+            click.echo(f"not everything was recorded: {unrecorded}", err=True)
     if not ended:
         what = "ended without reporting" if gone else f"has not ended after {FLEET_DOWN_TIMEOUT_S:g} s"
         raise click.ClickException(
             f"`fleet up` {what}. Cars may still be moving: check them. Then `fleet status` and `fleet logs supervisor`."
         )
-    raise SystemExit(1 if bad else 0)
+    raise SystemExit(1 if bad or unrecorded else 0)
 
 
 def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:

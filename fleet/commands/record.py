@@ -10,7 +10,7 @@ from typing import Any, Final
 import click
 
 from fleet.client.client import default_sender
-from fleet.client.services import ask_recorder
+from fleet.client.services import ask_recorder, why_unrecorded
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
@@ -288,4 +288,6 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
     found = _query("mark", connect, fleet, text=text, by=by or default_sender(chosen_person()))
+    if why := why_unrecorded(found):
+        raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` says whether it is.")
     click.echo(f"marked in {found.session}")

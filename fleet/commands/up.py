@@ -23,6 +23,7 @@ from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
+from fleet.recording.writing.session_writer import Options, why_unwritable
 from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
@@ -51,7 +52,8 @@ end, fresh gateways try again until the next Ctrl-C.
 --detach returns when all cars are ready. It also returns if no further car becomes ready for 30 s (10 s if only links
 cannot be opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log, `fleet down` ends it.
 
-Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or nothing came up, 2 wrong use."""
+Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not, nothing came up, or not everything was
+recorded, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--sim", "simulated", type=Number(int, 1, MAX_SIMULATED_CARS),
@@ -122,6 +124,11 @@ def up(
         endpoint = resolve_endpoint(spec.endpoint)
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)
+        if spec.record and (why := why_unwritable(spec.recordings, Options())):
+            raise click.ClickException(
+                f"No session can be made in {spec.recordings}: {why}. "
+                "Name another place with --sessions, or drive without a recording: --no-record."
+            )
         try:
             stopped = asyncio.run(_serve(spec, file, options, as_json=as_json, detached=detached))
         except AnotherSupervisor as error:

@@ -68,6 +68,8 @@ class Console:
         self._view = FleetView(self._color_of)
         self._colors: Mapping[str, Rgb] = {}
         """The colors of the cars, as the running fleet says. `fleet reload` changes them."""
+        self._unrecorded = ""
+        """Why not everything is recorded, as the running fleet says."""
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
         """The course of the last STOP."""
@@ -121,7 +123,10 @@ class Console:
         return hex_color(self._colors.get(car) or car_color(car, index))
 
     def _on_status(self, sample: Sample) -> None:
-        if (found := message_in(sample, logging.WARNING)) is not None and (colors := colors_of(found[1])):
+        if (found := message_in(sample, logging.WARNING)) is None:
+            return
+        self._unrecorded = found[1].unrecorded
+        if colors := colors_of(found[1]):
             self._colors = colors
             self._view.update_colors()
 
@@ -219,6 +224,7 @@ class Console:
             "pages": len(self._pages),
             "cars": self._view.as_list(now),
             "stop": None if report is None else report.as_dict(),
+            "unrecorded": self._unrecorded,
         }
         return json.dumps(state, separators=(",", ":"))
 

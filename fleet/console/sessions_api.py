@@ -21,7 +21,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from fleet.aio import Fleet
-from fleet.client.services import ask_recorder
+from fleet.client.services import ask_recorder, why_unrecorded
 from fleet.console.guard import PERSON
 from fleet.console.pairing import PagePerson
 from fleet.console.request_body import read_start
@@ -100,6 +100,8 @@ class SessionsApi:
             return refuse("No recorder is on the bus. `fleet record` starts one; `fleet up` records by itself.")
         if isinstance(answer, Failure):
             return refuse(answer.words)
+        if verb == "mark" and (why := why_unrecorded(answer)):
+            return refuse(f"The mark is not in a file yet: {why}.")
         return JSONResponse(
             {
                 "ok": True,

@@ -16,6 +16,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
+from fleet.client.services import why_unrecorded
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missing, describe_old_stops, describe_start
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy
@@ -46,6 +47,8 @@ SUPERVISOR_HUB_RESTART_DELAY_S: Final = 0.3
 """Time without a link after which the supervisor restarts the hub: sooner than gateways start one (0.5 s)."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
 """Timeout for the recorder's first heartbeat. Gateways start after it, so that the recorder misses nothing."""
+RECORDER_LOST_S: Final = 2.0
+"""Time without a status of a recorder, which sends one each second, after which nothing is recorded."""
 STOP_QUERY_TIMEOUT_S: Final = 0.5
 SERVICE_EXIT_TIMEOUT_S: Final = 5.0
 CAR_STOP_RETRY_S: Final = 30.0
@@ -109,6 +112,10 @@ class Supervisor:
         self._sim_links: dict[str, str] = {}
         self._shown: object = None
         self._session = ""
+        self._recorder_heard_at = inf
+        """When the last status of a recorder of this fleet came."""
+        self._unrecorded = ""
+        """Why not everything is recorded, though it should be."""
         self._console = ""
         """Address of the web page."""
         self.starting = True
@@ -169,7 +176,7 @@ class Supervisor:
         finally:
             await self._leave()
             self._log.close()
-        return not self._shutdown.not_stopped
+        return not (self._shutdown.not_stopped or self._unrecorded)
 
     @property
     def log_path(self) -> Path:
@@ -191,6 +198,8 @@ class Supervisor:
             up = process.status.state in (RunState.RUNNING, RunState.ELSEWHERE)
             if process.kind is not ProcessKind.GATEWAY and not up:
                 result[process.name] = process.status.words or str(process.status.state)
+        if self._unrecorded:
+            result.setdefault(RECORDER, self._unrecorded)
         return result
 
     def _follow_start(self, now: float) -> None:
@@ -242,6 +251,14 @@ class Supervisor:
         elif hub.status.state is RunState.ELSEWHERE and is_lost and not await asyncio.to_thread(accepts, self.endpoint):
             hub.status.schedule(now)
 
+    def _check_recorder(self, now: float) -> None:
+        """Say that nothing is recorded if the recorder does not come up, and no other one of this fleet is heard."""
+        recorder = self.processes.get(RECORDER)
+        if recorder is None or self._shutdown_requested.is_set() or now < self._recorder_heard_at + RECORDER_LOST_S:
+            return
+        if recorder.status.state is not RunState.RUNNING:
+            self._set_unrecorded(recorder.status.words or f"the recorder is {recorder.status.state}")
+
     async def _leave(self) -> None:
         """Close the session, then end the hub. After an error, end all other processes too."""
         if self._service is not None:
@@ -256,7 +273,7 @@ class Supervisor:
     def _populate(self) -> None:
         if self._spec.record:
             self.processes.add(RECORDER, ProcessKind.RECORDER, spec.recorder_command(self._spec, self.endpoint))
-            self._gateways_from = self.processes.now + RECORDER_START_TIMEOUT_S
+            self._gateways_from = self._recorder_heard_at = self.processes.now + RECORDER_START_TIMEOUT_S
         if self._spec.simulated:
             command = spec.simulator_command(self._spec, self.processes.directory, self.endpoint)
             self.processes.add(SIMULATOR_PROCESS, ProcessKind.SIMULATOR, command)
@@ -349,6 +366,7 @@ class Supervisor:
         elif not linked and self._linked_since is not None:
             self._linked_since, self._unlinked_since = None, now
         await self._check_hub(now, linked=linked)
+        self._check_recorder(now)
         self._shutdown.turn(now)
         await self.processes.turn(self._listening_since, self._may_start, self._may_move)
         shown = [(process.name, process.status.state, process.status.restarts) for process in self.processes]
@@ -391,6 +409,8 @@ class Supervisor:
         if process.kind is ProcessKind.SIMULATOR:
             self._sim_asked.clear()
             remove_links(self.processes.directory)
+        if process.kind is ProcessKind.RECORDER and requested and process.code != 0:
+            self._set_unrecorded(process.why or f"the recorder ended with exit code {process.code}")
         if process.kind is not ProcessKind.GATEWAY:
             return
         row = self.rows.get(process.name)
@@ -406,8 +426,11 @@ class Supervisor:
 
     def _on_message(self, car: str, topic: str, value: Any) -> None:
         row = self.rows.get(car)
-        if car == RECORDER and self.processes.on_heartbeat(RECORDER):
-            self._gateways_from = self.processes.now
+        if car == RECORDER:
+            if self.processes.on_heartbeat(RECORDER):
+                self._gateways_from = self.processes.now
+            self._recorder_heard_at = self.processes.now
+            self._set_unrecorded(why_unrecorded(value))
         elif car == COORDINATOR:
             self._on_plan(value)
         elif row is not None and topic == "state/health":
@@ -423,6 +446,12 @@ class Supervisor:
                 self._say("car", car, words)
             if topic == "event/log":
                 self._say("log", car, row.event)
+
+    def _set_unrecorded(self, why: str) -> None:
+        """Say once that nothing is recorded any more, and that everything is again. The cars drive on."""
+        if bool(why) is not bool(self._unrecorded):
+            self._say("process", RECORDER, f"NOT RECORDED: {why}" if why else "records again")
+        self._unrecorded = why
 
     def _on_line(self, process: ManagedProcess, line: str) -> bool:
         """Handle a line of a process's stdout. Return False if it is a heartbeat, which no log needs."""
@@ -494,7 +523,8 @@ class Supervisor:
                 self.processes.end(process, grace)
                 await self._until_ended([process])
         await asyncio.wait([stop_query], timeout=SERVICE_EXIT_TIMEOUT_S)
-        self._say("end", SELF, describe_end(self._shutdown.results))
+        lost = f"; not everything was recorded: {self._unrecorded}" if self._unrecorded else ""
+        self._say("end", SELF, f"{describe_end(self._shutdown.results)}{lost}")
 
     async def _until_ended(self, processes: list[ManagedProcess]) -> None:
         while self._shutdown.pending or any(process.status.alive for process in processes):
@@ -526,6 +556,7 @@ class Supervisor:
             session=self._session,
             groups={name: ",".join(cars) for name, cars in self._spec.groups.items()},
             colors=self._spec.colors,
+            unrecorded=self._unrecorded,
         )
         for process in self.processes:
             life = process.status

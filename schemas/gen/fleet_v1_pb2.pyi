@@ -759,7 +759,7 @@ class Supervised(_message.Message):
     def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., since_s: _Optional[float] = ..., words: _Optional[str] = ...) -> None: ...
 
 class Supervision(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "host", "pid", "uptime_s", "fleet_file", "directory", "processes", "became", "missing", "session", "groups", "colors")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "host", "pid", "uptime_s", "fleet_file", "directory", "processes", "became", "missing", "session", "groups", "colors", "unrecorded")
     class BecameEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -804,6 +804,7 @@ class Supervision(_message.Message):
     SESSION_FIELD_NUMBER: _ClassVar[int]
     GROUPS_FIELD_NUMBER: _ClassVar[int]
     COLORS_FIELD_NUMBER: _ClassVar[int]
+    UNRECORDED_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -820,7 +821,8 @@ class Supervision(_message.Message):
     session: str
     groups: _containers.ScalarMap[str, str]
     colors: _containers.ScalarMap[str, str]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., uptime_s: _Optional[float] = ..., fleet_file: _Optional[str] = ..., directory: _Optional[str] = ..., processes: _Optional[_Iterable[_Union[Supervised, _Mapping]]] = ..., became: _Optional[_Mapping[str, str]] = ..., missing: _Optional[_Mapping[str, str]] = ..., session: _Optional[str] = ..., groups: _Optional[_Mapping[str, str]] = ..., colors: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    unrecorded: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., uptime_s: _Optional[float] = ..., fleet_file: _Optional[str] = ..., directory: _Optional[str] = ..., processes: _Optional[_Iterable[_Union[Supervised, _Mapping]]] = ..., became: _Optional[_Mapping[str, str]] = ..., missing: _Optional[_Mapping[str, str]] = ..., session: _Optional[str] = ..., groups: _Optional[_Mapping[str, str]] = ..., colors: _Optional[_Mapping[str, str]] = ..., unrecorded: _Optional[str] = ...) -> None: ...
 
 class DownCommand(_message.Message):
     __slots__ = ("sender", "kind", "id")

@@ -19,6 +19,8 @@ import pytest
 
 from fleet.client.supervision import ask_status
 from schemas import bus, keys
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, freeze, wait_for
 from tests.support.up import Up, fleet_command
@@ -576,6 +578,46 @@ def test_wrong_use_starts_nothing(
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_takes_no_recording_is_refused_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    done = fleet_command("up", "--sim", "1", "--sessions", str(tmp_path / "file" / "sessions"), environment={})
+    assert done.returncode == 1
+    assert str(tmp_path / "file" / "sessions") in done.stderr
+    assert "--no-record" in done.stderr
+
+
+def test_a_recording_that_pauses_is_said_by_up_status_doctor_and_down(tmp_path: Path) -> None:
+    """The status is what the recorder of a full disk publishes (tests/fleet/recording/scenarios/test_disk.py)."""
+    with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as up:
+        up.until("ready", "@supervisor", "red is ready")
+        recorder = up.bus.publisher("fleet/@recorder/status", TOPICS["@recorder/status"], keys.RECORDER)
+
+        def publish(state: str, error: str = "") -> None:
+            recorder.put(pb.Recording(state=state, error=error), time.time_ns())
+
+        publish("full", "0.1 MB are left")
+        up.until("process", "@recorder", "0.1 MB are left")
+        assert "0.1 MB are left" in up.status().unrecorded
+        status = up.fleet("status")
+        assert "0.1 MB are left" in status.stdout
+        (odd,) = json.loads(up.fleet("doctor", "red", "--json").stdout)["findings"]
+        assert odd["code"] == "not_recorded"
+        assert up.fleet("drive", "red", "forward", "--for", "200ms").returncode == 0, "the cars drive on"
+        publish("recording")
+        up.until("process", "@recorder", "records again")
+        assert up.status().unrecorded == ""
+        publish("failed", "it was unplugged")
+        up.until("process", "@recorder", "it was unplugged")
+        down = up.fleet("down")
+        assert down.returncode == 1
+        assert "red: stopped" in down.stdout
+        assert "it was unplugged" in down.stderr
+        assert up.process.wait() == 1
 
 
 def _file(directory: Path, **links: str) -> Path:

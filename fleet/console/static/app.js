@@ -141,6 +141,7 @@ class App extends Component {
       ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
       ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired} <a href="/pair">${t.pairAgain}</a></p>`}
       ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
+      ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
       <${Paused} cars=${state?.cars ?? []} />
       <main id="content" tabindex="-1">
         ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}

@@ -75,6 +75,7 @@ export const t = {
   shows: { no: "no:", not_known_yet: "not known yet:", doubt: "in doubt, no plan uses it:" },
   consoleLost: "The console does not answer. A car that you drove stops by itself. STOP is still sent; look at the cars.",
   hubLost: "The console has lost the bus. What the cards show is old, and a STOP may not arrive: look at the cars.",
+  unrecorded: (why) => `Nothing is recorded: ${why}`,
   stopUnsent: "STOP has not reached the console. Go to the cars, or type `fleet stop` in a terminal.",
   stop: "STOP all cars",
   stopKeys: "Escape, or Space",

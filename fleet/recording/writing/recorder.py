@@ -368,7 +368,7 @@ class Recorder:
             free_bytes=session.free_bytes,
             error=self._error
             or session.cost
-            or (f"{session.full}; {session.waiting} messages wait" if session.full else ""),
+            or (f"{session.full.rstrip('.')}; {session.waiting} messages wait" if session.full else ""),
             missed=session.missed,
             recovered=session.recovered,
             segments=session.segments,
@@ -449,3 +449,4 @@ class Recorder:
         self._marks.put(message, now)
         with contextlib.suppress(OSError):  # the disk is full: the bus has the mark, and `close` writes it
             self._session.mark(text, by, now)
+        self._last = self._status()

@@ -4,7 +4,9 @@ All methods are called from one thread. The module knows no bus and starts no th
 """
 
 import contextlib
+import os
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -34,6 +36,8 @@ MIN_START_BYTES: Final = 500_000
 """Minimum free space above the reserve to begin a session."""
 MAX_RESUME_BYTES: Final = 50 * MB
 """Maximum space above the reserve to wait for before resuming. With less, the disk fills again at once."""
+PROBE_BYTES: Final = 4096
+"""Size of the file that tries whether a directory takes files: a block of most disks."""
 MIN_CLOSE_BYTES: Final = 200_000
 """Minimum free space to write the end of a session: the index of its last file needs it."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
@@ -72,6 +76,25 @@ class Options:
     def session_limit(self) -> int:
         """Return the maximum size of one session in bytes; 0 is no limit."""
         return self.session_bytes or self.root_bytes // SESSIONS_PER_QUOTA
+
+
+def why_unwritable(root: Path, options: Options) -> str:
+    """Return why no session can begin in this directory, which is made if it is missing. Empty if one can."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=root) as file:
+            file.write(bytes(PROBE_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+        free, needed = retention.free_bytes_for(root), options.keep_free_bytes + MIN_START_BYTES
+    except OSError as error:
+        return error.strerror or str(error)
+    return "" if free >= needed else describe_shortage(free, needed)
+
+
+def describe_shortage(free_bytes: int, needed_bytes: int) -> str:
+    """Return how much space is missing, in words."""
+    return f"{free_bytes / MB:.1f} MB are left on the disk, {needed_bytes / MB:.1f} MB are needed"
 
 
 class KeyState:
@@ -338,7 +361,7 @@ class SessionWriter:
             room_bytes += len(self._unflushed[0][2])
         if free < room_bytes:
             if not self.full:
-                self._pause(f"{free / MB:.1f} MB are left on the disk, {room_bytes / MB:.1f} MB are needed")
+                self._pause(describe_shortage(free, room_bytes))
             return False
         made = self._made
         try:

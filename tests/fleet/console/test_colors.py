@@ -1,6 +1,7 @@
-"""The console on a real bus, without its pages: each car has the color of the running fleet."""
+"""The console on a real bus, without its pages: it shows the colors of the running fleet, and what it says."""
 
 import asyncio
+import json
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -43,7 +44,8 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_aft
                 return [each["color"] for each in console._view.as_list(0.0)]
 
             def reloaded() -> bool:
-                statuses.put(pb.Supervision(colors={"red": "#040506"}), time.time_ns())
+                status = pb.Supervision(colors={"red": "#040506"}, unrecorded="0.1 MB are left")
+                statuses.put(status, time.time_ns())
                 return colors() == ["#040506"]
 
             await asyncio.to_thread(wait_for, reaches_the_supervisor, "the hub knows who has the status")
@@ -57,6 +59,7 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_aft
                 reply_message(query, KEY, pb.Supervision(colors={"red": "#010203"}), as_json=False)
             assert await asyncio.to_thread(wait_for, colors, "red is there") == ["#010203"]
             assert await asyncio.to_thread(wait_for, reloaded, "the color changes")
+            assert json.loads(console._state(0.0))["unrecorded"] == "0.1 MB are left"
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
             await console.close()

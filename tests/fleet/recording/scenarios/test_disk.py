@@ -238,7 +238,9 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lyin
             out.put(pb.Range(range_m=1.0), time.time_ns())
         wait_for(lambda: status(bus).messages > 100, "those wait")
         assert list(there.root.glob("*")) == []
-        assert fleet(endpoint, "mark", "full").returncode == 0
+        marked = fleet(endpoint, "mark", "full")
+        assert marked.returncode == 1
+        assert status(bus).error.partition(";")[0] in marked.stderr, "why it is not in a file yet"
         there.free()
         wait_for(lambda: status(bus).state == "recording", "it records")
         process.send_signal(signal.SIGTERM)
