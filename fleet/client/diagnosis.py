@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
+from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import person_of
@@ -350,10 +351,12 @@ CHECKS: Final = (
 """The table of findings, the likeliest cause first."""
 
 
-def diagnose(evidence: CarEvidence) -> list[DoctorFinding]:
-    """Return what is odd, the likeliest cause first. Empty if nothing is."""
+def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
+    """Return what is odd, the likeliest cause first. Empty if nothing is. options: what proposed commands need."""
     found = [
-        DoctorFinding(check.code, cause, check.todo.format(car=evidence.car))
+        DoctorFinding(
+            check.code, complete_hints(cause, options), complete_command(check.todo.format(car=evidence.car), options)
+        )
         for check in CHECKS
         if (cause := check.cause(evidence))
     ]
@@ -404,9 +407,9 @@ def describe_reports(health: Any) -> str:
     return f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
 
 
-def as_dict(evidence: CarEvidence) -> dict[str, Any]:
-    """Return the findings and what is known, for JSON."""
-    found = [asdict(finding) for finding in diagnose(evidence)]
+def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:
+    """Return the findings and what is known, for JSON. options: as for `diagnose`."""
+    found = [asdict(finding) for finding in diagnose(evidence, options)]
     return {"car": evidence.car, "findings": found, "facts": dict(describe(evidence))}
 
 

@@ -8,8 +8,9 @@ from typing import Final
 import click
 
 from fleet.client.car_evidence import collect
-from fleet.client.client import Fleet
 from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe, diagnose
+from fleet.commands.fleets import open_client
+from fleet.commands.group import hint_options, say
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import SessionPath, complete_car, no_cars
 from fleet.commands.sessions import watched
@@ -49,7 +50,8 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
         _show_session(session, car or "", as_json=as_json)
     if car is not None:
         raise click.UsageError(f'"{name}" is no session, and a second name needs one: fleet doctor SESSION CAR')
-    with Fleet(connect, fleet, kind="person") as client:
+    named = (name,) if name is not None else ()
+    with open_client(connect, fleet, named) as client:
         found = collect(client)
         if not found:
             raise no_cars(client)
@@ -57,10 +59,10 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
             near = did_you_mean(name, found) or f"Cars: {', '.join(found)}."
             raise click.ClickException(f'No car or session "{name}". {near}')
     cars = list(found.values()) if name is None else [found[name]]
-    odd = [diagnose(evidence) for evidence in cars]
+    odd = [diagnose(evidence, hint_options()) for evidence in cars]
     for evidence, findings in zip(cars, odd, strict=True):
         if as_json:
-            click.echo(json.dumps(as_dict(evidence)))
+            click.echo(json.dumps(as_dict(evidence, hint_options())))
         elif name is None:
             click.echo(_first_line(evidence.car, findings))
         else:
@@ -113,4 +115,4 @@ def _show(findings: Sequence[DoctorFinding], facts: Iterable[tuple[str, str]]) -
     if further := findings[1 : 1 + MAX_FURTHER_FINDINGS]:
         click.echo(f"  also: {' '.join(map(str, further))}")
     for name, words in facts:
-        click.echo(f"  {name:11} {words}")
+        say(f"  {name:11} {words}")

@@ -1,7 +1,8 @@
 """`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Final, Never
 
 import click
 
@@ -16,7 +17,10 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.outcome import Outcome
+from fleet.commands.fleets import in_all_fleets
+from fleet.commands.group import chosen_person
 from fleet.commands.options import (
+    bus_options,
     carry_out,
     end_with,
     json_option,
@@ -81,29 +85,47 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 @click.command(epilog="\b\nexamples:\n  fleet stop\n  fleet stop red blue")
 @any_cars_argument
 @json_option
-@with_client
-def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
+@bus_options
+def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Stop these cars now (no name: all). A running plan leaves them alone until you drive or resume them.
 
-    `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
+    Of several fleets on one bus, every one that could be meant is stopped. `fleet estop` also makes cars refuse every
+    command. `fleet mode CAR manual` stops without a hold.
     """
-    request = stop_request()
-    end_with(client, [*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json)
+    _stop(connect, fleet, cars, lambda _: stop_request(), as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
 @any_cars_argument
 @click.option("--why", default="", metavar="WORDS", help="What happened, for the record.")
 @json_option
-@with_client
-def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> None:
+@bus_options
+def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
 
-    `fleet resume --estops` releases them. `fleet stop` is for every day: cars obey again at once.
+    Of several fleets on one bus, every one that could be meant. `fleet resume --estops` releases them. `fleet stop` is
+    for every day: cars obey again at once.
     """
-    named = _named(client, cars)
-    request = estop_request(why, "fleet" if named is None else "car")
-    end_with(client, [*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
+    _stop(connect, fleet, cars, lambda named: estop_request(why, "fleet" if named is None else "car"), as_json=as_json)
+
+
+def _stop(
+    connect: str | None,
+    fleet: str,
+    cars: tuple[str, ...],
+    request_for: Callable[[list[str] | None], CommandRequest],
+    *,
+    as_json: bool,
+) -> Never:
+    """Stop the cars in every fleet that the command could mean. request_for: makes the request for the named cars."""
+
+    def act(there: Fleet) -> list[Outcome]:
+        named = _named(there, cars)
+        request = request_for(named)
+        return [*there.ask(request, named), *_strangers(there, request, cars)]
+
+    with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
+        end_with(client, in_all_fleets(client, connect, cars, act), as_json=as_json)
 
 
 @click.command(

@@ -7,11 +7,14 @@ from typing import Any, Final
 import click
 from click.core import ParameterSource
 
+from fleet.client.hints import complete_hints
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.suggestion import did_you_mean
 
 PERSON: Final = "fleet.person"
 """Key of the value of --as in the context."""
+_BUS: Final = "fleet.bus"
+"""Key of the chosen bus and fleet in the context."""
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -71,6 +74,24 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
     """Return the option --fleet. Without a default the fleet file has the name."""
     words = "Name of the fleet." if default else f"Name of the fleet (default: the file's, or {DEFAULT_FLEET})."
     return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)
+
+
+def choose_fleet(connect: str | None, fleet: str) -> None:
+    """Remember by which options the user reaches the fleet, for the commands that messages propose."""
+    click.get_current_context().meta[_BUS] = (f"--connect {connect}" if connect else "", fleet)
+
+
+def hint_options(fleet: str = "") -> str:
+    """Return the options that a proposed command needs. fleet: another one than that of the running command."""
+    context = click.get_current_context(silent=True)
+    connect, chosen = context.meta.get(_BUS, ("", DEFAULT_FLEET)) if context is not None else ("", DEFAULT_FLEET)
+    name = fleet or chosen
+    return " ".join(filter(None, (connect, "" if name == DEFAULT_FLEET else f"--fleet {name}")))
+
+
+def say(words: str, *, err: bool = False, fleet: str = "") -> None:
+    """Print words for a person. Each command that they propose gets the options that it needs."""
+    click.echo(complete_hints(words, hint_options(fleet)), err=err)
 
 
 def starter_option() -> _Decorator:

@@ -12,11 +12,12 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client.claims import is_bad_rest
-from fleet.client.client import default_sender
+from fleet.client.client import Fleet, default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
-from fleet.commands.group import chosen_person
+from fleet.commands.fleets import the_fleet
+from fleet.commands.group import chosen_person, say
 from fleet.commands.observe import show_cars
-from fleet.commands.options import bus_options, json_option, not_running, open_client
+from fleet.commands.options import bus_options, json_option, not_running
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from schemas import keys, messages
@@ -43,6 +44,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
     """Show fleet and session, then the cars, then the services that are not running as they should."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
+        fleet = the_fleet(bus, fleet)
         found = ask_status(bus, fleet)
         if not found:
             raise not_running(fleet)
@@ -60,14 +62,14 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
             for process in each.processes:
                 click.echo(_describe_process(process))
             continue
-        with open_client(connect, fleet) as client:
+        with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
             show_cars(client)
         for name, why in each.missing.items():
             if name == keys.RECORDER and each.unrecorded:
                 continue
-            click.echo(f"not ready: {name.lstrip('@')} ({why})")
+            say(f"not ready: {name.lstrip('@')} ({why})")
         if each.unrecorded:
-            click.echo(f"not recorded: {each.unrecorded}")
+            say(f"not recorded: {each.unrecorded}")
 
 
 def _describe_process(process: Any) -> str:
@@ -86,6 +88,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         received: list[Any] = []
+        fleet = the_fleet(bus, fleet)
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
         sender = default_sender(chosen_person())
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
@@ -101,7 +104,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         click.echo(json.dumps({"ended": ended, "cars": results, "unrecorded": unrecorded}))
     else:
         for car, words in sorted(results.items()):
-            click.echo(f"{car}: {words}", err=car in bad)
+            say(f"{car}: {words}", err=car in bad)
         if unrecorded:
             click.echo(f"not everything was recorded: {unrecorded}", err=True)
     if not ended:
@@ -141,13 +144,14 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Read the fleet file again and apply changes of cars and plan. Says which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
+        fleet = the_fleet(bus, fleet)
         answer = ask_service(bus, fleet, "reload", default_sender(chosen_person()))
         if answer is None:
             raise not_running(fleet)
     if as_json:
         click.echo(messages.to_json(answer))
     else:
-        click.echo(answer.words, err=answer.status != "sent")
+        say(answer.words, err=answer.status != "sent")
     raise SystemExit({"rejected": 2, "failed": 1}.get(answer.status, 0))
 
 
@@ -193,6 +197,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
     """Return the log directory of the running fleet if it is on this machine, else of the last run."""
     try:
         with Bus.open(connect) as bus:
+            fleet = the_fleet(bus, fleet)
             for each in ask_status(bus, fleet):
                 if Path(each.directory).is_dir():
                     return Path(each.directory)

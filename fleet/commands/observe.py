@@ -16,7 +16,9 @@ from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySur
 from fleet.client.reading import Reading, Watch
 from fleet.client.supervision import ask_colors
 from fleet.client.wait import NotInTime
-from fleet.commands.options import bus_options, json_option, open_client, with_client
+from fleet.commands.fleets import open_client, open_observer
+from fleet.commands.group import say
+from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
 from fleet.commands.params import (
     Duration,
@@ -109,7 +111,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
         if row["doubted"]:
-            click.echo(f"fleet: {row['shows_stops_words']}. {describe_end_of_doubt(row['car'])}", err=True)
+            say(f"fleet: {row['shows_stops_words']}. {describe_end_of_doubt(row['car'])}", err=True)
 
 
 def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -> dict[str, Any]:
@@ -242,7 +244,7 @@ def get(
     why_not = history.describe_missing_history(under) if past else ""
     if why_not:
         raise click.UsageError(why_not)
-    with open_client(connect, fleet) as client:
+    with open_observer(connect, fleet, keyexpr) as client:
         readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
@@ -266,7 +268,7 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
     limit = _MAX_SHORTFALL_LINES
     more = [f"and {len(lines) - limit} more likewise"] if len(lines) > limit + 1 else lines[limit : limit + 1]
     for words in (*lines[:limit], *more):
-        click.echo(f"fleet: {words}", err=True)
+        say(f"fleet: {words}", err=True)
 
 
 @click.command(
@@ -287,7 +289,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     written = check_key(written_out(keyexpr, fleet))
     if when is not None:
         KeyCondition.of(when, written)
-    with open_client(connect, fleet) as client:
+    with open_observer(connect, fleet, keyexpr) as client:
         warn_if_missing(written, client.cars())
         reported = shown = 0
         with client.watch(keyexpr, when=when) as readings:
@@ -325,7 +327,7 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
-    with open_client(connect, fleet) as client:
+    with open_observer(connect, fleet, keyexpr or "") as client:
         found = _alive(client, written, look_s)
         if not found:
             what = f"under {written[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
@@ -440,7 +442,7 @@ def wait(
     KeyCondition.of(condition, written)
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
         raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
-    with open_client(connect, fleet) as client:
+    with open_observer(connect, fleet, keyexpr) as client:
         warn_if_missing(written, client.cars())
         try:
             reading = client.wait(keyexpr, condition, timeout_s=timeout_s, for_s=for_s or 0.0)

@@ -11,8 +11,10 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
+from fleet.client.hints import complete_hints
 from fleet.client.outcome import NO_ANSWER, Outcome
-from fleet.commands.group import as_option, chosen_person, connect_option, fleet_option
+from fleet.commands.fleets import open_client
+from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
@@ -34,6 +36,7 @@ def bus_options(function: _Function) -> _Function:
     @as_option(complete_people)
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
+        choose_fleet(options["connect"], options["fleet"])
         with cli_errors():
             return function(*args, **options)
 
@@ -46,15 +49,11 @@ def with_client(function: _Function) -> _Function:
     @bus_options
     @functools.wraps(function)
     def command(*args: Any, connect: str | None, fleet: str, **options: Any) -> Any:
-        with open_client(connect, fleet) as client:
+        named = options.get("cars") or options.get("car") or ()
+        with open_client(connect, fleet, [named] if isinstance(named, str) else named) as client:
             return function(client, *args, **options)
 
     return command
-
-
-def open_client(connect: str | None, fleet: str) -> Fleet:
-    """Open the client of the person whom --as or FLEET_AS names."""
-    return Fleet(connect, fleet, kind="person", person=chosen_person())
 
 
 def not_running(fleet: str) -> click.ClickException:
@@ -74,13 +73,16 @@ def cli_errors() -> Iterator[None]:
     """Turn errors of a user into click's errors: exit code 2 for wrong use, 1 for a failure."""
     try:
         yield
+    except click.ClickException as error:
+        vars(error)["message"] = complete_hints(error.message, hint_options())  # click declares it final
+        raise
     except (BadEndpoint, ValueError) as error:  # BadKey is a ValueError
         # A BadFile of schemas.yaml_document. Its import would slow down every other command.
         if hasattr(error, "problems"):
             raise WrongFile(str(error)) from None
-        raise click.UsageError(str(error)) from None
+        raise click.UsageError(complete_hints(str(error), hint_options())) from None
     except BusError as error:
-        raise click.ClickException(str(error)) from None
+        raise click.ClickException(complete_hints(str(error), hint_options())) from None
 
 
 take_option = click.option("--take", is_flag=True, help="Take the car over from another person.")
@@ -114,4 +116,4 @@ def print_outcomes(outcomes: Iterable[Outcome], *, as_json: bool) -> None:
         if as_json:
             click.echo(json.dumps(asdict(outcome)))
         else:
-            click.echo(str(outcome), err=not outcome.ok)
+            say(str(outcome), err=not outcome.ok, fleet=outcome.car.rpartition("/")[0])

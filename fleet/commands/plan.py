@@ -16,8 +16,9 @@ from fleet.client.client import Fleet
 from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
-from fleet.commands.group import CommandGroup
-from fleet.commands.options import WrongFile, bus_options, json_option, open_client, with_client
+from fleet.commands.fleets import open_client
+from fleet.commands.group import CommandGroup, say
+from fleet.commands.options import WrongFile, bus_options, json_option, with_client
 from fleet.commands.params import SessionPath, complete_car
 from fleet.policy.requests import PlanRequest
 from schemas import keys
@@ -59,7 +60,7 @@ def why(
             )
         explain_session(subjects[0], session, at, as_json=as_json)
         return
-    with open_client(connect, fleet) as client:
+    with open_client(connect, fleet, subjects) as client:
         _explain_now(client, subjects, as_json=as_json)
 
 
@@ -72,7 +73,7 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
             raise click.ClickException(_no_plan(client))
         for car, deeds in people.items():
             words = "; ".join(deeds)
-            click.echo(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
+            say(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
         return
     for subject in subjects or sorted(found):
         reading = found.get(subject) or found.get(f"role {subject}")
@@ -85,7 +86,7 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
             claimed = None if claim is None else claim.as_dict()
             click.echo(json.dumps(reading.as_dict() | {"people": deeds, "motors": claimed}))
         else:
-            click.echo(_describe(reading, deeds, claim))
+            say(_describe(reading, deeds, claim))
 
 
 def _no_plan(client: Fleet) -> str:
@@ -197,7 +198,7 @@ def show(client: Fleet, *, as_json: bool) -> None:
         return
     by = f", set by {in_force.set_by}" if in_force.set_by else ""
     state = f"stopped by {stopped_by}. `fleet plan restart` starts it again" if stopped_by else "running"
-    click.echo(f"Plan {in_force.version}{by}: {state}.")
+    say(f"Plan {in_force.version}{by}: {state}.")
     if plan.phases:
         click.echo(f"phase: {phase or '-'} (of {', '.join(plan.phases)})")
     for name, role in plan.roles.items():
@@ -249,7 +250,7 @@ def _request(client: Fleet, verb: str, plan_text: str = "", *, as_json: bool, so
     if as_json:
         click.echo(json.dumps({"status": result.status, "reason": result.reason, "words": words}))
     elif ok:
-        click.echo(words)
+        say(words)
     else:
         raise (WrongFile if wrong else click.ClickException)(words)
     raise SystemExit(0 if ok else 2 if wrong else 1)

@@ -11,7 +11,8 @@ import click
 
 from fleet.client.client import default_sender
 from fleet.client.services import ask_recorder, why_unrecorded
-from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, starter_option
+from fleet.commands.fleets import the_fleet
+from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
@@ -222,6 +223,7 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
     """Send a command to the recorder and return its status. Raises click's errors."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
+        fleet = the_fleet(bus, fleet)
         answer = ask_recorder(bus, fleet, verb, **fields)
         if isinstance(answer, Failure):
             raise click.ClickException(f"the recorder says: {answer.words}")
@@ -250,7 +252,7 @@ def _show_status(found: Any, *, as_json: bool) -> None:
         click.echo(f"{sum(found.recovered.values())} were missed at first and had again from their publishers")
     for words in (found.error, found.warning):
         if words:
-            click.echo(words)
+            say(words)
 
 
 @record.command(epilog="\b\nexample:\n  fleet record start")

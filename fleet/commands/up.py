@@ -16,7 +16,8 @@ from typing import Final
 
 import click
 
-from fleet.commands.group import connect_option, fleet_option
+from fleet.client.hints import complete_hints
+from fleet.commands.group import choose_fleet, connect_option, fleet_option
 from fleet.commands.options import cli_errors
 from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
@@ -113,6 +114,7 @@ def up(
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
         spec = read(file, options)
+        choose_fleet(spec.endpoint if resolve_endpoint(spec.endpoint) != resolve_endpoint() else None, spec.fleet)
         for warning in spec.warnings:
             click.echo(f"fleet: {warning}", err=True)
         if not spec.cars:
@@ -217,7 +219,7 @@ def _follow_start(child: "subprocess.Popen[str]", *, as_json: bool) -> int:
             if as_json and ended:
                 click.echo(line, nl=False)
             elif ended:
-                click.echo(f"{words} `fleet down` ends it.", err=what == MISSING)
+                click.echo(words, err=what == MISSING)
             elif what in ("hold", "end"):
                 click.echo(f"{event['name']}: {words}", err=True)
             if ended:
@@ -244,6 +246,8 @@ async def _serve(
     def tell(event: SupervisorEvent) -> None:
         if detached and not supervisor.starting:  # the event is in the supervisor's log
             return
+        if detached and event.what in (READY, MISSING):
+            event = replace(event, words=complete_hints(f"{event.words} `fleet down` ends it.", supervisor.options))
         _written(write, event) if table is None else table.on_event(event)
         if detached and event.what in (READY, MISSING):
             _append_output_to(supervisor.log_path)

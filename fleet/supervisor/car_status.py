@@ -196,14 +196,14 @@ def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str
     return f"{words} Console: {console}" if console else words
 
 
-def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "") -> str:
+def describe_old_stops(car: str, safety: Any, began_s: float) -> str:
     """Describe a hold and e-stops older than `began_s` (s since the epoch). Return an empty string if there are none.
 
-    safety: a fleet.v1.Safety. options: options of `fleet resume` that select this fleet.
+    safety: a fleet.v1.Safety.
     """
     estops = [each for each in safety.estops if each.stamp.ToDatetime(UTC).timestamp() < began_s]
     held = safety.HasField("hold") and safety.hold.since.ToDatetime(UTC).timestamp() < began_s
-    resume = f"fleet resume {car}{options}"
+    resume = f"fleet resume {car}"
     words = []
     if estops:
         first = estops[0]
@@ -214,7 +214,7 @@ def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "")
         words.append(f"on hold by {safety.hold.by} since {_date(safety.hold.since)}: no plan moves {car}")
     if not words:
         return ""
-    ends = " and then ".join([f"{resume} --estops"] * bool(estops) + [resume] * held)
+    ends = " and then ".join([f"`{resume} --estops`"] * bool(estops) + [f"`{resume}`"] * held)
     return f"{'; '.join(words)}. To end that: {ends}"
 
 

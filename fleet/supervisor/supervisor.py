@@ -16,6 +16,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
+from fleet.client.hints import complete_hints
 from fleet.client.services import why_unrecorded
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missing, describe_old_stops, describe_start
@@ -400,10 +401,11 @@ class Supervisor:
     # ------------------------------------------------------------------ callbacks
 
     @property
-    def _options(self) -> str:
+    def options(self) -> str:
         """The options that select this fleet in a command."""
-        name = "" if self._spec.fleet == DEFAULT_FLEET else f" --fleet {self._spec.fleet}"
-        return name if self.endpoint == resolve_endpoint() else f"{name} --connect {self.endpoint}"
+        name = "" if self._spec.fleet == DEFAULT_FLEET else f"--fleet {self._spec.fleet}"
+        connect = "" if self.endpoint == resolve_endpoint() else f"--connect {self.endpoint}"
+        return " ".join(filter(None, (name, connect)))
 
     def _on_exit(self, process: ManagedProcess, requested: bool) -> None:  # noqa: FBT001 - called by ProcessSet
         if process.kind is ProcessKind.SIMULATOR:
@@ -440,7 +442,7 @@ class Supervisor:
         elif row is not None:
             if topic == "state/safety" and not row.safety_received:
                 row.safety_received = True
-                if words := describe_old_stops(car, value, self._began_wall_s, self._options):
+                if words := describe_old_stops(car, value, self._began_wall_s):
                     self._say("hold", car, words)
             if words := row.take(topic, value, time.monotonic()):
                 self._say("car", car, words)
@@ -619,6 +621,7 @@ class Supervisor:
         return "\n".join([*(words or ["nothing has changed"]), *found.spec.warnings])
 
     def _say(self, what: str, name: str, words: str) -> None:
+        words = complete_hints(words, self.options)
         if self._log is not None and what not in _LOGGED_ELSEWHERE:
             self._log.add(f"{name}: {words}", time.time())
         self._on_event(SupervisorEvent(what, name, words))

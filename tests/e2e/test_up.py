@@ -227,7 +227,7 @@ def test_a_hold_of_an_earlier_run_is_told_at_the_start_with_how_to_end_it(tmp_pa
     assert "| red: on hold by mia" in fleet_command("logs", "supervisor", environment=environment).stdout
     with Up(tmp_path, endpoint, "--sim", "1", "--no-record") as started:
         said = started.until("hold", "red", "on hold by mia since ")
-        assert said["words"].endswith(" no plan moves red. To end that: fleet resume red")
+        assert said["words"].endswith(" no plan moves red. To end that: `fleet resume red`")
         assert started.fleet("resume", "red").returncode == 0
         assert not started.get("red/state/safety").HasField("hold")
 

@@ -139,30 +139,27 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
         (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # a hold of this run
         (
             pb.Safety(hold=MIAS),
-            (
-                f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
-                "To end that: fleet resume red --fleet lab"
-            ),
+            (f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. To end that: `fleet resume red`"),
         ),
         (
             pb.Safety(hold=MIAS, estops=[BOBS]),
             (
                 f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)}: red only accepts stops; "
                 f"on hold by mia since {date_and_clock(YESTERDAY)}: no plan moves red. "
-                "To end that: fleet resume red --fleet lab --estops and then fleet resume red --fleet lab"
+                "To end that: `fleet resume red --estops` and then `fleet resume red`"
             ),
         ),
         (
             pb.Safety(estops=[BOBS, BOBS]),
             (
                 f"e-stopped by bob (smoke) since {date_and_clock(YESTERDAY + 60)} and 1 more: red only accepts stops. "
-                "To end that: fleet resume red --fleet lab --estops"
+                "To end that: `fleet resume red --estops`"
             ),
         ),
     ],
 )
 def test_what_keeps_a_car_still_from_an_earlier_day_is_told_with_how_to_end_it(safety: pb.Safety, words: str) -> None:
-    assert describe_old_stops("red", safety, TODAY, " --fleet lab") == words
+    assert describe_old_stops("red", safety, TODAY) == words
 
 
 def test_the_rate_is_what_came_over_some_seconds() -> None:

@@ -1,0 +1,29 @@
+"""Puts the options that select a fleet into the commands that messages propose. Pure.
+
+Messages propose commands in backticks: `fleet stop red`. They come from gateways, services and this computer. Only the
+command that prints them knows how its user reaches the fleet.
+"""
+
+import re
+from typing import Final
+
+WITHOUT_BUS: Final = frozenset(
+    ("bind", "check", "demo", "example", "init", "plan try", "play", "replay", "scan", "schema", "sessions", "sim")
+)
+"""Commands that take no --fleet."""
+_PROPOSED: Final = re.compile(r"`(fleet [a-z][^`]*)`")
+
+
+def complete_hints(words: str, options: str) -> str:
+    """Add the options to each command in backticks that needs them. options: such as `--fleet two`; may be empty."""
+    if not options or "`fleet " not in words:
+        return words
+    return _PROPOSED.sub(lambda found: f"`{complete_command(found[1], options)}`", words)
+
+
+def complete_command(command: str, options: str) -> str:
+    """Add the options to one command such as `fleet stop red`, unless it takes none or has one of them already."""
+    _, verb, *more = command.split()
+    is_without = verb in WITHOUT_BUS or f"{verb} {more[0] if more else ''}" in WITHOUT_BUS
+    has_one = any(word.startswith("--") and word in more for word in options.split())
+    return command if is_without or has_one or not options else f"{command} {options}"

@@ -1,0 +1,127 @@
+"""Which fleet a command means, where several are on one bus and nobody has named one."""
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import click
+from click.core import ParameterSource
+
+from fleet.client.client import Fleet
+from fleet.client.outcome import NO_ANSWER, Outcome
+from fleet.commands.group import choose_fleet, chosen_person
+from fleet.commands.params import ALL_CARS
+from schemas import keys
+from schemas.bus import Bus
+
+
+def fleets_on(bus: Bus) -> dict[str, set[str]]:
+    """Return the fleets that run on the bus, with their cars that have a gateway."""
+    found: dict[str, set[str]] = {}
+    for token in bus.tokens("*/*"):
+        name, _, car = token.partition("/")
+        found.setdefault(name, set()).add(car)
+    for token in bus.tokens(f"*/{keys.SUPERVISOR}"):
+        found.setdefault(token.partition("/")[0], set())
+    return found
+
+
+def is_named() -> bool:
+    """Return True if the user has named the fleet of the running command."""
+    at: click.Context | None = click.get_current_context()
+    while at is not None:
+        if at.get_parameter_source("fleet") not in (None, ParameterSource.DEFAULT):
+            return True
+        at = at.parent
+    return False
+
+
+def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
+    """Return the fleets that a command for these cars could mean if it names none: at least `fleet`, the default."""
+    found = fleets_on(bus)
+    if len(found) < 2:
+        return [fleet]
+    wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
+    return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
+
+
+def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
+    """Return the one fleet that a command means. If it could mean several, ask at a terminal, else fail.
+
+    Raises click.UsageError.
+    """
+    could = [fleet] if is_named() else candidates(bus, fleet, cars)
+    if len(could) == 1:
+        return could[0]
+    if sys.stdin.isatty() and sys.stdout.isatty():
+        chosen: str = click.prompt("Which fleet?", type=click.Choice(could), err=True)
+        return chosen
+    raise _ambiguous(could)
+
+
+def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fleet:
+    """Open the client of the person whom --as or FLEET_AS names, in the fleet that the command means."""
+    client = Fleet(connect, fleet, kind="person", person=chosen_person())
+    try:
+        name = the_fleet(client.bus, fleet, cars)
+        if name == fleet:
+            return client
+        choose_fleet(connect, name)
+    except BaseException:
+        client.close()
+        raise
+    client.close()
+    return Fleet(connect, name, kind="person", person=chosen_person())
+
+
+def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
+    """Open a client for a key expression as the user wrote it. Raises click.UsageError if several fleets could fit."""
+    client = Fleet(connect, fleet, kind="person", person=chosen_person())
+    try:
+        _check_only(client.bus, fleet, keyexpr.partition("/")[0])
+    except BaseException:
+        client.close()
+        raise
+    return client
+
+
+def _check_only(bus: Bus, fleet: str, first: str) -> None:
+    """Fail if a key expression that begins with this chunk could be of another fleet."""
+    if is_named() or first in ("**", fleet):
+        return
+    could = candidates(bus, fleet, [first] if first and not set(first) & set("*$") else ())
+    if could != [fleet]:
+        raise _ambiguous(could)
+
+
+def _ambiguous(could: Iterable[str]) -> click.UsageError:
+    return click.UsageError(f"Several fleets are on this bus: {', '.join(could)}. Say which one with --fleet NAME.")
+
+
+def in_all_fleets(
+    client: Fleet, connect: str | None, cars: Sequence[str], act: Callable[[Fleet], Sequence[Outcome]]
+) -> list[Outcome]:
+    """Stop the cars in this client's fleet at once, and meanwhile in every other fleet that the command could mean."""
+    is_explicit = is_named()
+
+    def elsewhere() -> list[Outcome]:
+        could = [client.name] if is_explicit else candidates(client.bus, client.name, cars)
+        others = [name for name in could if name != client.name]
+        if not others:
+            return []
+        with ThreadPoolExecutor(len(others)) as pool:
+            return [each for found in pool.map(other, others) for each in found]
+
+    def other(name: str) -> list[Outcome]:
+        with Fleet(connect, name, sender=client.sender, kind=client.kind) as there:
+            return [replace(each, car=f"{name}/{each.car}") for each in act(there)]
+
+    with ThreadPoolExecutor(1) as pool:
+        further = pool.submit(elsewhere)
+        own = list(act(client))
+        found = further.result()
+    both = [*own, *found]
+    # A car that is in one fleet only is missing in the others.
+    answered = {each.car.rpartition("/")[2] for each in both if each.phase != NO_ANSWER}
+    return [each for each in both if each.phase != NO_ANSWER or each.car.rpartition("/")[2] not in answered]

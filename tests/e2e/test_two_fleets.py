@@ -1,0 +1,78 @@
+"""Two fleets on one bus: a stop reaches both, nothing else is guessed, and each proposed command reaches its own."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from schemas.bus import Bus, Sample
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.support.ports import free_endpoint
+from tests.support.processes import wait_for
+from tests.support.up import fleet_command
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """Start two fleets, each with one simulated car `red`. The second one is ended by what its start proposed."""
+    environment = {"FLEET_ENDPOINT": free_endpoint(), "FLEET_STATE_DIR": str(tmp_path / "state")}
+    run = partial(fleet_command, environment=environment)
+    try:
+        assert run("up", "--sim", "1", "--no-record", "--detach").returncode == 0
+        begun = run("up", "--sim", "1", "--fleet", "two", "--no-record", "--detach")
+        assert begun.returncode == 0
+        yield environment
+        (down,) = proposed(begun.stdout)
+        assert run(*down).returncode == 0
+        wait_for(lambda: run("list").returncode == 0, "one is left, and no name is needed")
+    finally:
+        run("down", "--fleet", "two")
+        run("down")
+
+
+def proposed(text: str) -> list[list[str]]:
+    """Return the words of each command in backticks, without `fleet`."""
+    return [shlex.split(words) for words in re.findall(r"`fleet ([^`]*)`", text)]
+
+
+def test_a_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, str]) -> None:
+    run = partial(fleet_command, environment=environment)
+    with Bus.open(environment["FLEET_ENDPOINT"]) as bus:
+
+        def safety(fleet: str) -> pb.Safety:
+            (answer,) = bus.query(f"{fleet}/red/state/safety", timeout_s=10.0)
+            assert isinstance(answer, Sample)
+            message = answer.message()
+            assert isinstance(message, pb.Safety)
+            return message
+
+        for words in (["list"], ["drive", "red", "forward"], ["get", "red/sensor/range"], ["status"], ["down"]):
+            refused = run(*words)
+            assert refused.returncode == 2, words
+            assert "fleet, two" in refused.stderr
+        assert run("drive", "red", "forward", "--fleet", "two", "--for", "100ms").returncode == 0
+        assert run("get", "fleet/red/state/mode").returncode == 0
+        assert not safety("fleet").HasField("hold")
+        stopped = run("stop", "red")
+        assert [line.partition(":")[0] for line in stopped.stdout.splitlines()] == ["red", "two/red"]
+        assert safety("fleet").hold.by == safety("two").hold.by != ""
+        estopped = run("estop", "--why", "smoke")
+        assert estopped.returncode == 0
+        assert safety("fleet").estops[0].why == safety("two").estops[0].why == "smoke"
+        for command in proposed(estopped.stdout):
+            named = command if "--fleet" in command else [*command, "--fleet", "fleet"]
+            assert run(*named).returncode == 0
+        wait_for(lambda: not safety("fleet").estops and not safety("two").estops, "both are released")
+
+
+def test_a_car_that_only_one_fleet_has_needs_no_name(environment: dict[str, str]) -> None:
+    run = partial(fleet_command, environment=environment)
+    other = run("stop", "green")
+    assert other.returncode == 1, "no fleet has it"
+    assert run("down", "--fleet", "two").returncode == 0
+    assert run("up", "--sim", "2", "--fleet", "two", "--no-record", "--detach").returncode == 0
+    assert run("mode", "green", "manual").returncode == 0
+    assert [line.partition(":")[0] for line in run("stop", "green").stdout.splitlines()] == ["two/green"]
