@@ -431,7 +431,10 @@ class CarGateway:
                 await link.close()  # `_connect` wakes and reopens it
                 return
             now = self._loop.time()
+            opened_as = self._control.model.learned.opened_as
             self._control.on_written(write, now)
+            if self._control.model.learned.opened_as != opened_as:  # the next gateway needs it to stop the car
+                self._save_learned(now, at_once=True)
             self._health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
 

@@ -32,7 +32,7 @@ OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
 """Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
 LATE_ANSWER_S: Final = 2.0
 """If an answer takes longer than this, further timeouts count from the answer, not from the request."""
-COMMAND_QUEUE_TIMEOUT_S: Final = 10.0  # gateway.control: timeout of a command that waits for a busy car
+COMMAND_QUEUE_TIMEOUT_S: Final = 15.0  # gateway.control: timeout of a command that waits for a busy car
 
 
 class Until(StrEnum):

@@ -56,6 +56,9 @@ class CarModel:
     range_at: float = float("-inf")
     cut_write: bool = False
     """True if a write has failed since the last recovery: the car may keep a string that only a color frame clears."""
+    missed_stop: bool = False
+    """True if a stop on this link has had its time, and the car, which reported meanwhile, did not show it."""
+    link_since: float = float("-inf")
     link_open: bool = False
     link_reason: str = "not connected yet"
 
@@ -123,7 +126,7 @@ class CarModel:
 
     @property
     def is_deaf(self) -> bool:
-        """Return True if the car could have shown a stop, and has not reacted to the last one."""
+        """Return True if the car could have shown a stop, and has not reacted to the last one yet."""
         shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME
         return shows and self.evidence.reacted_at is None and not self.evidence.without_echo
 
@@ -134,10 +137,17 @@ class CarModel:
 
     @property
     def silent_program(self) -> str:
-        """Return what to do if the car drives and never sends readings; empty if it has sent one."""
+        """Return what to do about a car that never sent a reading; empty if it has sent one."""
         if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
             return ""
-        return " If it drives and never sends readings, say so: `platform: raspberry_pi+no_readings` in the fleet file."
+        if self.profile.kind is not Platform.UNKNOWN:
+            return (
+                f" If it never sends readings, say so: `platform: {self.profile.name}+no_readings` in the fleet file."
+            )
+        return (
+            " In some modes a car sends nothing, and general stops do not end a mode: name its platform in the fleet "
+            "file, as in `platform: arduino`. If it never sends readings: `platform: raspberry_pi+no_readings`."
+        )
 
     @property
     def is_heard(self) -> bool:
@@ -175,6 +185,8 @@ class CarModel:
         """Return whether the reports of this car show that a stop arrived, and why, in words."""
         if not self.profile.has_readings:
             return Shows.NO, EVIDENCE[StopCase.NO_READINGS].words.format(car=self.name)
+        if self.stop_style is StopStyle.GENERAL and self.auto and not self.platform.is_settled:
+            return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
         if self.stop_style is StopStyle.GENERAL:
             case = StopCase.RASPBERRY_PI if self.profile.kind is Platform.RASPBERRY_PI else StopCase.UNKNOWN_PLATFORM
             return Shows.NO, EVIDENCE[case].words.format(car=self.name)

@@ -17,7 +17,7 @@ from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
 from gateway.protocol.enums import Cause, Mode
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.modes import only_candidate
-from gateway.protocol.platforms import StopStyle
+from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
 
 STALL_S: Final = 0.5
@@ -50,8 +50,17 @@ class CarMonitor:
         self._silent_since = None
         model.platform.begin_link()
         if model.platform.auto:  # another car may have been plugged in
-            model.platform = PlatformDetector(model.platform.configured, auto=True)
-            model.treat_as(model.platform.configured)
+            opened_as = model.learned.opened_as
+            remembered = parse_platform(opened_as) if opened_as else None
+            model.platform = PlatformDetector(model.platform.configured, auto=True, remembered=remembered)
+            model.treat_as(model.platform.profile)
+
+    def link_down(self) -> None:
+        """Forget what the car was before this link if it said nothing after a frame that only such a car takes."""
+        model = self.model
+        is_silent = model.left_at > model.link_since > model.mode.heard_at
+        if model.platform.is_remembered and is_silent:
+            model.learned.opened_as = ""
 
     def on_event(self, event: Event, now: float) -> None:
         """Update the model with an event of the decoder."""
@@ -93,6 +102,8 @@ class CarMonitor:
         model.learned.on_fields(event)
         if event.at > model.left_at + FLIGHT_S:
             model.left_until = float("-inf")
+            if model.trust.state is not CarTrust.IN_MODE:
+                model.learned.opened_as = ""
         if event.range_cm is not None:
             model.pacing.on_report(event.at)
             model.range_cm, model.range_at = event.range_cm or None, event.at

@@ -14,8 +14,9 @@ from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.protocol.enums import Motion
 
-MAX_QUEUE_TIME_S: Final = 10.0
-"""Maximum time that a one-shot or a mode waits for a busy car."""
+MAX_QUEUE_TIME_S: Final = 15.0
+"""Maximum time that a command waits for a busy car: longer than the longest stop, that of a connect to a car that sends
+nothing (`stopping.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
 
 
 @dataclass(slots=True)

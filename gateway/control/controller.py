@@ -134,11 +134,13 @@ class Controller:
 
     def link_down(self, reason: str, now: float) -> None:
         """Fail all commands: the link is down."""
+        self._monitor.link_down()
         self._executor.link_down(reason, now, cause=Reason.LINK_DOWN)
 
     def on_write_failed(self, reason: str, now: float) -> None:
         """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
         self.model.cut_write = True
+        self._monitor.link_down()
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
     def waits_for(self, now: float) -> str:

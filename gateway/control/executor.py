@@ -50,6 +50,8 @@ class Executor:
         """Bring the car to a known state: the link is open."""
         model = self.model
         model.link_open = True
+        model.missed_stop = False
+        model.link_since = now
         model.evidence.begin_link()
         model.pacing.reset()
         self.senders.halt_streams(now)
@@ -149,9 +151,11 @@ class Executor:
 
     @property
     def _full_stop_runs(self) -> bool:
-        """Return True if a stop runs that is more than the end of a drive."""
+        """Return True if a stop runs that is more than the end of a drive, and that does not give way at once."""
         running = self.stops.running
-        return running is not None and running.sequence.rank > SOFT.rank
+        if running is None or running.sequence.rank <= SOFT.rank:
+            return False
+        return running.frames_sent or not running.repeats
 
     @property
     def _has_new_command(self) -> bool:
@@ -190,6 +194,7 @@ class Executor:
         self.stops.begin(sequence, why, now)
         assert self.stops.running is not None
         self.stops.running.before = before
+        self.stops.running.repeats = why is FrameOrigin.REPEAT
         return self._next_step(self.stops.running, now)
 
     def _write(
@@ -251,6 +256,8 @@ class Executor:
         match frame:
             case ModeOpen(mode):
                 self.mode_sent = None
+                if model.auto:
+                    model.learned.opened_as = model.profile.name
                 model.mode.on_mode_sent(mode, now=now, block_s=block_s)
                 model.evidence.opened(mode, now, silent=mode in model.profile.silent_modes, shown=shown)
                 self._end_rest(TrustEvent.MODE_SENT, now)
@@ -320,7 +327,7 @@ class Executor:
     def _doubt_of_drive(self) -> str:
         """Return why the car may have ignored a drive; empty if there is no reason to think so."""
         model = self.model
-        if model.is_deaf:
+        if model.is_deaf and model.missed_stop:
             return "it has not reacted to the last stop"
         if model.profile.kind is Platform.UNKNOWN and model.mode.verdict is not Verdict.CONFIRMED:
             return "no reading shows its mode, and in some modes it ignores drives. Name its platform to leave them"

@@ -69,6 +69,8 @@ class StopExecutor:
             self._start(sequence, why, now, [*(running.commands if running is not None else ()), *joining])
             return
         running.commands.extend(joining)
+        if joining:
+            running.repeats = False
         if why is FrameOrigin.SHUTDOWN:
             running.why = why
         # A new command need not wait for the next try, but only after this silence the next frame is certain.
@@ -247,12 +249,15 @@ class StopExecutor:
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:
         """Go on with full stops after a soft one: the car has not reacted to the last full stop."""
-        words = f"{self.model.name} was driven again, and has not reacted to the last stop"
+        what = (
+            "and has not reacted to the last stop" if self.model.missed_stop else "before it could show its last stop"
+        )
+        words = f"{self.model.name} was driven again, {what}"
         for pending in running.commands:
             self._log.record(pending, Phase.SENT, now, words=words, basis=Basis.SENT)
         self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
-        self.running.overdue = True  # the next drive need not wait for the evidence
+        self.running.overdue = self.running.repeats = True  # the next drive need not wait for the evidence
         self.model.learn(TrustEvent.NOT_SHOWN, now, words)
 
     def _try_again(self, running: StopInProgress, now: float) -> None:
@@ -281,6 +286,7 @@ class StopExecutor:
             running.overdue = True
             if self.model.mode.heard_at > running.began_at:
                 self.model.evidence.reacted_at = None
+                self.model.missed_stop = True
                 self.model.learned.doubted = self.model.learned.shows is Shows.YES
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
@@ -338,6 +344,9 @@ class StopExecutor:
                 pass
         if finding is Finding.UNJUDGED:  # let the next interval be undisturbed, so that the rhythm can be learned
             running.reported_s = stopping.reported_s(self.model.profile, self.model.learned, slowest=True)
+            if self.model.learned.echo.is_known:  # and it is another one now
+                next_s = at - running.last_at + stopping.SLOWEST_S + stopping.REPORT_MARGIN_S
+                running.reported_s = max(running.reported_s, next_s)
         if self.running is running and running.frames_sent:
             self._await(running, now)
         # A probe counts only on a car that is awake, so directly after a report. If it must wait, let it wait for one.

@@ -12,7 +12,8 @@ A *delay* is by how much a report comes later than the rhythm after one frame th
 acknowledges each such frame by its delay; one that reports by a timer never does.
 
 "It cannot show a stop" is a finding, not a first impression. It takes `UNREACTED` blocking frames without any delay,
-and none with one. Nothing is sent just to learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
+and none with one. It ends as it began: by `REACTED` delays of just the block of a frame. Nothing is sent just to
+learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
 """
 
 from collections import deque
@@ -24,6 +25,7 @@ from typing import Any, Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import SENSOR_FIELDS, Sensors
 
 KEPT_INTERVALS: Final = 9
@@ -44,6 +46,12 @@ ALWAYS: Final = 5
 """Minimum number of values out of range that are a finding, if none was in range."""
 UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
+
+
+REACTED: Final = 3
+"""Number of consecutive reactions that end that finding."""
+MAX_KEPT_S: Final = 10.0
+"""Maximum interval or block in a state file: three times those of the slowest car."""
 
 
 class Shows(StrEnum):
@@ -104,6 +112,11 @@ class Rhythm:
         return max(self.intervals) - min(self.intervals) if self.intervals else 0.0
 
     @property
+    def is_changing(self) -> bool:
+        """Return True if the last undisturbed interval did not fit: another rhythm may begin."""
+        return bool(self._others)
+
+    @property
     def is_firm(self) -> bool:
         """Return True if there are enough intervals to know their spread."""
         return len(self.intervals) >= FIRM_INTERVALS
@@ -152,6 +165,9 @@ class Learned:
     shows: Shows = Shows.UNKNOWN
     doubted: bool = False
     """True if the car has shown its stops before, and did not show the last one."""
+    opened_as: str = ""
+    """The detected platform as which the gateway last opened a mode, until a report shows mode 0 again. In a silent
+    mode nothing else tells what ends it. Empty if none is open."""
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -161,6 +177,8 @@ class Learned:
     _delays: dict[Blocking, deque[float]] = field(default_factory=dict)
     _blocks: dict[Blocking, float] = field(default_factory=dict)
     _unreacted: int = 0
+    _reacted: int = 0
+    """Number of consecutive reactions of a car that counts as one that cannot show a stop."""
 
     # ------------------------------------------------------------------ rhythm and delays
 
@@ -213,13 +231,18 @@ class Learned:
         self._unreacted = 0
         return True
 
-    def on_reaction(self) -> None:
-        """Record that a report came late by just the block of a frame."""
+    def on_reaction(self, *, sure: bool) -> None:
+        """Record that a report came late by just the block of a frame. `sure`: a lost report cannot look so."""
         self._unreacted = 0
+        if self.shows is Shows.NO and sure:
+            self._reacted += 1
+            if self._reacted >= REACTED:  # its wire was loose, or another program runs
+                self.shows, self._reacted = Shows.UNKNOWN, 0
 
     def on_no_reaction(self) -> bool:
         """Record a blocking frame without a delay. Return True if the car counts as one that cannot show a stop now."""
         self._unreacted += 1
+        self._reacted = 0
         if self.shows is not Shows.UNKNOWN or self._unreacted < UNREACTED:
             return False
         self.shows = Shows.NO
@@ -267,6 +290,7 @@ class Learned:
             "shows": str(self.shows),
             "doubted": self.doubted,
             "reporting": sorted(self.reporting),
+            "opened_as": self.opened_as,
             "blocks_s": {str(kind): round(block_s, 4) for kind, block_s in self._blocks.items()},
         }
 
@@ -277,11 +301,14 @@ class Learned:
             shows=Shows(kept["shows"]),
             doubted=bool(kept["doubted"]),
             reporting={Mode(mode) for mode in kept["reporting"]},
+            opened_as=parse_platform(kept["opened_as"]).name if kept.get("opened_as") else "",
         )
         for rhythm, name in ((learned.echo, "echo_s"), (learned.no_echo, "no_echo_s")):
             intervals = [float(each) for each in kept[name]]
-            if not all(0.0 < each < 60.0 for each in intervals):  # also refuses NaN
+            if not all(0.0 < each <= MAX_KEPT_S for each in intervals):  # also refuses NaN
                 raise ValueError(f"{name}: {intervals}")
             rhythm.intervals.extend(intervals)
         learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
+        if not all(0.0 < each <= MAX_KEPT_S for each in learned._blocks.values()):
+            raise ValueError(f"blocks_s: {learned._blocks}")
         return learned

@@ -52,6 +52,8 @@ class PlatformDetector:
 
     configured: Profile
     auto: bool = False
+    remembered: Profile | None = None
+    """With `auto`: what the car was when a mode was opened that may still be open. It counts until readings come."""
     profile: Profile = field(init=False)
     """The profile in force: the configured one, or with `auto` the detected one."""
     _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
@@ -71,12 +73,13 @@ class PlatformDetector:
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
+    _readings: int = 0
     _head: str = ""
     _heads: int = 0
     """The first word of the last sensors frames if it is none of this profile, and their number."""
 
     def __post_init__(self) -> None:
-        self.profile = self.configured
+        self.profile = self.remembered or self.configured
 
     @property
     def contradictions(self) -> tuple[str, ...]:
@@ -92,6 +95,16 @@ class PlatformDetector:
     def open_mode(self) -> bool:
         """Return True if the last readings show a mode other than 0, so the car knows MODE frames."""
         return self._open_mode.holds
+
+    @property
+    def is_remembered(self) -> bool:
+        """Return True if no reading of this link has settled the platform, and one from before counts."""
+        return self.profile is self.remembered
+
+    @property
+    def is_settled(self) -> bool:
+        """Return True if enough readings came to know what they can tell of the platform."""
+        return self.profile.kind is not Platform.UNKNOWN or self._readings > EVIDENCE_FRAMES
 
     def begin_link(self) -> None:
         """Forget what the readings of the last link showed of the mode."""
@@ -139,7 +152,8 @@ class PlatformDetector:
         in_manual = only_candidate(event) is Mode.MANUAL
         for words in observed:
             self._against.setdefault(words, _PlatformEvidence())
-        affected = [words for words in self._against if in_manual or words in observed]
+        judged = [words for words in self._against if words not in self._extra_options]
+        affected = [words for words in judged if in_manual or words in observed]
         new = tuple(words for words in affected if self._against[words].update(shown=words in observed))
         for words in affected:
             if words not in observed and not self._against[words].holds:
@@ -172,13 +186,19 @@ class PlatformDetector:
             self._options = self._without_head(self._options) | {option}
             self._apply_evidence()
             return ()
-        kind = "+".join((self.profile.kind, *sorted(self._without_head(self.profile.options) | {option})))
-        words = f"readings that begin with {head}: none of them can be read. Is it {kind}?"
+        # No other car sends such frames, so the option was written wrongly. With it, no reading could be read.
+        named = self.profile.name
+        self.profile = parse_platform(
+            "+".join((self.profile.kind, *sorted(self._without_head(self.profile.options) | {option})))
+        )
+        words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
+        self._extra_options.add(words)
         self._against[words] = _PlatformEvidence(holds=True)
         return (words,)
 
     def _detect(self, event: Sensors) -> None:
         """Detect the platform from the first evidence."""
+        self._readings += 1
         if len(candidate_modes(event)) > 1:
             return
         in_manual = only_candidate(event) is Mode.MANUAL
@@ -230,4 +250,6 @@ class PlatformDetector:
             return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._with_modes}",)
         if self._raspberry_pi:
             return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._raspberry_pi}",)
+        if self.is_remembered:
+            return (f"{self.profile.name}: so it was detected before a mode was opened, and it may be in that mode",)
         return (f"not settled: it takes {EVIDENCE_FRAMES} readings running",)

@@ -81,6 +81,8 @@ PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
 PAUSES_IN_DOUBT: Final = 3
 """Number of pauses that are needed if one of them is in doubt."""
+MISFITS: Final = 2
+"""Number of intervals that fit nothing, after which the rhythm is looked at again without a `MODE00`."""
 SETTLING_S: Final = 0.25
 """Minimum time without a reading after the last pause, before the pauses count."""
 SHAPES: Final = 2
@@ -274,6 +276,8 @@ class StopEvidence:
     """True if a general frame of this stop did not delay a report."""
     _blocking: list[_Block] = field(default_factory=list)
     """The other frames that block, since the last report."""
+    _misfits: int = 0
+    """Number of intervals with a `MODE00` that neither were normal nor had a pause: this may be another program."""
     _fast_before: bool = False
     """True if the last bytes were a report with an echo, however soon it came."""
     _general: bool = False
@@ -469,7 +473,8 @@ class StopEvidence:
 
     @property
     def _report(self) -> Finding:
-        return Finding.REPORT if self._rhythm.is_known else Finding.UNJUDGED
+        is_judged = self._rhythm.is_known and not (self._misfits >= MISFITS and self._rhythm.is_changing)
+        return Finding.REPORT if is_judged else Finding.UNJUDGED
 
     def _without_mode_00(self, before: float | None, at: float, blocking: list[_Block], *, general: bool) -> Finding:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
@@ -488,7 +493,7 @@ class StopEvidence:
             delay_s = gap_s - self._rhythm.median_s
             self.learned.add_delay(kind, delay_s, self.profile.reopened_s, controlled=True)
             if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
-                self.learned.on_reaction()
+                self.learned.on_reaction(sure=True)
                 self.reacted_at = at
             elif self._rhythm.fits(gap_s) and expected_s > 2 * self._rhythm.tolerance_s:
                 self.found_out = self.learned.on_no_reaction()
@@ -504,6 +509,7 @@ class StopEvidence:
     def _learn_interval(self, gap_s: float) -> None:
         if self.learned.add_interval(gap_s, echo=True):
             self.found_out = True
+            self._misfits = 0
             self._drop_pauses()
 
     def _compare(self, before: float, pending: float, at: float, blocking: list[_Block]) -> Finding:
@@ -537,9 +543,11 @@ class StopEvidence:
         none_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
         if abs(delay_s) > none_s:
             self._drop_pauses()
-            return other
+            self._misfits += 1
+            return Finding.UNJUDGED if self._misfits >= MISFITS else other
         if first_delay_s is not None and abs(first_delay_s) > none_s:
             return other
+        self._misfits = 0
         self._drop_pauses()
         if not blocking and rhythm.fits(gap_s):
             self._learn_interval(gap_s)
@@ -552,7 +560,8 @@ class StopEvidence:
         self._pauses += 1
         self.reacted_at = at
         self._delay_s = None
-        self.learned.on_reaction()
+        self._misfits = 0
+        self.learned.on_reaction(sure=self._controlled or not self.learned.is_confusable(delay_s))
         if learn:
             self.learned.add_delay(Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s, controlled=self._controlled)
         if not self._controlled and self.learned.is_confusable(delay_s):

@@ -149,6 +149,8 @@ class StopInProgress:
     """True if the car did not show the stop in time. The stop goes on."""
     before: Pending | None = None
     """The mode command that this stop precedes."""
+    repeats: bool = False
+    """True if it repeats a stop whose first frames went out: it gives way at once."""
     at_rest: bool = False
     """True if the car had shown that it stands before it fell silent. Send it general stops only: unlike a named frame,
     a general stop that loses bytes cannot start the motors."""
@@ -195,6 +197,8 @@ class StopInProgress:
         Missing evidence delays no command. The first frames do, through the announced worst case, unless a report came
         in between: the car is in mode 0 then, and reads.
         """
+        if self.repeats:
+            return self.began_at
         if not self.sent_all:
             return float("inf")
         return self.report_at if self.report_at > float("-inf") else self.obeyed_at
@@ -209,7 +213,7 @@ class StopInProgress:
 
     def over_at(self, pacing: Pacing, now: float) -> float:
         """Return when a new command may take the place of the stop, as far as that is known."""
-        if self.sent_all:
+        if self.sent_all or self.repeats:
             return max(self.gives_way_at, now)
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
         return max(began + self.sequence.length_s + FLIGHT_S, self.worst_at, now)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from fleet.client.effects import EFFECTS, STOP_VERBS
-from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
+from fleet.client.outcome import COMMAND_QUEUE_TIMEOUT_S, STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
 from tests.support.message_length import MAX_LINES, count_lines
 
@@ -213,7 +213,7 @@ def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
 
 def test_a_drive_whose_records_come_late_is_not_taken_for_one_that_only_prolonged_another() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
-    assert progress.deadline == 117.0, "it may wait for a stop"
+    assert progress.deadline == 100.0 + 2.0 + COMMAND_QUEUE_TIMEOUT_S + 5.0, "it may wait for a stop"
     for at, phase in enumerate(("queued", "sent"), start=104):
         progress.on_event(phase, "", "", 0.0, at)
     assert progress.deadline == 112.0, "its duration counts from its frame"

@@ -122,12 +122,13 @@ def test_the_bytes_know_the_head_better_than_an_option() -> None:
     assert truth.profile.name == "unknown+head=BALA"
 
 
-def test_another_head_than_the_named_one_is_said_once() -> None:
+def test_another_head_than_the_named_one_is_taken_and_said_once() -> None:
     truth = PlatformDetector(parse_platform("arduino+arm+head=CART"))
     (words,) = hear_raw(truth, *["BALA"] * 9)
     assert "arduino+arm+head=BALA" in words
-    assert truth.profile.name == "arduino+arm+head=CART"
+    assert truth.profile.name == "arduino+arm+head=BALA"
     assert truth.contradictions == (words,)
+    assert not truth.doubted, "everything else is as it was named"
 
 
 def test_a_car_that_is_neither_is_treated_as_unknown() -> None:

@@ -1,11 +1,14 @@
 """With `--platform auto`, a car is unknown at first. Its bytes settle the platform, and with it the kind of stop."""
 
+import json
+
 import pytest
 
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
+from gateway.control.estimate.learned import Learned
 from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.platform_name import parse_option
+from gateway.protocol.platform_name import Platform, parse_option
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from tests.support.virtual import Pair
@@ -63,6 +66,49 @@ def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
     other.connect()
     assert other.control.model.profile.name == "unknown"
     other.until(lambda: other.control.model.profile.name == "raspberry_pi", 30.0)
+
+
+def in_a_silent_mode(platform: str, mode: Mode) -> Pair:
+    pair = paired(platform)
+    pair.until(lambda: pair.control.model.profile.kind is not Platform.UNKNOWN, 20.0)
+    pair.until(lambda: pair.control.is_free(pair.now), 20.0)
+    pair.ask(SetMode(mode))
+    pair.until(lambda: pair.car.truth.driving, 20.0)
+    return pair
+
+
+@pytest.mark.parametrize("gateway", ["the same", "another"])
+@pytest.mark.parametrize(
+    ("platform", "mode"), [("arduino", Mode.OBSTACLE_AVOIDANCE), ("stm32", Mode.TRACKING)], ids=["arduino", "stm32"]
+)
+def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
+    platform: str, mode: Mode, gateway: str
+) -> None:
+    pair = in_a_silent_mode(platform, mode)
+    if gateway == "the same":
+        pair.control.link_down("unplugged", pair.now)
+    else:
+        kept = json.loads(json.dumps(pair.control.model.learned.kept()))
+        pair.control = Controller("red", parse_platform("unknown"), auto=True, learned=Learned.restore(kept))
+    pair.run(1.0, linked=False)
+    pair.connect()
+    pair.until(lambda: not pair.car.truth.driving, 8.0)
+    pair.run(5.0)
+    assert not pair.car.truth.driving
+    assert pair.control.model.learned.opened_as == "", "a report has shown mode 0"
+
+
+def test_what_a_car_was_is_forgotten_if_its_link_ends_without_a_word_after_a_mode_frame() -> None:
+    """Behind the same address there may be a program that ends at a mode frame now. It must not end again and again."""
+    pair = in_a_silent_mode("arduino", Mode.OBSTACLE_AVOIDANCE)
+    pair.control.link_down("unplugged", pair.now)
+    pair.car.feed = lambda *_: None  # type: ignore[method-assign]
+    for counted in (1, 0, 0):
+        pair.sent.clear()
+        pair.connect()
+        pair.run(6.0)
+        assert min(1, sum(b"MODE00" in data for _, data in pair.sent)) == counted
+        pair.control.link_down("closed", pair.now)
 
 
 def test_a_contradicted_profile_is_told_of_once() -> None:

@@ -1,0 +1,123 @@
+"""What was learned of a car ends as it began: by its readings. Another program on the same link is learned again."""
+
+import json
+from typing import Any
+
+import pytest
+
+from gateway.control.commands import Drive, Stop
+from gateway.control.controller import Controller
+from gateway.control.estimate.learned import REACTED, Learned, Shows
+from gateway.protocol.enums import Motion
+from gateway.protocol.platforms import parse_platform
+from gateway.sim.model.traits import CarTraits
+from tests.support.virtual import Pair
+
+KEPT: dict[str, Any] = {
+    "echo_s": [1.254] * 9,
+    "no_echo_s": [],
+    "shows": "yes",
+    "doubted": False,
+    "reporting": ["manual"],
+    "blocks_s": {},
+}
+
+
+def met(kept_s: float, traits: CarTraits) -> Pair:
+    """Connect a car of which another rhythm is kept, that showed its stops."""
+    pair = Pair(start_s=2.0, traits=traits)
+    pair.control = Controller(
+        "red", parse_platform("arduino"), learned=Learned.restore(KEPT | {"echo_s": [kept_s] * 9})
+    )
+    pair.connect()
+    return pair
+
+
+@pytest.mark.parametrize(
+    ("kept_s", "traits"),
+    [
+        (1.254, CarTraits(interval_s=3.0)),
+        (1.254, CarTraits(interval_s=2.2)),
+        (1.254, CarTraits(interval_s=0.71)),
+        (3.0, CarTraits()),
+        (0.5, CarTraits(interval_s=2.2)),
+        (1.254, CarTraits(interval_s=1.0, timer=True, close_s=0.0)),
+    ],
+    ids=str,
+)
+def test_a_kept_rhythm_of_another_program_is_learned_again_while_stops_go_out(kept_s: float, traits: CarTraits) -> None:
+    pair = met(kept_s, traits)
+    pair.run(60.0)
+    learned = pair.control.model.learned
+    assert abs(learned.echo.median_s - traits.interval_s) < 0.1
+    assert not learned.doubted
+    assert pair.control.model.motors == "off"
+    pair.ask(Stop(), identity="it")
+    pair.run(25.0)
+    last = pair.last_of("it")
+    assert last is not None
+    assert last.basis in ("sent", "shown")
+    closes = [at for at, data in pair.sent if b"MODE00" in data and at > pair.now - 20.0]
+    assert len(closes) <= 6, "it is not stopped for ever"
+
+
+def test_a_car_that_could_not_show_its_stops_shows_them_when_its_wire_is_whole() -> None:
+    pair = Pair(start_s=2.0)
+    feed = pair.car.feed
+    pair.car.feed = lambda *_: None  # type: ignore[method-assign]
+    pair.connect()
+    pair.until(lambda: pair.control.model.learned.shows is Shows.NO, 60.0)
+    pair.car.feed = feed  # type: ignore[method-assign]
+    for number in range(REACTED + 1):
+        pair.ask(Stop(), identity=str(number))
+        pair.run(15.0)
+    assert pair.control.model.learned.shows is Shows.YES
+    last = pair.last_of(str(REACTED))
+    assert last is not None
+    assert last.basis == "shown"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"blocks_s": {"mode_close": 40.0}},
+        {"blocks_s": {"mode_close": float("nan")}},
+        {"blocks_s": {"mode_close": -1.0}},
+        {"echo_s": [40.0]},
+        {"no_echo_s": [float("inf")]},
+        {"opened_as": "arduino+head=4,D"},
+    ],
+    ids=str,
+)
+def test_numbers_of_no_car_are_not_restored(damage: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        Learned.restore(json.loads(json.dumps(KEPT | damage)))
+
+
+def test_a_drive_right_after_the_connect_is_not_said_to_have_been_ignored() -> None:
+    pair = Pair(start_s=2.0)
+    pair.connect()
+    pair.until(lambda: pair.control.is_free(pair.now), 20.0)
+    for number in range(4):
+        pair.ask(Drive(Motion.FORWARD, 1.0), identity=str(number))
+        pair.run(2.5)
+        last = pair.last_of(str(number))
+        assert last is not None
+        assert "may not have moved" not in last.words
+
+
+def test_the_repeats_of_a_stop_give_way_at_once() -> None:
+    """A full stop that repeats the end of a drive delays the next drive by the block of its `MODE00` at most."""
+    for wait in range(20):
+        pair = Pair(start_s=2.0)
+        pair.connect()
+        pair.until(lambda pair=pair: pair.control.is_free(pair.now), 20.0)
+        pair.ask(Drive(Motion.FORWARD, 0.5))
+        pair.run(1.5 + wait * 0.1)
+        closed_at = max((at for at, data in pair.sent if b"MODE00" in data), default=float("-inf"))
+        asked_at = pair.now
+        pair.ask(Drive(Motion.BACK, 0.5))
+        pair.until(lambda pair=pair: pair.sent[-1][1].startswith(b"$2"), 2.0)
+        after = [data for at, data in pair.sent if at > asked_at + 0.01]
+        assert not [data for data in after if b"MODE00" in data], "no new block begins while a drive waits"
+        assert pair.now <= max(asked_at, closed_at + 1.0) + 0.3
