@@ -520,7 +520,7 @@ class CarGateway:
                 now=now,
                 limit_s=mode.silence_limit(fan=bool(self._control.model.believed.fan)),
                 unheard_s=mode.unheard_s(now),
-                why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
+                why_quiet=mode.why_quiet,
                 is_heard=self._control.model.is_heard,
             )
             if changed or self._shown_state != before or now >= next_health:

@@ -216,7 +216,12 @@ def _run(arguments: argparse.Namespace) -> int:
             from gateway.protocol.platforms import parse_platform
             from schemas.state_dir import directory_of
 
-            logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
+            logging.basicConfig(
+                format="%(asctime)s %(levelname)s %(message)s",
+                datefmt="%H:%M:%S %Z",
+                level=logging.INFO,
+                stream=sys.stderr,
+            )
             state_dir = directory_of(opened.endpoint, Path(arguments.state_dir) if arguments.state_dir else None)
             settings = Settings(
                 car,

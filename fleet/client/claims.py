@@ -104,7 +104,7 @@ def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
     """Return what is claimed of the mode. mode: the newest fleet.v1.Mode; None: there is none."""
     if mode is None or not mode.asked:
         return CarClaim(UNKNOWN)
-    since_s = mode.evidence_age_s + age_s if mode.HasField("evidence_age_s") else None
+    since_s = mode.since_s + age_s if mode.HasField("since_s") else None
     is_stale = _is_stale("state/mode", age_s)
     claim = CarClaim(mode.asked, mode.verdict, since_s, age_s, mode.evidence, is_stale=is_stale)
     return claim if present else CarClaim(UNKNOWN, past=claim)

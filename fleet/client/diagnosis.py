@@ -25,6 +25,11 @@ MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
 _PORT_SHARED: Final = "port_shared"
+_OUT_OF_RANGE: Final = {
+    "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
+    "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
+}
+"""What a field that is always out of range may mean."""
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are no rejected frames."""
@@ -158,7 +163,8 @@ def _out_of_range(e: CarEvidence) -> str:
     if health is None or not health.out_of_range:
         return ""
     fields = ", ".join(health.out_of_range)
-    return f"Always out of range, and so never published: {fields}. Its program is not that of {health.platform} cars."
+    hints = [words for field, words in _OUT_OF_RANGE.items() if field in health.out_of_range]
+    return " ".join((f"Always out of range for a {health.platform} car, and so never published: {fields}.", *hints))
 
 
 def _silent(e: CarEvidence) -> bool:

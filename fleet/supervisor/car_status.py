@@ -18,6 +18,8 @@ READY_TIMEOUT_S: Final = 30.0
 """Time without another ready car after which a start ends, although somebody is missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
 """The same time if everything runs, and only links of cars cannot be opened."""
+REACHED_S: Final = 2.0
+"""Time after which an open link has reached a car that sends nothing."""
 RATE_WINDOW_S: Final = 2.0
 """Minimum time over which the frame rate is measured."""
 
@@ -43,7 +45,7 @@ class CarStatus:
     safety_received: bool = False
     """True if any gateway has published the car's state/safety."""
     reached: bool = False
-    """True if any gateway has had an open link to the car."""
+    """True if any gateway has had an open link to the car: bytes came, or it stayed open."""
     waits_for: str = ""
     """What a command would wait for."""
     heard: bool = False
@@ -64,7 +66,8 @@ class CarStatus:
         match topic:
             case "state/link":
                 self.link, self.reason = value.state, value.reason
-                self.reached |= value.state in _OPEN
+                # A bridge that is in use accepts a connection, and closes it before it sends a byte.
+                self.reached |= value.state in _OPEN and (value.rx_bytes > 0 or value.since_s >= REACHED_S)
                 self.heard = value.HasField("last_rx_s")
                 self._count(value.rx_frames, now)
                 return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")

@@ -148,7 +148,8 @@ class GatewayShutdown:
         """Return the result for a car that its gateway did not stop."""
         row = self._rows.get(process.name)
         if row is None or not row.reached:
-            return f"{NEVER_REACHED}, so it got no command ({why.rstrip('.')})"
+            reason = row.reason if row is not None and row.reason not in ("", NOT_TRIED) else why
+            return f"{NEVER_REACHED}, so it got no command ({reason.rstrip('.')})"
         if row.rest.what == OFF and row.rest.basis == SHOWN:
             return f"{STOPPED}, as it showed before its gateway ended ({why.rstrip('.')})"
         could_not_reach = process.code is None or process.code < 0 or row.link in ("", "lost")

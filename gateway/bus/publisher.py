@@ -320,6 +320,8 @@ def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
     message.evidence = mode.evidence
     if mode.evidence_at is not None:
         message.evidence_age_s = max(0.0, now - mode.evidence_at)
+    if mode.since is not None:
+        message.since_s = max(0.0, now - mode.since)
     message.candidates.extend(mode.candidates)
 
 

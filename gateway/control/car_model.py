@@ -8,7 +8,7 @@ from typing import Final
 
 from gateway.control.command_log import CommandLog
 from gateway.control.estimate.battery import Battery, BatteryPolicy
-from gateway.control.estimate.learned import Learned, Shows
+from gateway.control.estimate.learned import Blocking, Learned, Shows
 from gateway.control.estimate.mode import ModeEstimator, Verdict
 from gateway.control.estimate.outputs import StateEstimate
 from gateway.control.estimate.platform import PlatformDetector
@@ -193,8 +193,9 @@ class CarModel:
         if self.learned.doubted:
             return Shows.YES, f"{self.name} has shown its stops before, and did not show the last one"
         if self.learned.shows is Shows.YES:
-            return Shows.YES, f"the reports of {self.name} show that a stop arrived"
-        if not self.can_show:
+            now = ", but not now: it has no sonar echo" if self.evidence.without_echo > 1 else ""
+            return Shows.YES, f"the reports of {self.name} show that a stop arrived{now}"
+        if not self.can_show and Blocking.MODE_CLOSE not in self.learned.blocks:
             return Shows.NO, EVIDENCE[StopCase.NO_REACTION].words.format(car=self.name)
         return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
 

@@ -6,7 +6,7 @@ from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog
 from gateway.control.commands import Phase, Reason, SetMode
 from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
-from gateway.control.estimate.learned import Shows
+from gateway.control.estimate.learned import Blocking, Shows
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
@@ -89,6 +89,10 @@ class CarMonitor:
             self._silent_since = None
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
+        if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:
+            words = f"its reports pause after MODE00, which those of {model.profile.name} cars do not"
+            if model.platform.note(words):
+                self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
         if model.evidence.found_out:
             self._log_found_out(now)
         if only_candidate(event) is Mode.MANUAL:
@@ -99,7 +103,7 @@ class CarMonitor:
     def _on_report(self, event: Sensors, now: float) -> None:
         """Update the model with a report of mode 0."""
         model = self.model
-        model.learned.on_fields(event)
+        model.learned.on_fields(event, model.profile.rejects(event))
         if event.at > model.left_at + FLIGHT_S:
             model.left_until = float("-inf")
             if model.trust.state is not CarTrust.IN_MODE:

@@ -242,7 +242,7 @@ class StopExecutor:
         if running.case in (StopCase.RASPBERRY_PI, StopCase.UNKNOWN_PLATFORM):
             return None
         if running.no_echo_at > running.closed_at:
-            return StopCase.NO_ECHO
+            return StopCase.NO_ECHO if model.can_show else StopCase.NO_REACTION
         if running.case is StopCase.MANUAL or running.case is StopCase.NO_REACTION:
             return StopCase.NO_REACTION if not model.can_show and running.report_at > running.try_at else None
         return None
@@ -398,9 +398,8 @@ class StopExecutor:
         self.renewal.left_mode = model.left_at >= running.began_at
         model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
-            how = "confirmed" if shown else f"not confirmed: {words}"
-            known = f"{model.name} is stopped ({how}), mode manual"
-            self._log.log(Level.INFO, "recovered", known, now)
+            how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
+            self._log.log(Level.INFO, "recovered", f"{model.name} {how}, mode manual", now)
         if not shown:
             self.renewal.restart(now)
         phase, reason, evidence = (Phase.COMPLETE, "", (words,)) if shown else (Phase.SENT, words, ())

@@ -193,7 +193,7 @@ class Link(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., reason: _Optional[str] = ..., url: _Optional[str] = ..., rx_bytes: _Optional[int] = ..., tx_bytes: _Optional[int] = ..., rx_frames: _Optional[int] = ..., tx_frames: _Optional[int] = ..., rejects: _Optional[_Mapping[str, int]] = ..., reconnects: _Optional[int] = ..., tx_airtime: _Optional[float] = ..., since_s: _Optional[float] = ..., last_rx_s: _Optional[float] = ...) -> None: ...
 
 class Mode(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "asked", "inferred", "verdict", "evidence", "evidence_age_s", "candidates")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "asked", "inferred", "verdict", "evidence", "evidence_age_s", "candidates", "since_s")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -204,6 +204,7 @@ class Mode(_message.Message):
     EVIDENCE_FIELD_NUMBER: _ClassVar[int]
     EVIDENCE_AGE_S_FIELD_NUMBER: _ClassVar[int]
     CANDIDATES_FIELD_NUMBER: _ClassVar[int]
+    SINCE_S_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -214,7 +215,8 @@ class Mode(_message.Message):
     evidence: str
     evidence_age_s: float
     candidates: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., asked: _Optional[str] = ..., inferred: _Optional[str] = ..., verdict: _Optional[str] = ..., evidence: _Optional[str] = ..., evidence_age_s: _Optional[float] = ..., candidates: _Optional[_Iterable[str]] = ...) -> None: ...
+    since_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., asked: _Optional[str] = ..., inferred: _Optional[str] = ..., verdict: _Optional[str] = ..., evidence: _Optional[str] = ..., evidence_age_s: _Optional[float] = ..., candidates: _Optional[_Iterable[str]] = ..., since_s: _Optional[float] = ...) -> None: ...
 
 class Motion(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "motion", "source", "speed", "owner", "expires_in_s", "fan", "servo_deg")

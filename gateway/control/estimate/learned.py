@@ -26,7 +26,7 @@ from typing import Any, Final
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.protocol.platforms import parse_platform
-from gateway.protocol.sensors import SENSOR_FIELDS, Sensors
+from gateway.protocol.sensors import SENSOR_FIELDS, Reject, Sensors
 
 KEPT_INTERVALS: Final = 9
 """Number of intervals of a rhythm."""
@@ -261,15 +261,16 @@ class Learned:
         """Return the fields whose values were often out of range, and never in it."""
         return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
 
-    def on_fields(self, event: Sensors) -> None:
-        """Record the values of the fields of a report of mode 0."""
-        for reject in event.rejects:
-            self.rejected[reject.word] = self.rejected.get(reject.word, 0) + 1
+    def on_fields(self, event: Sensors, rejects: tuple[Reject, ...]) -> None:
+        """Record the values of the fields of a report of mode 0. rejects: those out of the range of this car."""
+        rejected = {reject.word for reject in rejects}
+        for name in rejected:
+            self.rejected[name] = self.rejected.get(name, 0) + 1
         for each in SENSOR_FIELDS:
             value = getattr(event, each.attribute)
-            if value is None:
-                continue
             word = each.word.decode()
+            if value is None or word in rejected:
+                continue
             if isinstance(value, tuple):
                 self.extremes.setdefault(word, (0.0, 1.0))
             else:

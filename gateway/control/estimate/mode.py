@@ -53,6 +53,8 @@ class ModeEstimator:
     verdict: Verdict = Verdict.ASSUMED
     evidence: str = "no reading yet"
     evidence_at: float | None = None
+    since: float | None = None
+    """Since when the mode is commanded and the verdict is what it is; None if no mode was commanded on this link."""
     candidates: tuple[Mode, ...] = ()
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
@@ -87,6 +89,8 @@ class ModeEstimator:
         self._obeyed_at = now + self.profile.mode_turn_s(mode) + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
+        if mode is not self.asked or self.verdict is not Verdict.ASSUMED:
+            self.since = now
         self.asked = mode
         self._asked_at = now
         self._matches = self._mismatches = 0
@@ -109,7 +113,7 @@ class ModeEstimator:
         self._blocks.clear()
         self.verdict = Verdict.ASSUMED
         self.evidence = "the link was lost"
-        self.evidence_at = None
+        self.evidence_at = self.since = None
 
     def on_reading(self, event: Sensors, *, counts: bool = True) -> None:
         """Update the estimate with a reading. If it does not count, it only ends the silence."""
@@ -150,6 +154,8 @@ class ModeEstimator:
         if limit is None:
             self._on_expected_silence(self.asked, now)
             return
+        if self._heard_at == float("-inf"):
+            return  # a car that never sent anything shows no mode by its silence
         silent_s = self.unheard_s(now)
         if silent_s > self.manual_silence_s:
             self._set_candidates(self._silent_modes)
@@ -171,6 +177,15 @@ class ModeEstimator:
     def heard_at(self) -> float:
         """Return when the last reading arrived; -inf if none has."""
         return self._heard_at
+
+    @property
+    def why_quiet(self) -> str:
+        """Return why a silence of the car is expected, in words."""
+        if self.asked is None:
+            return "in an unknown mode a car may be silent"
+        if self.asked in self.profile.silent_modes or self.asked is Mode.MANUAL:
+            return f"{self.asked} is silent"
+        return f"it is not known whether this car reports in {self.asked}"
 
     def fade(self, now: float) -> None:
         """Withdraw a confirmation that is older than the longest silence of the commanded mode."""
@@ -247,6 +262,8 @@ class ModeEstimator:
     def _conclude(self, verdict: Verdict, evidence: str, at: float) -> None:
         if verdict is Verdict.CONFIRMED and self.asked is not None:
             self.learned.reporting.add(self.asked)
+        if verdict is not self.verdict:
+            self.since = at
         self.verdict = verdict
         self.evidence = evidence
         self.evidence_at = at

@@ -137,6 +137,14 @@ class PlatformDetector:
                 return ()
         return new
 
+    def note(self, words: str) -> bool:
+        """Add a contradiction that other evidence has shown. Return True if it is new."""
+        if words in self._against:
+            return False
+        self._extra_options.add(words)
+        self._against[words] = _PlatformEvidence(holds=True)
+        return True
+
     def _count_variant(self, option: str) -> None:
         """Count one sign of a variant of the program. Only a car whose platform is detected gets it by itself."""
         self._frames[option] = self._frames.get(option, 0) + 1
@@ -169,9 +177,7 @@ class PlatformDetector:
             self._apply_evidence()
             return ()
         words = f"{option} frames, which {self.profile.name} cars do not send. Is it {self.profile.name}+{option}?"
-        self._extra_options.add(words)
-        self._against[words] = _PlatformEvidence(holds=True)
-        return (words,)
+        return (words,) if self.note(words) else ()
 
     def _count_head(self, head: str | None) -> tuple[str, ...]:
         """Count one sensors frame that begins with another word than those of this profile."""
@@ -192,9 +198,7 @@ class PlatformDetector:
             "+".join((self.profile.kind, *sorted(self._without_head(self.profile.options) | {option})))
         )
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
-        self._extra_options.add(words)
-        self._against[words] = _PlatformEvidence(holds=True)
-        return (words,)
+        return (words,) if self.note(words) else ()
 
     def _detect(self, event: Sensors) -> None:
         """Detect the platform from the first evidence."""

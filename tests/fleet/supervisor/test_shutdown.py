@@ -17,7 +17,10 @@ from schemas.gen import fleet_v1_pb2 as pb
 SHOWN = pb.Safety(motors="off", motors_basis="shown", boot_id="a")
 SENT = pb.Safety(motors="off", motors_basis="sent", trust_evidence="red sends no readings", boot_id="a")
 UNKNOWN = pb.Safety(motors="unknown", boot_id="a")
-ONLINE, LOST = pb.Link(state="online", boot_id="a"), pb.Link(state="lost", boot_id="a")
+ONLINE, LOST = pb.Link(state="online", boot_id="a", rx_bytes=41), pb.Link(state="lost", boot_id="a")
+ACCEPTED = pb.Link(state="stale", boot_id="a", since_s=0.1)
+"""A bridge that is in use accepts a connection, and closes it."""
+SILENT = pb.Link(state="stale", boot_id="a", since_s=5.0)
 
 
 class Shutdown:
@@ -53,6 +56,8 @@ class Shutdown:
         (1, [ONLINE, UNKNOWN], NOT_CONFIRMED, True),
         (1, [ONLINE, UNKNOWN, LOST], NOT_STOPPED, True),
         (1, [LOST, UNKNOWN], NEVER_REACHED, False),
+        (1, [ACCEPTED, LOST, UNKNOWN], NEVER_REACHED, False),
+        (1, [SILENT, UNKNOWN], NOT_CONFIRMED, True),
         (1, [ONLINE, SHOWN, LOST], STOPPED, False),
     ],
 )
