@@ -28,7 +28,8 @@ MAX_RUN_DIRECTORIES: Final = 10
 """Maximum number of run directories, apart from those that may be in use."""
 RUN_IN_USE_S: Final = 3600.0
 """A run directory that was changed within this time may be in use and is not removed."""
-_LOGGED: Final = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (?P<level>[A-Z]+) (?P<words>.*)")
+_LOGGED: Final = re.compile(r"\d\d:\d\d:\d\d \S+ (?P<level>[A-Z]+) (?P<words>.*)")
+"""A line of a gateway's log, as gateway/cli.py formats it."""
 
 
 class Log(RotatingFileHandler):

@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fleet import cli
+from fleet.client.hints import complete_hints
 from fleet.commands.observe import CAR_COLUMNS
 from tests.fleet.conftest import Cars, running
 from tests.support.message_length import too_long
@@ -253,7 +254,7 @@ def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:
     endpoint = free_endpoint()
     done = run(endpoint, "list")
     assert done.returncode == 1
-    assert done.stderr.startswith("fleet: Nothing is running yet. Start your cars with `fleet up`")
+    assert f"`fleet up --connect {endpoint}`" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
@@ -417,17 +418,20 @@ def test_a_wrong_name_beside_all_is_named_and_all_are_stopped(cars: Cars) -> Non
 
 def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
     estopped = run(cars.endpoint, "estop", "blue", "--why", "wall")
-    assert estopped.stdout.endswith(". Release it with `fleet resume blue --estops`\n")
+    options = f"--connect {cars.endpoint}"
+    release = complete_hints("`fleet resume blue --estops`", options)
+    assert estopped.stdout.endswith(f"{release}\n")
     still = run(cars.endpoint, "resume", "blue")
     assert (still.returncode, still.stdout) == (1, "")
     assert re.fullmatch(
-        r'blue: still emergency-stopped by \S+ ."wall".. Release it with `fleet resume blue --estops` \[estopped\]\n',
+        rf'blue: still emergency-stopped by \S+ ."wall".. Release it with {re.escape(release)} \[estopped\]\n',
         still.stderr,
     )
     run(cars.endpoint, "stop", "blue")
     ended = run(cars.endpoint, "resume", "blue", "--estops")
     assert ended.returncode == 0
-    assert re.fullmatch(r"blue: e-stop released; still on hold by \S+: `fleet resume blue`\n", ended.stdout)
+    resume = re.escape(complete_hints("`fleet resume blue`", options))
+    assert re.fullmatch(rf"blue: e-stop released; still on hold by \S+: {resume}\n", ended.stdout)
     again = run(cars.endpoint, "resume", "blue", "--estops")
     assert (again.returncode, again.stderr) == (0, "blue: no e-stop is in force\n")
     nobody = run(cars.endpoint, "resume", "pink", "--estops")
@@ -442,7 +446,7 @@ def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> 
 
     estopped = invoke("estop")
     assert [line.split(". ")[-1] for line in estopped.output.splitlines()] == [
-        "One release frees all cars: `fleet resume --estops`"
+        complete_hints("One release frees all cars: `fleet resume --estops`", f"--connect {cars.endpoint}")
     ] * 3
     released = invoke("resume", "--estops")
     assert released.exit_code == 0, released.output

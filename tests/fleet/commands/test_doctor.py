@@ -33,7 +33,8 @@ def test_a_car_has_its_likely_cause_and_ten_lines(cars: Cars) -> None:
     lines = held.stdout.splitlines()
     assert held.returncode == 1
     assert lines[0] == (
-        "red: On hold: mia sent it a stop. No plan moves it until someone resumes it. Type: fleet resume red"
+        "red: On hold: mia sent it a stop. No plan moves it until someone resumes it. "
+        f"Type: fleet resume red --connect {cars.endpoint}"
     )
     assert len(lines) <= 10
     assert any(line.startswith("  refused") and "[held]" in line for line in lines), held.stdout

@@ -7,6 +7,7 @@ from click.testing import CliRunner, Result
 
 from fleet.cli import cli
 from fleet.client.client import Fleet
+from fleet.client.hints import complete_hints
 from schemas import keys
 from schemas.bus import reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb
@@ -22,6 +23,7 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
     def run(*words: str) -> Result:
         return CliRunner().invoke(cli, [*words, "--connect", endpoint])
 
+    options = f"--connect {endpoint}"
     with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
 
         def answer(query: zenoh.Query) -> bool:
@@ -33,20 +35,20 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
         for words in commands:
             done = run(*words)
             assert done.exit_code == 1
-            assert done.stderr == (
+            assert done.stderr == complete_hints(
                 "Error: No plan is running. Start one: `fleet plan run FILE`, "
-                "or a fleet with one: `fleet up --plan FILE`.\n"
+                "or a fleet with one: `fleet up --plan FILE`.\n",
+                options,
             )
         token = client.bus.token(keys.car_token("fleet", keys.SUPERVISOR))
         for words in commands:
-            assert run(*words).stderr == "Error: No plan is running. Start one: `fleet plan run FILE`.\n", token
-        assert (
-            run("why", "red").stdout == "red: on hold by ann (lead); `fleet resume red` ends it. No plan is running.\n"
-        )
+            one = complete_hints("Error: No plan is running. Start one: `fleet plan run FILE`.\n", options)
+            assert run(*words).stderr == one, token
+        held = "red: on hold by ann (lead); `fleet resume red` ends it. No plan is running.\n"
+        assert run("why", "red").stdout == complete_hints(held, options)
         safety.estops.add(id="1", by="bob", why="fire")
-        assert run("why", "red").stdout.startswith(
-            "red: e-stopped by bob: fire; `fleet resume red --estops` ends it; on "
-        )
+        estopped = "red: e-stopped by bob: fire; `fleet resume red --estops` ends it; on "
+        assert run("why", "red").stdout.startswith(complete_hints(estopped, options))
         safety.loan.CopyFrom(pb.Loan(to="eve", by="ann@lab-1", rank="lead", expires_in_s=60))
         safety.loan.since.seconds = at = 1_790_000_000
         safety.pauses.add(by="ann@lab-1", rank="lead", why="listen").stamp.seconds = at
