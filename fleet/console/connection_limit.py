@@ -7,8 +7,12 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
 
-MAX_CONNECTIONS: Final = 192
-"""Maximum number of connections from the network."""
+from fleet.console.budgets import Budget
+
+MAX_CONNECTIONS: Final = 640
+"""Maximum number of connections from the network: forty devices that take all they may."""
+MAX_PER_DEVICE: Final = 16
+"""Maximum number of connections of one paired device: a browser opens six for requests, and one for each tab."""
 MAX_STRANGERS_PER_ADDRESS: Final = 24
 STRANGER_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that has shown no cookie of a paired device."""
@@ -24,29 +28,11 @@ MAX_ADDRESSES: Final = 1024
 
 
 @dataclass(slots=True)
-class _Budget:
-    """A token bucket."""
-
-    burst: float
-    rate: float
-    left: float
-    at: float
-
-    def take(self, now: float) -> bool:
-        """Take one token. Return False if there is none."""
-        self.left = min(self.burst, self.left + max(0.0, now - self.at) * self.rate)
-        self.at = now
-        if self.left < 1.0:
-            return False
-        self.left -= 1.0
-        return True
-
-
-@dataclass(slots=True)
 class _OpenConnection:
     address: str
     since_s: float
-    is_paired: bool = False
+    device: str = ""
+    """The paired device whose cookie it has shown; empty: none."""
 
 
 @dataclass(slots=True)
@@ -54,19 +40,19 @@ class ConnectionLimit:
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
-    _total: _Budget = field(default_factory=lambda: _Budget(TOTAL_BURST, TOTAL_RATE, TOTAL_BURST, 0.0))
-    _addresses: dict[str, _Budget] = field(default_factory=dict)
+    _total: Budget = field(default_factory=lambda: Budget(TOTAL_BURST, TOTAL_RATE))
+    _addresses: dict[str, Budget] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
         """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
-        budget = self._addresses.pop(address, None) or _Budget(ADDRESS_BURST, ADDRESS_RATE, ADDRESS_BURST, now)
+        budget = self._addresses.pop(address, None) or Budget(ADDRESS_BURST, ADDRESS_RATE, at=now)
         self._addresses[address] = budget
         if len(self._addresses) > MAX_ADDRESSES:
             del self._addresses[next(iter(self._addresses))]
         # One address in a flood uses up its own budget, not that of all.
         if not budget.take(now) or not self._total.take(now):
             return False, None
-        strangers = [other for other, each in self._open.items() if not each.is_paired]
+        strangers = [other for other, each in self._open.items() if not each.device]
         neighbors = [other for other in strangers if self._open[other].address == address]
         ended: Hashable | None = None
         if len(neighbors) >= MAX_STRANGERS_PER_ADDRESS:
@@ -80,10 +66,16 @@ class ConnectionLimit:
         self._open[key] = _OpenConnection(address, now)
         return True, ended
 
-    def on_paired(self, key: Hashable) -> None:
-        """Keep a connection: it has shown the cookie of a paired device."""
-        if key in self._open:
-            self._open[key].is_paired = True
+    def on_paired(self, key: Hashable, device: str) -> bool:
+        """Keep a connection: it has shown the cookie of a paired device. Return False if the device has too many."""
+        found = self._open.get(key)
+        if found is None or found.device == device:
+            return True
+        if sum(each.device == device for each in self._open.values()) >= MAX_PER_DEVICE:
+            del self._open[key]
+            return False
+        found.device = device
+        return True
 
     def on_closed(self, key: Hashable) -> None:
         """Forget a connection."""
@@ -91,9 +83,7 @@ class ConnectionLimit:
 
     def expire(self, now: float) -> list[Hashable]:
         """Remove the connections of strangers that have lasted too long. Return their keys."""
-        late = [
-            key for key, each in self._open.items() if not each.is_paired and now - each.since_s >= STRANGER_TIMEOUT_S
-        ]
+        late = [key for key, each in self._open.items() if not each.device and now - each.since_s >= STRANGER_TIMEOUT_S]
         for key in late:
             del self._open[key]
         return late

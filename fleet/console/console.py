@@ -16,8 +16,10 @@ from fleet.client.client import default_sender
 from fleet.client.commands import CommandRequest, estop_request, pause_request, plain_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
+from fleet.console.budgets import MAX_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
+from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
@@ -41,8 +43,13 @@ from schemas.commands import STOPS
 from schemas.keys import person_of
 from schemas.process.suspend import SleepWatch, clock_pair
 
-MAX_PAGES: Final = 32
+MAX_PAGES: Final = 96
 """Maximum number of connected pages."""
+MAX_PAGES_OF_DEVICE: Final = 8
+"""Maximum number of connected pages of one device on the network."""
+KEPT_FOR_LEADS: Final = 8
+KEPT_FOR_THIS_COMPUTER: Final = 8
+"""Pages that are kept for leads, and for this computer."""
 _MAX_EVENTS: Final = 4096
 MAX_PLOT_S: Final = 600
 """Maximum time that a plot shows, s."""
@@ -53,7 +60,7 @@ log = logging.getLogger("fleet")
 
 
 class TooManyPages(Exception):
-    """No more pages may connect."""
+    """No more pages may connect. The text says why."""
 
 
 class Console:
@@ -73,6 +80,9 @@ class Console:
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
         """The course of the last STOP."""
+        self.budgets = Budgets()
+        self._merges: dict[tuple[str, ...], StopMerge] = {}
+        self._bad_messages = LogLimit()
         self._stop_ids: dict[str, None] = {}
         self._stops = 0
         self._pages: dict[int, PageLink] = {}
@@ -261,15 +271,33 @@ class Console:
         """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
         return management_refusal(self._view.rules.values(), (person or self.person).name)
 
-    async def add_page(self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None) -> PageLink:
-        """Add a page of a person (None: of this computer). Raises TooManyPages and BusError."""
-        person = person or self.person
-        operator = await self._operators.join(person.name)
-        if len(self._pages) >= MAX_PAGES:
-            self._operators.leave(person.name)
-            raise TooManyPages
+    def _check_room(self, person: PagePerson | None, device: str) -> None:
+        """Raise TooManyPages if no other page of this device may connect."""
+        most = MAX_PAGES
+        if person is not None:
+            most -= KEPT_FOR_THIS_COMPUTER + (0 if person.rank == "lead" else KEPT_FOR_LEADS)
+        if len(self._pages) >= most:
+            raise TooManyPages("too many pages are open")
+        if device and sum(page.device == device for page in self._pages.values()) >= MAX_PAGES_OF_DEVICE:
+            raise TooManyPages(f"this device has {MAX_PAGES_OF_DEVICE} pages open: close one")
+
+    async def add_page(
+        self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None, device: str = ""
+    ) -> PageLink:
+        """Add a page of a person (None: of this computer). Raises TooManyPages and BusError.
+
+        device: the id of the device on the network.
+        """
+        self._check_room(person, device)
+        whose = person or self.person
+        operator = await self._operators.join(whose.name)
+        try:
+            self._check_room(person, device)  # others may have come meanwhile
+        except TooManyPages:
+            self._operators.leave(whose.name)
+            raise
         self._last_page += 1
-        page = self._pages[self._last_page] = PageLink(self._last_page, send, person, operator)
+        page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
         names = {"sender": operator.sender, "fleet": self._fleet.sync.name}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), plottable=plottable())
         page.show("plan", self._plan_text())
@@ -292,7 +320,9 @@ class Console:
         try:
             self._on_message(page, PageMessage.of(text))
         except BadPageMessage as error:
-            log.warning("page %d sent a bad message: %s", page.number, error)
+            shown = self._bad_messages.words(f"page {page.number} sent a bad message: {error}", time.monotonic())
+            if shown is not None:
+                log.warning("%s", shown)
             page.answer(t="bad", words=str(error))
 
     async def set_plan(self, text: str, sender: str) -> tuple[bool, str]:
@@ -321,7 +351,22 @@ class Console:
             self._stop_ids[stop_id] = None
         if len(self._stop_ids) > _MAX_STOP_IDS:
             del self._stop_ids[next(iter(self._stop_ids))]
-        now, operator, request = time.monotonic(), operator or self.operator, request or stop_request()
+        operator, request = operator or self.operator, request or stop_request()
+        who = (request.sender or operator.sender, request.verb)
+        self._merged(who, partial(self._stop_all, operator, request))
+
+    def _merged(self, who: tuple[str, ...], stop: Callable[[], object]) -> None:
+        """Stop at once. Of further stops of the same kind in the next moment, one is sent at its end for all."""
+        if len(self._merges) >= _MAX_STOP_IDS:
+            del self._merges[next(iter(self._merges))]
+        delay_s = self._merges.setdefault(who, StopMerge()).delay_s(time.monotonic())
+        if delay_s == 0.0:
+            stop()
+        elif delay_s is not None:
+            asyncio.get_running_loop().call_later(delay_s, stop)
+
+    def _stop_all(self, operator: ConsoleOperator, request: CommandRequest) -> None:
+        now = time.monotonic()
         for press in self._presses.on_stop(now):
             self._end(press, "All cars were stopped.")
         self._stops += 1
@@ -375,10 +420,16 @@ class Console:
                 else:
                     page.operator.spawn(self._ask_coordinator(page, request_id, verb))
             case "do":
-                request, cars = message.request(), message.cars()
+                request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
                 if request.verb in (*STOPS, "mode"):
                     self._stop_presses(set(cars), "The car was stopped.")
-                page.operator.command(request, cars, self._answer_to(page, message))
+                send = partial(page.operator.command, request, cars, answer)
+                if request.verb in STOPS:
+                    self._merged((page.operator.sender, request.verb, *cars), send)
+                elif page.operator.is_busy:
+                    raise BadPageMessage(f"{MAX_COMMANDS} commands have no result yet. Wait for them.")
+                else:
+                    send()
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
 

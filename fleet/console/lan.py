@@ -71,6 +71,11 @@ class LimitedListener(socket.socket):
         self._accepted[address] = connection
         return connection, address
 
+    def on_paired(self, key: Hashable, device: str) -> None:
+        """Keep the connection of a paired device, or end it if the device has too many."""
+        if not self.limit.on_paired(key, device):
+            self._end(key)
+
     def expire(self) -> None:
         """End connections of strangers that have lasted too long."""
         self._forget_closed()
@@ -152,7 +157,7 @@ class Lan:
         self.guesses.on_right(address)
         paired = found.devices[-1]
         log.warning("%s paired as %s, %s (%s)", address, paired.person.name, paired.person.rank, paired.id)
-        self.listener.limit.on_paired(client)
+        self.listener.on_paired(client, paired.id)
         return cookie, 0.0, paired.person
 
     @staticmethod
@@ -177,7 +182,7 @@ class Lan:
 
     def on_device(self, client: tuple[str, int], device: PairedDevice) -> None:
         """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
-        self.listener.limit.on_paired(client)
+        self.listener.on_paired(client, device.id)
         others = {address for id_, address, _ in self._connected.values() if id_ == device.id} - {client[0]}
         if others and (words := self._shared_cookies.words("", time.monotonic())) is not None:
             places = ", ".join([client[0], *sorted(others)])

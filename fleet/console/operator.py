@@ -11,6 +11,7 @@ from fleet.aio import Fleet
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
+from fleet.console.budgets import MAX_COMMANDS
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from fleet.policy.plan.parser import BadPlan, parse
@@ -38,6 +39,8 @@ class ConsoleOperator:
         """Time of the last drive and number of drives, by press."""
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
+        self._commands = 0
+        """Number of commands without an outcome, apart from stops of all."""
         self._renewals: set[str] = set()
         """Cars whose lease is being renewed."""
 
@@ -111,12 +114,22 @@ class ConsoleOperator:
         self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> None:
         """Send one command to some cars (None: to all) and report the outcomes."""
+        self._commands += 1
         self.spawn(self._command(request, cars, on_outcomes))
 
     async def _command(
         self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> None:
-        on_outcomes([asdict(outcome) for outcome in await self._fleet.ask(request, cars)])
+        try:
+            outcomes = await self._fleet.ask(request, cars)
+        finally:
+            self._commands -= 1
+        on_outcomes([asdict(outcome) for outcome in outcomes])
+
+    @property
+    def is_busy(self) -> bool:
+        """True if too many commands of this person have no outcome yet."""
+        return self._commands >= MAX_COMMANDS
 
     def take_lease(
         self, client: int, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]

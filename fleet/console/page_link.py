@@ -22,9 +22,15 @@ class PageLink:
     """One connected page."""
 
     def __init__(
-        self, number: int, send: Callable[[str], Awaitable[None]], person: PagePerson, operator: ConsoleOperator
+        self,
+        number: int,
+        send: Callable[[str], Awaitable[None]],
+        person: PagePerson,
+        operator: ConsoleOperator,
+        device: str = "",
     ) -> None:
         self.number = number
+        self.device = device
         self.person = person
         self.operator = operator
         self._send = send

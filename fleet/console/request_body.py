@@ -1,15 +1,26 @@
 """Reads the bodies of HTTP requests, at most as much of them as is allowed."""
 
+import asyncio
+from typing import Final
+
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
+
+BODY_TIMEOUT_S: Final = 10.0
+"""Timeout of a body, from its first wait on."""
 
 
 async def read_start(request: Request, size: int) -> bytes:
-    """Return the first `size` bytes of the body. The rest is not read."""
+    """Return the first `size` bytes of the body. The rest is not read. Raises HTTPException if it does not come."""
     body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) >= size:
-            break
+    try:
+        async with asyncio.timeout(BODY_TIMEOUT_S):
+            async for part in request.stream():
+                body += part
+                if len(body) >= size:
+                    break
+    except TimeoutError:
+        raise HTTPException(408, "the body of the request did not come", {"connection": "close"}) from None
     return body[:size]
 
 

@@ -4,6 +4,7 @@ import asyncio
 import logging
 import secrets
 import socket
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -21,8 +22,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleet.aio import Fleet
 from fleet.client.commands import stop_request
+from fleet.console.budgets import TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
-from fleet.console.guard import PERSON, STOP_PATH, App, Guard, NetworkGuard
+from fleet.console.fair_socket import FairWebSocket
+from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
 from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.request_body import read_text
 from schemas.bus import LARGEST_PAYLOAD, BusError
@@ -42,7 +45,9 @@ HELLO: Final = "fleet console"
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Room for what a message contains beside the text of a plan, bytes."""
-_TRY_AGAIN_LATER: Final = 1013
+TRY_AGAIN_LATER: Final = 1013
+SENT_TOO_MUCH: Final = 4008
+"""Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
 _CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout for open connections when the console ends."""
 
@@ -103,6 +108,7 @@ def network_app(console: Console, lan: "Lan") -> App:
 def _config(app: App) -> uvicorn.Config:
     return uvicorn.Config(
         app,
+        ws=FairWebSocket,
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_max_queue=64,
         log_config=None,
@@ -153,7 +159,7 @@ async def serve(
                 await each
 
 
-def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Starlette:
+def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App:
     async def page(_: Request) -> Response:
         return FileResponse(STATIC / "index.html")
 
@@ -179,18 +185,29 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
+        person = socket_.scope.get(PERSON)
+        name, budget = person and person.name, page_budget(time.monotonic())
+        if not console.budgets.may_open(name, time.monotonic()):
+            await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
+            return
         try:
             async with _joined(console, socket_, lan) as on_text:
                 while True:
-                    on_text(await socket_.receive_text())
-        except TooManyPages:
-            await socket_.close(_TRY_AGAIN_LATER, "too many pages are open")
+                    text = await socket_.receive_text()
+                    if not console.budgets.may_send(name, budget, time.monotonic()):
+                        log.warning("a page of %s was closed: it sent too much", name or "this computer")
+                        await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
+                        return
+                    on_text(text)
+                    await asyncio.sleep(0)  # a page that floods must not keep the others waiting
+        except TooManyPages as error:
+            await socket_.close(TRY_AGAIN_LATER, str(error))
         except BusError:
-            await socket_.close(_TRY_AGAIN_LATER, "the bus cannot be reached")
+            await socket_.close(TRY_AGAIN_LATER, "the bus cannot be reached")
         except (WebSocketDisconnect, KeyError, RuntimeError):  # a binary message; a socket that we have closed
             await _close(socket_)
 
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/", page),
             Route("/hello", hello),
@@ -206,6 +223,17 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
         ]
     )
 
+    async def limited(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["path"] != STOP_PATH:
+            person = scope.get(PERSON)
+            if not console.budgets.may_ask(person and person.name, time.monotonic()):
+                words = "This device asks for far more than a page does. Wait a few seconds."
+                await PlainTextResponse(words, 429, {"connection": "close"})(scope, receive, send)
+                return
+        await app(scope, receive, send)
+
+    return limited
+
 
 async def _answer_plan(request: Request, ask: Callable[[str], Awaitable[tuple[bool, str]]]) -> Response:
     """Answer a request with the text of a plan."""
@@ -219,7 +247,7 @@ async def _answer_plan(request: Request, ask: Callable[[str], Awaitable[tuple[bo
 @asynccontextmanager
 async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> AsyncIterator[Callable[[str], None]]:
     """Join a page to the console. Yield the function that takes its messages."""
-    page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON))
+    page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON), socket_.scope.get(DEVICE, ""))
     sending = asyncio.ensure_future(page.run())
 
     def end() -> None:

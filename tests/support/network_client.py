@@ -100,6 +100,7 @@ class NetworkDevice:
             ssl=untrusting(),
             proxy=None,
             open_timeout=30,
+            close_timeout=1,  # this client does not read the answer to its closing behind messages that nobody took
             source_address=self._source,
         )
 

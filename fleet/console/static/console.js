@@ -1,6 +1,8 @@
 // The page's side of the one WebSocket: the newest state, presses, STOP, commands and their outcomes.
 
 const RECONNECT_MS = 500;
+const SENT_TOO_MUCH = 4008; // the close code of a page that has sent far more than a person can
+const COOLDOWN_MS = 15_000;
 const UNPAIRED_MS = 5000;
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
@@ -313,11 +315,12 @@ async function connect() {
     changed();
   };
   socket.onmessage = (event) => onMessage(event.data);
-  socket.onclose = () => {
+  socket.onclose = (event) => {
     store.connected = false;
     store.press = null;
+    if (event.code === SENT_TOO_MUCH) note(event.reason, true);
     changed();
-    setTimeout(connect, RECONNECT_MS);
+    setTimeout(connect, event.code === SENT_TOO_MUCH ? COOLDOWN_MS : RECONNECT_MS);
   };
 }
 

@@ -10,6 +10,7 @@ from fleet.console.connection_limit import (
     ADDRESS_RATE,
     MAX_ADDRESSES,
     MAX_CONNECTIONS,
+    MAX_PER_DEVICE,
     MAX_STRANGERS_PER_ADDRESS,
     STRANGER_TIMEOUT_S,
     TOTAL_BURST,
@@ -162,7 +163,7 @@ def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, 
                     strangers[key] = now
             case "pair" if strangers:
                 key = sorted(strangers)[number % len(strangers)]
-                limit.on_paired(key)
+                assert limit.on_paired(key, f"device {key}")
                 del strangers[key]
                 paired_ones.add(key)
             case "close" if strangers:
@@ -194,10 +195,21 @@ def test_a_full_house_ends_the_oldest_stranger_never_a_paired_device() -> None:
     for number in range(MAX_CONNECTIONS):
         assert limit.admit(number, str(number), float(number)) == (True, None)
         if number:
-            limit.on_paired(number)
+            assert limit.on_paired(number, str(number))
     assert limit.admit("new", "x", 1000.0) == (True, 0)
-    limit.on_paired("new")
+    assert limit.on_paired("new", "a new device")
     assert limit.admit("one more", "y", 1001.0) == (False, None)
+
+
+def test_one_device_keeps_so_many_connections_and_no_other_loses_one() -> None:
+    limit, kept = ConnectionLimit(), 0
+    for number in range(100):
+        assert limit.admit(number, str(number), 0.0)[0]
+        kept += limit.on_paired(number, "greedy")
+    assert kept == len(limit) == MAX_PER_DEVICE
+    assert limit.on_paired(0, "greedy"), "it shows its cookie with each request"
+    assert limit.admit("phone", "phone", 1.0)[0]
+    assert limit.on_paired("phone", "calm")
 
 
 def test_a_flood_of_messages_is_counted_not_logged() -> None:

@@ -23,8 +23,9 @@ from websockets.typing import Origin
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
+from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.people_file import PeopleFile, people_path
-from fleet.console.server import MAX_MESSAGE_BYTES
+from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
 from schemas.bus import reply_message
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.console import ConsoleProcess
@@ -35,6 +36,8 @@ from tests.support.processes import FleetProcesses, wait_for
 
 PEOPLE = ("teacher:lead", "mia", "thief")
 """The people who may drive red."""
+FLOOD = 40_000
+"""Messages of a page that floods."""
 WARM_UP = 2000
 """Connections until TLS and the allocator need no more memory. The first thousand take 17 MB, the next one about 1."""
 MAX_GROWTH_MB_PER_THOUSAND = 2.0
@@ -384,6 +387,54 @@ def loopback_socket(stage: ServerStage) -> ClientConnection:
     address = f"ws://127.0.0.1:{stage.console.port}/ws"
     headers = {"Cookie": loopback_cookie(stage)}
     return connect(address, origin=Origin(stage.console.address), additional_headers=headers, proxy=None)
+
+
+def close_code(page: ClientConnection) -> int:
+    """Read until the console closes the page. Return why."""
+    try:
+        while True:
+            page.recv(30)
+    except ConnectionClosed as ended:
+        return 0 if ended.rcvd is None else ended.rcvd.code
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("echo", '{"t":"echo","n":1,"press":1}'), ("stop", '{"t":"stop","id":""}'), ("bad", "{")]
+)
+def test_a_page_that_floods_is_closed_and_costs_nobody_a_stop(stage: ServerStage, name: str, text: str) -> None:
+    thief, calm = stage.device(name), stage.device("calm")
+    with thief.socket() as flooder, calm.socket() as page:
+        closed = threading.Event()
+
+        def flood() -> None:
+            with contextlib.suppress(ConnectionClosed):
+                for _ in range(FLOOD):
+                    flooder.send(text)
+            closed.set()
+
+        threading.Thread(target=flood, daemon=True).start()
+        assert closed.wait(60)
+        assert close_code(flooder) == SENT_TOO_MUCH
+        with thief.socket() as again:
+            assert close_code(again) == SENT_TOO_MUCH, "it waits first"
+        stage.drive()
+        assert thief.ask("POST", "/stop")[0] == 204, "a closed page still stops all cars"
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        stage.drive()
+        page.send(json.dumps({"t": "stop", "id": name}))
+        wait_for(lambda: not stage.judge.driving, "red stands")
+    assert "Traceback" not in stage.log()
+
+
+def test_one_device_has_so_many_pages_and_others_still_come(stage: ServerStage) -> None:
+    greedy, calm = stage.device("mia"), stage.device("calm")
+    with contextlib.ExitStack() as pages:
+        opened = [pages.enter_context(greedy.socket()) for _ in range(MAX_PAGES_OF_DEVICE)]
+        assert all(json.loads(each.recv(30))["t"] == "hello" for each in opened)
+        one_more = pages.enter_context(greedy.socket())
+        assert close_code(one_more) == TRY_AGAIN_LATER
+        other = pages.enter_context(calm.socket())
+        assert json.loads(other.recv(30))["t"] == "hello"
 
 
 @pytest.mark.soak

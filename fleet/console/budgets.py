@@ -1,0 +1,118 @@
+"""How much one page and one person may ask of the console. Pure: time is an argument (s, monotonic).
+
+The console stops the cars for everybody, on one loop. A page that sends without a pause must cost nobody but itself.
+So each has a budget, far above what our own page can send, and a page that exceeds it is closed. STOP is merged and
+never dropped: it has no budget here, and a page that was closed still stops all cars by POST.
+"""
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Final
+
+# Our page sends 10 echoes a second while a finger is down, and a few messages for each press. After 30 s of slow Wi-Fi
+# it may send some 450 at once. The limits are ten times that.
+PAGE_BURST: Final = 5000.0
+PAGE_RATE: Final = 160.0
+"""Messages of one page: at once, and per second."""
+PERSON_BURST: Final = 10_000.0
+PERSON_RATE: Final = 320.0
+"""The same for all pages of one person."""
+REQUEST_BURST: Final = 1000.0
+REQUEST_RATE: Final = 50.0
+"""HTTP requests of one person other than STOP: a page loads some 25 files."""
+COOLDOWN_S: Final = 15.0
+"""Time for which a person whose page was closed opens no other one."""
+MAX_COMMANDS: Final = 16
+"""Maximum commands of one person without an outcome. One command may be for many cars."""
+MAX_PERSONS: Final = 256
+"""Maximum number of remembered persons. The one that was idle the longest is forgotten."""
+MERGE_S: Final = 0.1
+"""Time for which further STOPs of one person are merged into one that follows."""
+TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
+
+
+@dataclass(slots=True)
+class Budget:
+    """A token bucket."""
+
+    burst: float
+    rate: float
+    left: float = -1.0
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.left < 0.0:
+            self.left = self.burst
+
+    def take(self, now: float) -> bool:
+        """Take one token. Return False if there is none."""
+        self.left = min(self.burst, self.left + max(0.0, now - self.at) * self.rate)
+        self.at = now
+        if self.left < 1.0:
+            return False
+        self.left -= 1.0
+        return True
+
+
+def page_budget(now: float) -> Budget:
+    """Return the budget of messages of a new page."""
+    return Budget(PAGE_BURST, PAGE_RATE, at=now)
+
+
+@dataclass(slots=True)
+class _PersonBudget:
+    messages: Budget
+    requests: Budget
+    closed_until: float = float("-inf")
+
+
+@dataclass(slots=True)
+class Budgets:
+    """The budgets of all persons, by name (None: of this computer)."""
+
+    _persons: dict[Hashable, _PersonBudget] = field(default_factory=dict)
+
+    def may_send(self, person: Hashable, page: Budget, now: float) -> bool:
+        """Count a message. Return False if the page has to be closed: it, or its person, has sent too many."""
+        one = self._of(person, now)
+        if page.take(now) and one.messages.take(now):
+            return True
+        one.closed_until = now + COOLDOWN_S
+        return False
+
+    def may_open(self, person: Hashable, now: float) -> bool:
+        """Return False if a page of this person was closed a moment ago."""
+        return now >= self._of(person, now).closed_until
+
+    def may_ask(self, person: Hashable, now: float) -> bool:
+        """Count an HTTP request. Return False if there were too many."""
+        return self._of(person, now).requests.take(now)
+
+    def _of(self, person: Hashable, now: float) -> _PersonBudget:
+        found = self._persons.pop(person, None)
+        if found is None:
+            found = _PersonBudget(
+                Budget(PERSON_BURST, PERSON_RATE, at=now), Budget(REQUEST_BURST, REQUEST_RATE, at=now)
+            )
+        self._persons[person] = found
+        if len(self._persons) > MAX_PERSONS:
+            del self._persons[next(iter(self._persons))]
+        return found
+
+
+@dataclass(slots=True)
+class StopMerge:
+    """Merges the STOPs of one person: the first goes at once, all others of the next moment become one more."""
+
+    _open_at: float = float("-inf")
+
+    def delay_s(self, now: float) -> float | None:
+        """Return after which time to send this STOP, 0 for at once. None: one that waits stands for it."""
+        if now >= self._open_at:
+            self._open_at = now + MERGE_S
+            return 0.0
+        if self._open_at > now + MERGE_S:
+            return None
+        wait_s = self._open_at - now
+        self._open_at += MERGE_S
+        return wait_s
