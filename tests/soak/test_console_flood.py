@@ -68,7 +68,7 @@ def test_a_stop_does_not_notice_three_pupils_that_flood(tmp_path: Path) -> None:
     stage = ServerStage(FleetProcesses(free_endpoint(), tmp_path))
     written: list[float] = []
     stage.fleet.bus.subscribe("fleet/red/frame/tx", lambda _: written.append(time.monotonic()))
-    teacher = stage.device("teacher", "--lead")
+    teacher = stage.device("teacher")
     server, over = psutil.Process(stage.console.process.popen.pid), threading.Event()
     before_mb = server.memory_info().rss / 1e6
     pupils = [NetworkDevice(stage.lan_port, source=f"127.0.0.{10 + number}") for number in range(3)]
