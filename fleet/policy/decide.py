@@ -360,11 +360,14 @@ def _decide_places(
 ) -> list[Decision]:
     result = []
     for name in candidates.plan.roles:
-        if not allocation.places.get(name):
+        role, places = candidates.plan.roles[name], allocation.places.get(name, 0)
+        # A role for all cars has no place while every car is left alone, and wants one nevertheless.
+        wants_all = role.count is None and not role.by_rules and name in candidates.in_force
+        if not places and not wants_all:
             result.append(explain_inactive(name, candidates, phase))
             continue
-        least = 1 if candidates.plan.roles[name].count is None else allocation.places[name]
-        if len(allocation.holders(name)) < min(least, allocation.places[name]):
+        least = 1 if role.count is None else places
+        if len(allocation.holders(name)) < least:
             result.append(explain_vacancy(name, candidates, allocation, barriers))
         else:
             result.append(explain_filled(name, candidates, allocation, barriers))

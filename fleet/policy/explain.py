@@ -228,6 +228,8 @@ class _Others:
     """Why each of them does not have it."""
     words: str
     """The same with the cars' names, truncated if there are many."""
+    changes: str
+    """What would let each of them have it, with the cars' names, truncated likewise."""
     used: tuple[str, ...]
     has_able: bool
     """True if one of them could have it."""
@@ -236,7 +238,8 @@ class _Others:
 def _list_others(
     name: str, candidates: Candidates, allocation: RoleAllocation, barriers: Mapping[str, Barrier]
 ) -> _Others:
-    role, kinds, whys, used, has_able = candidates.plan.roles[name], list[str](), list[str](), list[str](), False
+    role, kinds, whys, changes = candidates.plan.roles[name], list[str](), list[str](), list[str]()
+    used, has_able = list[str](), False
     for car in sorted({*candidates.free, *barriers}):
         if allocation.roles.get(car) == name or not candidates.plan.may(car, role):
             continue
@@ -247,8 +250,11 @@ def _list_others(
         if len(whys) < _MAX_REASONS:
             whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
             used += candidates.seen(car, barrier)
+            if barrier is not None:
+                changes.append(f"{car}: {barrier.change}")
     more = f"; and {len(kinds) - _MAX_REASONS} more" if len(kinds) > _MAX_REASONS else ""
-    return _Others(tuple(kinds), "; ".join(whys) + more, tuple(dict.fromkeys(used)), has_able)
+    change = "; or ".join(changes)
+    return _Others(tuple(kinds), "; ".join(whys) + more, change, tuple(dict.fromkeys(used)), has_able)
 
 
 def explain_vacancy(
@@ -259,8 +265,9 @@ def explain_vacancy(
     decided, others = _count(role, allocation), _list_others(name, candidates, allocation, barriers)
     instead = f"; {role.if_none} gets the place" if role.if_none is not None else ""
     if others.kinds:
-        why = f"{'no car is left for it' if others.has_able else 'no other car can'}: {others.words}"
-        change = "one of them is left for it, or becomes able to" if others.has_able else "one of them becomes able to"
+        cannot = f"no {'other ' if holders else ''}car can"
+        why = f"{'no car is left for it' if others.has_able else cannot}: {others.words}"
+        change = "one of them is left for it, or becomes able to" if others.has_able else others.changes
     elif {*candidates.free, *barriers} - {*holders}:
         why, change = "the plan gives it to no other car that is there", "a car comes up that may have it"
     else:

@@ -167,6 +167,7 @@ phases: {search: {until: {any_car: light.left}, next: gather}, gather: {}}
 OF_ALL = {
     "all that are left": (LEFT_OVER, ("blue", "green", "red")),
     "all but one on hold": (LEFT_OVER, ("blue", "green", "red")),
+    "all on hold": (REST, ("red",)),
     "all there are": (REST, ("blue", "red")),
     "given to no other": (CERTAIN, ("blue", "red")),
     "not measured in its mode": (UNSEEN, ("red",)),
@@ -179,6 +180,8 @@ def _of_all(case: str) -> PolicyRun:
     run = PolicyRun(plan, *cars)
     if case == "all but one on hold":
         run.change("green", held_by="ann")
+    if case == "all on hold":
+        run.change("red", held_by="ann")
     if case == "phase that nothing ends":
         run.change("red", mode="obstacle_avoidance")
     run.at(0.0)
