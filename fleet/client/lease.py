@@ -116,7 +116,8 @@ class Lease:
     def check(self) -> None:
         """Raise LeaseLost if the lease is lost: leave the car to its new holder."""
         if self._monitor.lost:
-            raise LeaseLost(Outcome(self._name, ok=False, phase="rejected", reason="leased"), self._monitor.lost)
+            lost = self._monitor.lost
+            raise LeaseLost(Outcome(self._name, ok=False, phase="rejected", reason="leased", words=lost), lost)
 
     def _release(self, error: BaseException | None) -> None:
         if self._monitor.lost:

@@ -58,7 +58,7 @@ class Outcome:
     reason: str = ""
     """The gateway's reason (`held, wrong_mode, link_down, ...`). Empty if there is none."""
     words: str = ""
-    """Text for a person: the cause and what to do."""
+    """Text for a person, never empty: what was done, or the cause and what to do."""
     worst_case_s: float | None = None
     """Maximum time until the motors are off, as the gateway announced for a stop. None for other commands."""
     took_s: float = 0.0
@@ -283,4 +283,7 @@ class Progress:
                 effect = f"drove {words.removeprefix(_SENT_FOR)}"
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
-            self.outcome = Outcome(self.car, ok, phase, reason, words, worst_case_s, took_s, self._basis, effect, after)
+            # Of what was done, the gateway says only what is odd about it, often nothing. The effect has that, too.
+            told = (effect or words) if ok else (words or effect)
+            told = told or f"{self._verb or 'command'} {phase}"
+            self.outcome = Outcome(self.car, ok, phase, reason, told, worst_case_s, took_s, self._basis, effect, after)

@@ -56,6 +56,23 @@ def test_not_known_yet(until: Until, steps: Steps) -> None:
     assert told(until, steps, 2.0).outcome is None
 
 
+@pytest.mark.parametrize("verb", sorted({*COMMANDS, *EFFECTS} - {"*"}))
+@pytest.mark.parametrize("until", Until)
+@pytest.mark.parametrize("phase", ["sent", "complete", "superseded", "expired", "failed", "rejected"])
+def test_an_outcome_has_words_also_where_the_gateway_said_none(verb: str, until: Until, phase: str) -> None:
+    progress = Progress("red", until, 100.0, verb=verb)
+    progress.on_answer("sent", "", "", 0.0, 101.0)
+    progress.on_event(phase, "", "", 0.0, 102.0)
+    outcome = progress.outcome
+    if outcome is None:  # a drive that goes on
+        progress.give_up(200.0)
+        outcome = progress.outcome
+    assert outcome is not None
+    assert outcome.words
+    if outcome.ok and outcome.effect:
+        assert outcome.words == outcome.effect
+
+
 def test_an_answer_that_its_last_record_overtook_still_says_the_worst_case() -> None:
     outcome = told(Until.STOPPED, [("event", "complete", 0.0), ("answer", "sent", 0.5)]).outcome
     assert outcome is not None
