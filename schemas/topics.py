@@ -1,6 +1,7 @@
 """The one table of topics: name, message, units, rate, staleness, QoS, recorded or not, Rerun entity. Pure."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -278,6 +279,9 @@ SERVICE_TOPICS: Final = (
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
 
 RESULT: Final = "fleet.v1.Result"
+_FAMILIES: Final = tuple(dict.fromkeys(topic.family for topic in CAR_TOPICS))
+_MIN_WORD_LENGTH: Final = 4
+"""Minimum length of a word that is searched in what topics are about: shorter ones are in many texts."""
 
 
 def of_key(key: str) -> Topic | None:
@@ -289,13 +293,29 @@ def of_key(key: str) -> Topic | None:
 
 
 def likely_name(name: str) -> str | None:
-    """Return the topic that was probably meant by a wrong name: `sensor/rang` is sensor/range."""
+    """Return the topic that was probably meant by a wrong name: `sensor/rang` or `sensor/distance` is sensor/range."""
     family, _, last = name.rpartition("/")
     # The last part decides: with the family, any two topics of one family would be alike.
     there = sorted(TOPICS, key=lambda each: (each.rpartition("/")[0] != family, each.startswith("@")))
     parts = [each.rpartition("/")[2] for each in there]
     if last == "*" or (not family and last not in parts):
-        near = nearest(family or last, [each.family for each in CAR_TOPICS])
-        return f"{near}/*" if near else None
-    near = nearest(last, parts)
-    return there[parts.index(near)] if near else None
+        near = nearest(family or last, _FAMILIES)
+        if near:
+            return f"{near}/*"
+    near = None if last == "*" else nearest(last, parts)
+    if near:
+        return there[parts.index(near)]
+    return _topic_about(last, [each for each in there if each.startswith("@") == name.startswith("@")])
+
+
+def _topic_about(word: str, there: list[str]) -> str | None:
+    """Return the first topic that is about this word, or that has a field of this name. None if none is."""
+    about: dict[str, str] = {}
+    for name in there:
+        for each in re.findall(r"[a-z]+", f"{TOPICS[name].about} {' '.join(TOPICS[name].units)}".lower()):
+            about.setdefault(each, name)
+    known = [each for each in about if len(each) >= _MIN_WORD_LENGTH and each not in _FAMILIES]
+    for part in re.findall(r"[a-z]+", word.lower()):
+        if len(part) >= _MIN_WORD_LENGTH and (near := nearest(part, known)):
+            return about[near]
+    return None

@@ -82,7 +82,8 @@ class KeyCondition:
                     raise
         if not found:
             every = {name: kind for fields in names.values() for name, kind in fields.items()}
-            parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)})
+            aliases = {a: f for message in names for a, f in topic_aliases_of(short[message], names[message]).items()}
+            parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)}, aliases)
             raise BadExpression(text, 1, f"no message under {written} has all of its fields: it is about one message")
         if len(never) == len(found):
             raise BadExpression(text, 1, never[0])

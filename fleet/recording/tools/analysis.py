@@ -59,7 +59,11 @@ def _empty_table(of: str, session: str) -> "pa.Table":
 
 def no_messages(of: str, session: str) -> NoTable:
     """Return the error that a session has no messages of this name."""
-    return NoTable(f"{session} has no messages of {of}. {did_you_mean(of, _known_names(), 2)}".rstrip())
+    # A path is the name of a topic, where the last part decides. As a whole, two topics of one family are alike.
+    likely = topics.likely_name(of) if "/" in of else None
+    is_other = likely is not None and not f"/{of}".endswith(f"/{likely}")
+    near = f"Did you mean {likely}?" if is_other else did_you_mean(of, _known_names(), 2)
+    return NoTable(f"{session} has no messages of {of}. {near}".rstrip())
 
 
 def is_known(name: str) -> bool:

@@ -147,6 +147,13 @@ def test_a_name_that_is_no_table_says_which_are(name: str, words: str) -> None:
         Session(OLD).to_arrow(name)
 
 
+def test_a_name_is_answered_with_the_topic_that_is_about_it() -> None:
+    with pytest.raises(NoTable) as refused:
+        Session(OLD).to_arrow("sensor/distance")
+    assert "sensor/range?" in str(refused.value)
+    assert "sensor/obstacle" not in str(refused.value)
+
+
 def test_a_topic_without_messages_is_an_empty_table() -> None:
     assert Session(OLD).to_arrow("sensor/arm").num_rows == 0
     assert "joint_deg" in Session(OLD).to_pandas("sensor/arm").columns
