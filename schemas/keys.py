@@ -40,6 +40,11 @@ def person_of(sender: str) -> str:
     return sender.partition("@")[0]
 
 
+def name_of(sender: str) -> str:
+    """Return a sender's name for a text: its person, without the host and the process that JSON and records have."""
+    return person_of(sender) or sender
+
+
 def describe_fleet(fleet: str) -> str:
     """Return a fleet's name for a person. The default name is left out."""
     return "the fleet" if fleet == DEFAULT_FLEET else f"fleet {fleet}"

@@ -11,7 +11,7 @@ from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
 from schemas.bluetooth import ADAPTER_FULL
-from schemas.keys import person_of
+from schemas.keys import name_of
 from schemas.local_time import clock
 
 RECENT_COMMAND_S: Final = 600.0
@@ -223,7 +223,7 @@ def _estopped(e: CarEvidence) -> str:
     if safety is None or not safety.estops:
         return ""
     estop = safety.estops[0]
-    return f"E-stopped by {estop.by}{f': {estop.why}' if estop.why else ''}. It accepts only stops."
+    return f"E-stopped by {name_of(estop.by)}{f': {estop.why}' if estop.why else ''}. It accepts only stops."
 
 
 def _paused(e: CarEvidence) -> str:
@@ -258,7 +258,7 @@ def _held(e: CarEvidence) -> str:
     safety = e.of("state/safety")
     if safety is None or not safety.HasField("hold"):
         return ""
-    return f"On hold: {safety.hold.by} sent it a stop. No plan moves it until someone resumes it."
+    return f"On hold: {name_of(safety.hold.by)} sent it a stop. No plan moves it until someone resumes it."
 
 
 def _leased(e: CarEvidence) -> str:
@@ -266,7 +266,7 @@ def _leased(e: CarEvidence) -> str:
     refused = any(event.reason == "leased" for _, event in e.failed)
     if safety is None or not safety.HasField("lease") or not refused:
         return ""
-    return f"{safety.lease.holder} ({safety.lease.kind}) drives it, so others are refused."
+    return f"{name_of(safety.lease.holder)} ({safety.lease.kind}) drives it, so others are refused."
 
 
 def _breaks(e: CarEvidence) -> str:
@@ -305,7 +305,7 @@ def _refused(e: CarEvidence) -> str:
     # Or the car has done since then what was refused.
     if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
         return ""
-    return f"{event.sender}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
+    return f"{name_of(event.sender)}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
 
 
 def _unrecorded(e: CarEvidence) -> str:
@@ -321,7 +321,7 @@ def _drops(e: CarEvidence) -> str:
 def _stopped_plan(e: CarEvidence) -> str:
     if not e.coordinated or e.assignment is None or not e.assignment.stopped_by:
         return ""
-    return f"{e.assignment.stopped_by} stopped the plan: it moves no car."
+    return f"{name_of(e.assignment.stopped_by)} stopped the plan: it moves no car."
 
 
 CHECKS: Final = (
@@ -433,7 +433,7 @@ def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
         yield f"lent to {loan.to} by {_who(loan, loan.since)}, {left}", f"fleet lend {car} --end"
     if safety.HasField("lease"):
         # `--take` would move the car, and takes nothing from a lead. A stop is everybody's, and ends the lease in 2 s.
-        yield f"driven by {safety.lease.holder} ({safety.lease.kind})", f"fleet stop {car}"
+        yield f"driven by {name_of(safety.lease.holder)} ({safety.lease.kind})", f"fleet stop {car}"
 
 
 def _who(deed: Any, stamp: Any) -> str:
@@ -441,7 +441,7 @@ def _who(deed: Any, stamp: Any) -> str:
     rank = f" ({deed.rank})" if deed.rank else ""
     since = f" since {clock(stamp.seconds)}" if stamp.seconds else ""
     why = f": {deed.why}" if getattr(deed, "why", "") else ""
-    return f"{person_of(deed.by) or deed.by}{rank}{since}{why}"
+    return f"{name_of(deed.by)}{rank}{since}{why}"
 
 
 def _control(car: str, safety: Any) -> str:
@@ -454,7 +454,7 @@ def _describe_refused(evidence: CarEvidence) -> str:
         return "no command was refused lately"
     age, event = failed[-1]
     more = f" ({len(failed) - 1} more before)" if len(failed) > 1 else ""
-    return f"{event.verb} of {event.sender} {age:.0f} s ago: {_why(event)}{more}"
+    return f"{event.verb} of {name_of(event.sender)} {age:.0f} s ago: {_why(event)}{more}"
 
 
 def _services(evidence: CarEvidence, health: Any) -> Iterator[str]:

@@ -53,17 +53,23 @@ class LeaseMonitor:
         elif self.lost:
             return
         elif holder not in ("", self._sender):
-            self.lost = f"{self._car} was taken by {holder} ({safety.lease.kind})"
+            self.lost = f"{self._car} was taken by {_other(holder, self._sender)} ({safety.lease.kind})"
         elif safety.estops:
-            self.lost = f"{self._car} was e-stopped by {safety.estops[0].by}"
+            self.lost = f"{self._car} was e-stopped by {keys.name_of(safety.estops[0].by)}"
         elif hold not in (None, self._hold) and safety.hold.by != self._sender:
-            self.lost = f"{self._car} was stopped by {safety.hold.by}"
+            self.lost = f"{self._car} was stopped by {_other(safety.hold.by, self._sender)}"
         self._hold = hold
 
     def on_outcome(self, outcome: Outcome) -> None:
         """Handle the outcome of a command of ours."""
         if outcome.reason in ("leased", "lent", "paused"):
             self.lost = self.lost or outcome.words
+
+
+def _other(sender: str, ours: str) -> str:
+    """Return the name of another sender, also if the same person has it."""
+    name = keys.name_of(sender)
+    return f"another program of {name}" if name == keys.name_of(ours) else name
 
 
 class Lease:

@@ -175,11 +175,14 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
         age = f", {row['battery_age_s']:.0f} s old" if "sensor/battery" in row["stale"] else ""
         return f"{row['battery_v']:.2f} V {row['battery_level']}{age}"
     if name == "hold":
-        hold = f"e-stop {' '.join(row['estops'])}" if row["estops"] else row["hold"]
+        hold = f"e-stop {' '.join(row['estops'])}" if row["estops"] else keys.name_of(row["hold"] or "")
         paused, lent = row["paused"], row["lent"]
-        return ", ".join(filter(None, (hold, paused and f"paused by {paused}", lent and f"lent to {lent}"))) or "-"
+        return (
+            ", ".join(filter(None, (hold, paused and f"paused by {keys.name_of(paused)}", lent and f"lent to {lent}")))
+            or "-"
+        )
     if name == "driver" and row["driver"]:
-        return f"{row['driver']} ({row['driver_kind']})"
+        return f"{keys.name_of(row['driver'])} ({row['driver_kind']})"
     if name == "platform" and row["platform_contradictions"]:
         return f"{row['platform']} (contradicted)"
     if name == "link" and row["unheard"]:

@@ -196,8 +196,8 @@ def show(client: Fleet, *, as_json: bool) -> None:
         whole |= {"phases": list(plan.phases), "roles": roles, "without_role": others, "rules_in_force": rules}
         click.echo(json.dumps(whole))
         return
-    by = f", set by {in_force.set_by}" if in_force.set_by else ""
-    state = f"stopped by {stopped_by}. `fleet plan restart` starts it again" if stopped_by else "running"
+    by = f", set by {keys.name_of(in_force.set_by)}" if in_force.set_by else ""
+    state = f"stopped by {keys.name_of(stopped_by)}. `fleet plan restart` starts it again" if stopped_by else "running"
     say(f"Plan {in_force.version}{by}: {state}.")
     if plan.phases:
         click.echo(f"phase: {phase or '-'} (of {', '.join(plan.phases)})")

@@ -277,7 +277,7 @@ class Coordinator:
         self._memory = memory
         saved = self._save(memory)
         code, did = EVENTS[request]
-        self._log(_LEVEL_INFO, code, f"{by} {did} ({words})")
+        self._log(_LEVEL_INFO, code, f"{keys.name_of(by)} {did} ({words})")
         self._reply_result(query, pb.Result(status="sent", words=words if saved else f"{words}. {_UNSAVED}"))
 
     def _drop_decisions(self) -> None:
@@ -324,7 +324,7 @@ class Coordinator:
         self._drop_decisions()
         self._put_in_force(plan, by)
         self._save(self._memory)
-        self._log(_LEVEL_INFO, _PLAN_SET, f"{by} put plan {plan.version} in force")
+        self._log(_LEVEL_INFO, _PLAN_SET, f"{keys.name_of(by)} put plan {plan.version} in force")
         self._query_states()
 
     # ------------------------------------------------------------------ samples and queries

@@ -33,6 +33,7 @@ from fleet.policy.snapshot import CONTRADICTED, LOST, UNKNOWN_CAR, CarSnapshot, 
 from fleet.policy.state import HUB_RETURN_GRACE_S, BlinkState, HeldRole, LedRequest, ModeAttempts, PolicyState
 from gateway.protocol.enums import Mode
 from schemas.colors import COLORS, Rgb
+from schemas.keys import name_of
 
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
@@ -244,21 +245,22 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
         return Barrier(f"{car} has published no state yet", "its gateway publishes its first states"), False
     if known.estopped_by is not None:
         return Barrier(
-            f"{car} is e-stopped by {known.estopped_by}", f"a person or script ends it (`fleet resume {car} --estops`)"
+            f"{car} is e-stopped by {name_of(known.estopped_by)}",
+            f"a person or script ends it (`fleet resume {car} --estops`)",
         ), True
     if known.paused_by is not None:
         return Barrier(
-            f"{car} is paused with the whole fleet by {known.paused_by}", "somebody ends it (`fleet unpause`)"
+            f"{car} is paused with the whole fleet by {name_of(known.paused_by)}", "somebody ends it (`fleet unpause`)"
         ), True
     if known.lent_to is not None:
         return Barrier(f"{car} is lent to {known.lent_to}", f"the loan ends (`fleet lend {car} --end`)"), True
     if known.held_by is not None:
         return Barrier(
-            f"{car} is on hold by {known.held_by}",
+            f"{car} is on hold by {name_of(known.held_by)}",
             f"a person or script drives it, gives it a mode, or resumes it (`fleet resume {car}`)",
         ), True
     if known.driven_by is not None:
-        return Barrier(f"{car} is driven by {known.driven_by}", "that drive ends"), False
+        return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends"), False
     if known.link == LOST:
         return Barrier(f"the link of {car} is lost", "its link is back"), False
     if known.doubted:  # people may command it, and see what it does

@@ -16,6 +16,7 @@ from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
 from gateway.protocol.enums import Mode
+from schemas.keys import name_of
 
 _GOES_ON: Final = "a person runs `fleet plan restart` or `fleet plan set`"
 _MAX_REASONS: Final = 4
@@ -83,15 +84,15 @@ def explain_alone(car: str, barrier: Barrier, reserved_role: str | None, kept_s:
 def explain_stopped(car: str, by: str, *, rests: bool) -> Decision:
     """Explain a car of a stopped plan."""
     if rests:
-        why, kind, mode = f"{by} stopped the plan", DecisionKind.ALONE, None
+        why, kind, mode = f"{name_of(by)} stopped the plan", DecisionKind.ALONE, None
     else:
-        why, kind, mode = f"{by} stopped the plan: {car} is brought to rest", DecisionKind.IDLE, Mode.MANUAL
+        why, kind, mode = f"{name_of(by)} stopped the plan: {car} is brought to rest", DecisionKind.IDLE, Mode.MANUAL
     return _about_car(car, kind, why, why, (), [_GOES_ON], None, mode)
 
 
 def explain_stopped_role(name: str, by: str) -> Decision:
     """Explain a role of a stopped plan."""
-    why = f"{by} stopped the plan"
+    why = f"{name_of(by)} stopped the plan"
     return _about_role(name, DecisionKind.OUT, "not wanted", f"out: {why}", why, _GOES_ON)
 
 

@@ -55,7 +55,7 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
             return PolicyState(started_at=memory.started_at), f"plan {plan.version} begins anew{begins}"
         case PlanRequest.NEXT:
             name = _next_phase(plan, memory)
-            phase = PhaseState(name, now, why=f"{by} went on to it from {memory.phase.name}")
+            phase = PhaseState(name, now, why=f"{keys.name_of(by)} went on to it from {memory.phase.name}")
             return replace(memory, phase=phase), f"phase {memory.phase.name} is over: {name}"
         case PlanRequest.STOP:
             return _stop(memory, by)
@@ -63,7 +63,7 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
 
 def _next_phase(plan: Plan, memory: PolicyState) -> str:
     if memory.stopped_by:
-        raise RequestRefused(f"The plan is stopped (by {memory.stopped_by}): {GOES_ON}.")
+        raise RequestRefused(f"The plan is stopped (by {keys.name_of(memory.stopped_by)}): {GOES_ON}.")
     if not plan.phases:
         raise RequestRefused("The plan has no phases.")
     phase = plan.phases.get(memory.phase.name)
@@ -81,7 +81,7 @@ def _next_phase(plan: Plan, memory: PolicyState) -> str:
 def _stop(memory: PolicyState, by: str) -> tuple[PolicyState, str]:
     """Let go of all cars. Those that the plan commands are brought to rest first, without a hold."""
     if memory.stopped_by:
-        return memory, f"the plan is stopped already (by {memory.stopped_by}): {GOES_ON}"
+        return memory, f"the plan is stopped already (by {keys.name_of(memory.stopped_by)}): {GOES_ON}"
     commanded = {each.car for each in memory.decisions.values() if each.car is not None and each.mode is not None}
     cars = sorted(commanded | memory.held_roles.keys())
     stopped = PolicyState(started_at=memory.started_at, stopped_by=by, to_rest=frozenset(cars))

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim
 from schemas import messages
+from schemas.keys import name_of
 from schemas.local_time import date_and_clock
 
 MIN_COLUMN_WIDTH: Final = 4
@@ -75,7 +76,7 @@ class CarStatus:
                 self.mode, self.verdict = value.asked, value.verdict
                 return self._change("mode", f"mode {value.asked}, {value.verdict}")
             case "state/motion":
-                by = f" by {value.owner}" if value.owner else ""
+                by = f" by {name_of(value.owner)}" if value.owner else ""
                 self.motion = value.motion
                 return self._change("motion", f"motion {value.motion}{by}")
             case "state/safety":
@@ -102,9 +103,9 @@ class CarStatus:
         self._reported.clear()
 
     def _safety(self, value: Any) -> str:
-        self.hold = value.hold.by if value.HasField("hold") else ""
+        self.hold = name_of(value.hold.by) if value.HasField("hold") else ""
         self.estop = " ".join(each.id for each in value.estops)
-        self.lease = value.lease.holder if value.HasField("lease") else ""
+        self.lease = name_of(value.lease.holder) if value.HasField("lease") else ""
         self.motors = value.motors
         self.waits_for = value.waits_for
         self.rest, self._rest_boot = motors_claim(value), value.boot_id
@@ -212,9 +213,11 @@ def describe_old_stops(car: str, safety: Any, began_s: float) -> str:
         first = estops[0]
         why = f" ({first.why})" if first.why else ""
         more = f" and {len(estops) - 1} more" if len(estops) > 1 else ""
-        words.append(f"e-stopped by {first.by}{why} since {_date(first.stamp)}{more}: {car} only accepts stops")
+        words.append(
+            f"e-stopped by {name_of(first.by)}{why} since {_date(first.stamp)}{more}: {car} only accepts stops"
+        )
     if held:
-        words.append(f"on hold by {safety.hold.by} since {_date(safety.hold.since)}: no plan moves {car}")
+        words.append(f"on hold by {name_of(safety.hold.by)} since {_date(safety.hold.since)}: no plan moves {car}")
     if not words:
         return ""
     ends = " and then ".join([f"`{resume} --estops`"] * bool(estops) + [f"`{resume}`"] * held)

@@ -39,7 +39,7 @@ from fleet.supervisor.spec import (
 )
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.keys import DEFAULT_FLEET
+from schemas.keys import DEFAULT_FLEET, name_of
 from schemas.yaml_document.document import BadFile
 
 STATUS_INTERVAL_S: Final = 1.0
@@ -569,7 +569,7 @@ class Supervisor:
         return message
 
     async def _down(self, sender: str) -> str:
-        self.end(f"fleet down by {sender}", CAR_STOP_RETRY_S)
+        self.end(f"fleet down by {name_of(sender)}", CAR_STOP_RETRY_S)
         return "stopping every car, then closing the recording"
 
     async def _reload(self, sender: str) -> str:
@@ -613,7 +613,7 @@ class Supervisor:
         if found.needs_restart:
             words.append(f"cannot change while the fleet runs: {', '.join(found.needs_restart)}")
         for line in words:
-            self._say("process", SELF, f"reload by {sender}: {line}")
+            self._say("process", SELF, f"reload by {name_of(sender)}: {line}")
         if found.needs_restart:
             raise RestartNeeded(
                 "\n".join([*words, *found.spec.warnings, "Restart the fleet: `fleet down`, `fleet up`."])

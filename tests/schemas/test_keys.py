@@ -62,3 +62,17 @@ def test_the_topic_of_a_key() -> None:
     assert topics.of_key("fleet/@recorder/status") is topics.TOPICS["@recorder/status"]
     assert topics.of_key("fleet/red/sensor/none") is None
     assert topics.of_key("fleet/red") is None
+
+
+@pytest.mark.parametrize(
+    ("sender", "name"),
+    [
+        ("ann@laptop-4711", "ann"),
+        ("plan", "plan"),
+        ("coordinator-ann@host-1", "coordinator-ann"),
+        ("@x", "@x"),
+        ("", ""),
+    ],
+)
+def test_a_sender_is_called_by_its_name(sender: str, name: str) -> None:
+    assert keys.name_of(sender) == name

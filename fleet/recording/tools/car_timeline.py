@@ -57,7 +57,10 @@ class CarTimeline:
             words = f": {message.words or message.reason}" if message.words or message.reason else ""
             basis = f" ({message.basis})" if message.basis else ""
             self._changed(
-                message.id, f"{message.verb} by {message.sender or 'somebody'} {message.phase}{basis}{words}", "", at_ns
+                message.id,
+                f"{message.verb} by {keys.name_of(message.sender) or 'somebody'} {message.phase}{basis}{words}",
+                "",
+                at_ns,
             )
         elif topic == "event/log":
             self._add(message.message, at_ns)

@@ -12,6 +12,7 @@ from typing import Any, Final
 from fleet.client.claims import claims_of
 from schemas import messages
 from schemas.commands import STOPS
+from schemas.keys import name_of
 from schemas.local_time import clock
 
 NOT_STOPPED_CODE: Final = "not_stopped"
@@ -77,7 +78,7 @@ class StopFindings:
                 self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
         elif message.verb in STOP_VERBS and message.phase in _FAILED:
             code = NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
-            asked = f"{message.verb} by {message.sender or 'somebody'}"
+            asked = f"{message.verb} by {name_of(message.sender) or 'somebody'}"
             self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)
 
     def of(self, code: str) -> list[UnshownStop]:

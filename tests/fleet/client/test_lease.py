@@ -57,6 +57,18 @@ def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None
     assert ours.lost == lost
 
 
+def test_a_second_program_of_the_same_person_is_told_apart_without_its_process() -> None:
+    ours = LeaseMonitor("red", "bot@laptop-17")
+    for holder in ("bot@laptop-17", "bot@laptop-18"):
+        ours.on_safety(safety(holder))
+    assert "laptop" not in ours.lost
+    assert "another" in ours.lost
+    theirs = LeaseMonitor("red", "bot@laptop-17")
+    for holder in ("bot@laptop-17", "mia@laptop-17"):
+        theirs.on_safety(safety(holder))
+    assert theirs.lost == "red was taken by mia (person)"
+
+
 def test_what_was_published_before_is_no_news_when_it_comes_late() -> None:
     ours, told = LeaseMonitor("red", "bot"), [safety("mia"), safety("bot"), safety("mia")]
     for seq, message in enumerate(told, start=1):

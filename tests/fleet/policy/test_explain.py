@@ -47,11 +47,11 @@ CHANGES: dict[str, dict[str, Any]] = {
     "in recovery": {"motors": "unknown"},
     "in doubt": {"doubted": True},
     "link lost": {"link": "lost"},
-    "on hold": {"held_by": "ann"},
-    "e-stopped": {"estopped_by": "ann"},
-    "paused": {"paused_by": "ann"},
+    "on hold": {"held_by": "ann@laptop-4711"},
+    "e-stopped": {"estopped_by": "ann@laptop-4711"},
+    "paused": {"paused_by": "ann@laptop-4711"},
     "lent": {"lent_to": "ann"},
-    "driven": {"driven_by": "bob"},
+    "driven": {"driven_by": "bob@laptop-4711"},
 }
 
 

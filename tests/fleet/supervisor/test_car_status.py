@@ -113,7 +113,7 @@ def test_a_start_ends_when_nobody_has_become_ready_for_a_while() -> None:
 def test_a_row_shows_hold_and_e_stop() -> None:
     row = CarStatus("red")
     assert row.take("state/safety", pb.Safety(motors="off"), 0.0) == ""
-    held = pb.Safety(hold=pb.Hold(by="ann"))
+    held = pb.Safety(hold=pb.Hold(by="ann@laptop-4711"))
     assert row.take("state/safety", held, 1.0) == "on hold by ann"
     held.estops.add(id="e1", by="bob")
     assert row.take("state/safety", held, 2.0) == "e-stop e1"
