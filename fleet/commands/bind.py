@@ -10,6 +10,7 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.commands.fleet_file import (
+    confirm,
     file_argument,
     link_option,
     listen_option,
@@ -105,7 +106,7 @@ def _which(client: Fleet, name: str, file: Path) -> str:
             continue
         if answer in fleet.cars:
             there = fleet.cars[answer].link
-            if not click.confirm(f"  {answer} has the link {there}. Give it this one?"):
+            if not confirm(f"  {answer} has the link {there}. Give it this one?"):
                 continue
         return answer
 

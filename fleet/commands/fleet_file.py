@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +29,8 @@ DEFAULT_FILE: Final = Path("fleet.yaml")
 DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
 """Default names, in the order of the palette."""
 _SKIP: Final = "-"
+_OTHER_FILE: Final = "name another file with --out"
+_TAKE_ALL: Final = "`fleet init --yes` takes every likely car without a question"
 
 file_argument = click.argument(
     "file", default=DEFAULT_FILE, type=click.Path(path_type=Path, dir_okay=False), metavar="[FILE]"
@@ -121,7 +124,9 @@ def init(
             if yes or simulated:
                 other = "--out for another" if path == out else f"--out in a directory without {path.name}"
                 raise click.UsageError(f"{path} exists already: give --force to overwrite it, or {other}")
-            click.confirm(f"{path} exists already. Overwrite it?", abort=True)
+            if not confirm(f"{path} exists already. Overwrite it?", f"give --force, or {_OTHER_FILE}"):
+                click.echo(f"Nothing was written. To keep {path}, {_OTHER_FILE}.", err=True)
+                raise click.Abort
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")
     if simulated:
@@ -184,17 +189,25 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
         click.echo(f"\n{each.url}\n  {each.words}")
         free = [name for name in DEFAULT_CAR_NAMES if name not in {car.name for car in cars}] or [f"car{len(cars) + 1}"]
         offered = free[0] if each.verdict in LIKELY_VERDICTS else _SKIP
-        name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, {car.name for car in cars})
+        taken = {car.name for car in cars}
+        name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, taken, _TAKE_ALL)
         if name == _SKIP:
             continue
-        platform = prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
-        color = prompt("  its color", default=default_color(name, len(cars)), value_proc=_checked(validate_color))
+        platform = prompt(
+            "  its platform", default=each.platform, value_proc=_checked(validate_platform), instead=_TAKE_ALL
+        )
+        color = prompt(
+            "  its color",
+            default=default_color(name, len(cars)),
+            value_proc=_checked(validate_color),
+            instead=_TAKE_ALL,
+        )
         cars.append(NewCar(name, each.url, platform, color, each.words))
     return cars
 
 
-def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
-    """Prompt for an unused name of a car, or `-`."""
+def prompt_name(words: str, offered: str | None, taken: set[str], instead: str = "") -> str:
+    """Prompt for an unused name of a car, or `-`. instead: what to type where nobody answers."""
 
     def check_name(name: str) -> str:
         name = name.strip()
@@ -205,22 +218,37 @@ def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
             raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}. Such as {likely}.')
         return name if name == _SKIP else _checked(validate_car_name)(name)
 
-    name: str = prompt(words, default=offered, value_proc=check_name)
+    name: str = prompt(words, default=offered, value_proc=check_name, instead=instead)
     return name
 
 
-def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str]) -> str:
-    """Prompt until the answer is valid. Raises click's error if the input ends."""
+def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str], instead: str = "") -> str:
+    """Prompt until the answer is valid. Raises click's error, with `instead` as the way out, if the input ends."""
     while True:
         try:
             return value_proc(click.prompt(words, default=default, type=str))
         except click.UsageError as error:
             click.echo(f"fleet: {error.message}")
         except click.Abort as error:
-            if isinstance(error.__context__, KeyboardInterrupt):
-                raise
-            click.echo()
-            raise click.ClickException("Nothing was written.") from None
+            raise _unanswered(error, instead) from None
+
+
+def confirm(words: str, instead: str = "") -> bool:
+    """Ask for yes or no. Raises click's error, with `instead` as the way out, if the input ends."""
+    try:
+        return click.confirm(words)
+    except click.Abort as error:
+        raise _unanswered(error, instead) from None
+
+
+def _unanswered(error: click.Abort, instead: str) -> click.Abort | click.ClickException:
+    """Return the error to raise where a question got no answer. Ctrl-C stays what it is."""
+    if isinstance(error.__context__, KeyboardInterrupt):
+        return error
+    click.echo()
+    why = "the input has ended" if sys.stdin.isatty() else "stdin is no terminal, and no answer came from it"
+    other = f", or {instead}" if instead else ""
+    return click.ClickException(f"Nothing is written without an answer: {why}. Type the command at a terminal{other}.")
 
 
 def _checked(rule: Callable[[str], str]) -> Callable[[str], str]:

@@ -278,6 +278,22 @@ def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, 
     assert sum(role.count or 1 for role in plan.roles.values()) == count
 
 
+@pytest.mark.parametrize("exists", [True, False])
+def test_without_a_terminal_it_says_why_nothing_was_written(command: Command, tmp_path: Path, exists: bool) -> None:
+    """No question may end in silence where nobody can answer it."""
+    if exists:
+        (tmp_path / "fleet.yaml").write_text("mine\n")
+    port = Port()
+    try:
+        done = command("init", "--for", "0.5", "--link", port.path)
+    finally:
+        port.close()
+    assert done.returncode == 1
+    assert "terminal" in done.stderr
+    assert ("--force" if exists else "--yes") in done.stderr
+    assert [path.read_text() for path in tmp_path.glob("*.yaml")] == (["mine\n"] if exists else [])
+
+
 @pytest.mark.parametrize("name", ["fleet.yaml", "plan.yaml"])
 def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine\n")
