@@ -1,7 +1,6 @@
-"""Collects tests, spreads them over workers, removes the deadline of Hypothesis' examples, and restores SIGINT."""
+"""Collects tests, spreads them over workers, removes the deadline of Hypothesis' examples, and sets signals."""
 
 import gc
-import signal
 from collections.abc import Generator
 
 import pytest
@@ -9,6 +8,7 @@ from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 
 from tests.support import scheduling
+from tests.support.signals import give_default_signals
 
 # By default, Hypothesis fails an example that takes 200 ms, and a test whose examples take a second to generate. A
 # stall of the machine is no fault of the product. pytest's timeout ends an endless example.
@@ -20,9 +20,7 @@ settings.register_profile(
 )
 settings.load_profile("patient")
 
-# In the background of a script, SIGINT is ignored, also by each process that a test starts and ends by SIGINT.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+give_default_signals()
 
 
 def pytest_xdist_auto_num_workers() -> int:
