@@ -232,3 +232,9 @@ def test_a_page_or_a_heading_that_is_not_there_is_found() -> None:
     assert faults_of("(docs/reference/protocol.md" + "#nothing)", "x")[0].endswith("has no heading #nothing")
     assert faults_of("# protocol" + ".md, framing", "x"), "a citation without the path"
     assert not faults_of("(docs/reference/protocol.md#framing).", "x")
+
+
+def test_the_changelog_says_nothing_twice() -> None:
+    """Each heading and each line of a version stands once: two branches that were merged left a block twice."""
+    lines = Counter(line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line)
+    assert [line for line, count in lines.items() if count > 1] == []
