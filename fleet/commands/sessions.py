@@ -285,24 +285,29 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
 @click.option(
     "--parquet", "parquet", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write Parquet here."
 )
-def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
+@click.option("--nanoseconds", is_flag=True, help="Write the times of Parquet in nanoseconds (default microseconds).")
+def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds: bool) -> None:
     """Write a session as tidy tables, one file for each type of message, into a new directory.
 
-    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC. Units are in the columns'
-    names, in Parquet also in the fields' metadata. Messages that are not protobuf are in `other`.
+    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC, in Parquet in microseconds.
+    Units are in the columns' names, in Parquet also in the fields' metadata. Messages that are not protobuf are in
+    `other`.
     """
     from fleet.recording.tools.export import export as write
     from fleet.recording.tools.summary import total
-    from fleet.recording.tools.table_formats import FORMATS
+    from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
     from fleet.recording.tools.transform import atomic_directory
 
     outputs = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
     if not outputs or csv == parquet:
         raise click.UsageError("say where to, and as what: --csv DIR, --parquet DIR, or both (two directories)")
+    if nanoseconds and parquet is None:
+        raise click.UsageError("--nanoseconds is about Parquet, and CSV has them always: give --parquet DIR, too")
     for name, out in outputs.items():
+        sink = ParquetNsSink if nanoseconds and name == "parquet" else FORMATS[name]
         with _session_errors(out), atomic_directory(out) as new:
             found = _open(session)
-            done = write(watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
+            done = write(watched(f"export {name}", total(found))(found.rows()), new, sink)
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)

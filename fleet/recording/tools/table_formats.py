@@ -1,6 +1,7 @@
 """Writes tables as CSV with the standard library, as Parquet or into memory with pyarrow, imported only then.
 
-Times are UTC with nanoseconds and say so: `2026-03-14T15:16:17.123456789Z` in CSV, `timestamp[ns, UTC]` in Arrow.
+Times are UTC and say so: `2026-03-14T15:16:17.123456789Z` in CSV, `timestamp[ns, UTC]` in memory. Parquet has them in
+microseconds by default: DuckDB subtracts no times in nanoseconds (docs/explanation/measurements.md#mcap).
 """
 
 import csv
@@ -8,13 +9,17 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Literal, Protocol
 
 from fleet.recording.tools.tables import Column, ColumnKind, Values
 from schemas.suggestion import how_to_install
 
 MAX_CACHED_SECONDS: Final = 4096
 """Maximum seconds cached as text."""
+
+
+TimeUnit = Literal["us", "ns"]
+"""Unit of the times of a table."""
 
 
 class FormatMissing(ImportError):
@@ -114,7 +119,7 @@ def import_pyarrow() -> Any:
 class ArrowSink:
     """Arrow table in memory. The metadata of a field contains its `unit`. Raises FormatMissing without pyarrow."""
 
-    def __init__(self, columns: Sequence[Column]) -> None:
+    def __init__(self, columns: Sequence[Column], time_unit: TimeUnit = "ns") -> None:
         pa = import_pyarrow()
         kinds = {
             ColumnKind.FLOAT: pa.float64(),
@@ -125,9 +130,13 @@ class ArrowSink:
             ColumnKind.TIME: pa.timestamp("ns", "UTC"),
         }
         made = {ColumnKind.LIST: pa.list_, ColumnKind.MAP: lambda item: pa.map_(pa.string(), item)}
+        time = pa.timestamp(time_unit, "UTC")
+        self._in_us = [column.kind is ColumnKind.TIME and time_unit == "us" for column in columns]
         self._types = [
             made[column.kind](kinds.get(column.item, pa.string()))
             if column.kind in made
+            else time
+            if column.kind is ColumnKind.TIME
             else kinds.get(column.kind, pa.string())
             for column in columns
         ]
@@ -146,10 +155,8 @@ class ArrowSink:
     def batch(self, values: Sequence[Values]) -> Any:
         """Return rows as an Arrow record batch."""
         arrays = [
-            self._pa.array(
-                [None if value is None else list(value.items()) for value in column] if is_map else column, kind
-            )
-            for kind, is_map, column in zip(self._types, self._maps, values, strict=True)
+            self._pa.array(_items(column) if is_map else _microseconds(column) if in_us else column, kind)
+            for kind, is_map, in_us, column in zip(self._types, self._maps, self._in_us, values, strict=True)
         ]
         return self._pa.RecordBatch.from_arrays(arrays, schema=self.schema)
 
@@ -161,13 +168,22 @@ class ArrowSink:
         """Keep the rows."""
 
 
+def _items(column: Values) -> Values:
+    return [None if value is None else list(value.items()) for value in column]
+
+
+def _microseconds(column: Values) -> Values:
+    return [None if ns is None else ns // 1000 for ns in column]
+
+
 class ParquetSink:
-    """Parquet table, compressed with zstd."""
+    """Parquet table, compressed with zstd. Its times are in microseconds, rounded down."""
 
     ending: ClassVar[str] = ".parquet"
+    time_unit: ClassVar[TimeUnit] = "us"
 
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
-        self._arrow = ArrowSink(columns)
+        self._arrow = ArrowSink(columns, self.time_unit)
         from pyarrow import parquet
 
         self._file = path.open("wb")
@@ -183,6 +199,12 @@ class ParquetSink:
             self._writer.close()
         finally:
             self._file.close()
+
+
+class ParquetNsSink(ParquetSink):
+    """Parquet table with times in nanoseconds."""
+
+    time_unit: ClassVar[TimeUnit] = "ns"
 
 
 FORMATS: Final[dict[str, type[FileSink]]] = {"csv": CsvSink, "parquet": ParquetSink}

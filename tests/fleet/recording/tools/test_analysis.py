@@ -16,7 +16,7 @@ from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.analysis import NoTable
 from fleet.recording.tools.export import export
-from fleet.recording.tools.table_formats import FORMATS, FormatMissing
+from fleet.recording.tools.table_formats import FormatMissing, ParquetNsSink
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF, TOPICS
 from tests.fleet.recording.tools import every_type
@@ -45,7 +45,7 @@ def modes_and_distances(made: Made) -> None:
 def test_every_type_is_the_table_that_an_export_writes(tmp_path: Path) -> None:
     every_type.make(tmp_path / "0001.mcap")
     session = Session(tmp_path)
-    export(session.rows(), tmp_path, FORMATS["parquet"])
+    export(session.rows(), tmp_path, ParquetNsSink)
     for name in {topic.message for topic in TOPICS.values()}:
         table = session.to_arrow(name)
         assert table.equals(pq.read_table(tmp_path / f"{name}.parquet").sort_by("publish_time"))

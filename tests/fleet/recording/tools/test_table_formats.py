@@ -7,6 +7,7 @@ ours reads its own files.
 import csv
 import json
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ def tables(session: Path) -> Path:
             str(session.parent / "csv"),
             "--parquet",
             str(session.parent / "parquet"),
+            "--nanoseconds",
         ],
     )
     assert done.exit_code == 0, done.output
@@ -208,6 +210,26 @@ def test_parquet_holds_what_the_recording_holds(original: Rows, tables: Path) ->
                     row[field.name] = value
             found.setdefault(key, []).append((log, published, row))
     assert found == without_requests(without_car(original))
+
+
+def test_times_of_parquet_are_in_microseconds_that_duckdb_subtracts(
+    original: Rows, session: Path, tmp_path: Path
+) -> None:
+    done = CliRunner().invoke(cli, ["sessions", "export", str(session.parent), "--parquet", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    times = {log // 1000 for key, rows in original.items() if key.endswith("sensor/range") for log, _, _ in rows}
+    path = tmp_path / "out" / "fleet.v1.Range.parquet"
+    stored = pq.read_table(path).column("log_time")
+    assert (str(stored.type), {each.value for each in stored}) == ("timestamp[us, tz=UTC]", times)
+    (took,) = duckdb.sql(f"select max(log_time) - min(log_time) from '{path}'").fetchall()[0]
+    assert took == timedelta(microseconds=max(times) - min(times))
+
+
+def test_nanoseconds_are_an_option_of_parquet_only(session: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        cli, ["sessions", "export", str(session.parent), "--csv", str(tmp_path / "out"), "--nanoseconds"]
+    )
+    assert (done.exit_code, (tmp_path / "out").exists()) == (2, False)
 
 
 def test_rrd_holds_what_the_recording_holds(original: Rows, session: Path, tmp_path: Path) -> None:
