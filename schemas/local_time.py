@@ -18,6 +18,32 @@ def date_and_clock(at_s: float) -> str:
     return _local(at_s).strftime("%Y-%m-%d %H:%M:%S %Z") if _is_date(at_s) else f"{at_s:.0f} s"
 
 
+def exact(at_ns: int) -> str:
+    """Return a date and a time with milliseconds, `2026-11-25 14:05:12.345 CET`. at_ns: ns since the epoch."""
+    if not _is_date(at_ns / _NS):
+        return f"{at_ns} ns"
+    seconds, rest = divmod(at_ns, _NS)
+    when = _local(seconds)
+    return f"{when:%Y-%m-%d %H:%M:%S}.{rest // 1_000_000:03d} {when:%Z}"
+
+
+def of_iso(text: str) -> str:
+    """Return a stored time (ISO 8601, UTC) as `date_and_clock`; other texts as they are."""
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        return text
+    return date_and_clock(when.timestamp()) if when.tzinfo is not None else text
+
+
+def with_offset(at_ns: int) -> str:
+    """Return a time in ISO 8601 with milliseconds and the offset of the local zone: people may type it again."""
+    if not _is_date(at_ns / _NS):
+        return f"{at_ns} ns"
+    seconds, rest = divmod(at_ns, _NS)
+    return _local(seconds).replace(microsecond=rest // 1000).isoformat(timespec="milliseconds")
+
+
 def clock_times(text: str, start_ns: int, end_ns: int) -> tuple[int, int] | None:
     """Return when a local time of day (`14:05`, `14:05:12`) begins and ends, on a day from `start_ns` to `end_ns`.
 

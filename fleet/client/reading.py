@@ -14,6 +14,7 @@ from typing import Any, Final, Self, TypeAlias
 from fleet.conditions import fields_of, value_in
 from schemas import messages, topics
 from schemas.bus import Sample
+from schemas.local_time import exact
 
 READING_QUEUE_LIMIT: Final = 1024
 """Maximum number of queued samples."""
@@ -77,16 +78,17 @@ class Reading:
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{name}={'not measured' if text is None else text}" for name, text in self._fields())
-        return f"<{self.key} {self._clock} UTC: {fields}>"
+        return f"<{self.key} {self._clock}: {fields}>"
 
     def _repr_html_(self) -> str:
         cell = "<tr><th style='text-align:left'>{}</th><td style='text-align:left'>{}</td></tr>"
         rows = [cell.format(name, _NOT_MEASURED if text is None else escape(text)) for name, text in self._fields()]
-        return f"<table><caption>{escape(self.key)}, {self._clock} UTC</caption>{''.join(rows)}</table>"
+        return f"<table><caption>{escape(self.key)}, {self._clock}</caption>{''.join(rows)}</table>"
 
     @property
     def _clock(self) -> str:
-        return self.time.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+        since = self.time - _EPOCH
+        return exact((since // timedelta(microseconds=1)) * 1000)
 
     def _fields(self) -> Iterator[tuple[str, str | None]]:
         """Yield the fields with their values as text and their units; None if not measured."""

@@ -14,6 +14,8 @@ from fleet.commands.output import progress_bar
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.recording.session_lookup import sessions_place
+from schemas.keys import name_of
+from schemas.local_time import of_iso, with_offset
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -168,14 +170,14 @@ def _say_contents(about: "SessionSummary") -> None:
     from fleet.recording import time_spec
 
     size = f"{about.messages} messages, {_size(about.bytes)}"
-    click.echo(
-        f"  from {about.started or 'an unknown time'}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost"
-    )
+    began = of_iso(about.started) or "an unknown time"
+    click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
     if about.clock_back_s:
         click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
     click.echo(f"  cars: {', '.join(about.cars) or 'none'}")
     for mark in about.marks:
-        click.echo(f"  mark: {mark.get('time', '')} {mark.get('text', '')!r} by {mark.get('by') or 'somebody'}")
+        by = name_of(mark.get("by") or "") or "somebody"
+        click.echo(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
     width = max((len(key) for key in about.keys), default=0)
     for key, count in about.keys.items():
         rate = f"  {count / about.length_s:7.2f} Hz" if about.length_s else ""
@@ -269,7 +271,7 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
         except ValueError as error:
             raise click.UsageError(f"{name}: {error}") from None
     selection = Selection(None, *bounds)
-    there = f"{session.path} runs from {time_spec.iso(about.start_ns)} to {time_spec.iso(about.end_ns)}"
+    there = f"{session.path} runs from {with_offset(about.start_ns)} to {with_offset(about.end_ns)}"
     if bounds[0] is not None and bounds[1] is not None and bounds[0] >= bounds[1]:
         raise click.UsageError(f"--from {start} is not before --to {end}: {there}")
     if not selection.overlaps(about.start_ns, about.end_ns):

@@ -13,6 +13,7 @@ from fleet.recording.reading.session import Session
 from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
+from schemas.local_time import exact
 
 MAX_CLOCK_OFFSET_S: Final = 0.5
 """Maximum offset of a publisher's clock from the recorder's that is not reported."""
@@ -87,7 +88,7 @@ class SessionVerdict:
     def words(self) -> Iterable[str]:
         """Yield the lines of the report; the first is the verdict."""
         length = time_spec.words(max(self.last_ns - self.first_ns, 0) / 1e9)
-        span = f", {time_spec.iso(self.first_ns)} to {time_spec.iso(self.last_ns)} ({length})" if self.messages else ""
+        span = f", {exact(self.first_ns)} to {exact(self.last_ns)} ({length})" if self.messages else ""
         state = "whole" if self.whole else "NOT whole"
         if self.recording:
             state = f"is being recorded, {'nothing is missing so far' if self.whole else state}"
@@ -117,7 +118,7 @@ class SessionVerdict:
             if words != SAME_SCHEMA:
                 yield f"  schema: {name} {words}"
         for one in self.backwards[:MAX_LISTED_LINES]:
-            yield f"  clock: the recorder's went back by {one['step_s']:.3f} s at {time_spec.iso(one['at_ns'])}"
+            yield f"  clock: the recorder's went back by {one['step_s']:.3f} s at {exact(one['at_ns'])}"
         for name, clock in self.clocks.items():
             if clock.backwards:
                 yield f"  clock: {name}'s went back {clock.backwards} times, by {clock.step_s:.3f} s at most"
@@ -132,7 +133,7 @@ def _publisher_words(one: dict[str, Any]) -> str:
 
 def _missing_words(one: dict[str, Any]) -> str:
     numbers = f"number {one['first']}" if one["count"] == 1 else f"numbers {one['first']} to {one['last']}"
-    when = f"between {time_spec.iso(one['after_ns'])} and {time_spec.iso(one['before_ns'])}"
+    when = f"between {exact(one['after_ns'])} and {exact(one['before_ns'])}"
     return f"{one['key']} lacks {one['count']} of {_publisher_words(one)}: {numbers}, {when}"
 
 
@@ -252,9 +253,7 @@ def verify(
         if verdict.recording and session.segments[-1] in session.unended:
             verdict.damage.pop(session.segments[-1].name, None)
         elif not description.closed:
-            until = (
-                f"everything until {time_spec.iso(verdict.last_ns)} is here" if verdict.messages else "nothing is here"
-            )
+            until = f"everything until {exact(verdict.last_ns)} is here" if verdict.messages else "nothing is here"
             why = description.error or "it crashed, or is still recording"
             verdict.ended = f"the recorder did not close it ({why}); {until}, later messages are lost"
     return verdict

@@ -12,6 +12,7 @@ from fleet.client.reading import READING_QUEUE_LIMIT, Reading, Watch, reading_of
 from schemas import messages
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.local_time import exact
 
 RANGE = "fleet.v1.Range"
 KEY = "fleet/red/sensor/range"
@@ -34,7 +35,10 @@ def test_a_reading_has_the_time_of_its_stamp_else_the_time_on_the_bus() -> None:
 def test_a_reading_shows_itself_with_units_and_what_was_not_measured() -> None:
     at = datetime(2026, 3, 14, 15, 16, 17, 123_456, UTC)
     measured = Reading(KEY, at, pb.Range(range_m=0.25))
-    assert repr(measured) == "<fleet/red/sensor/range 2026-03-14 15:16:17.123 UTC: range_m=0.25 m, no_echo=false>"
+    assert (
+        repr(measured)
+        == f"<fleet/red/sensor/range {exact(round(at.timestamp() * 1e6) * 1000)}: range_m=0.25 m, no_echo=false>"
+    )
     nothing = Reading(KEY, at, pb.Range(no_echo=True))
     assert "range_m=not measured, no_echo=true" in repr(nothing)
     rows = re.findall(r"<tr><th[^>]*>(.*?)</th><td[^>]*>(.*?)</td>", nothing._repr_html_())

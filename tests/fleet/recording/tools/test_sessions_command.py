@@ -19,6 +19,7 @@ from fleet.recording.reading.mcap_scan import MAGIC
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
 from fleet.recording.tools.verify import verify
+from schemas.local_time import of_iso
 from tests.fleet.recording.damaged import Original, written
 from tests.fleet.recording.tools import every_type
 from tests.support import in_process
@@ -86,7 +87,7 @@ def test_the_list_says_how_each_is(session: Path) -> None:
 
 def test_info_has_versions_keys_and_marks(session: Path) -> None:
     words = fleet("info", session).stdout
-    assert "mark: 2026-09-21T14:13:21Z 'here it slips' by ann" in words
+    assert f"mark: {of_iso('2026-09-21T14:13:21Z')} 'here it slips' by ann" in words
     assert "fleet fleet, recorded on here; python 3" in words
     assert "fleet/@coordinator/decision" in words
     about = json.loads(fleet("info", session, "--json").stdout)
