@@ -13,6 +13,7 @@ import pytest
 
 from fleet.client.client import Fleet, default_sender
 from schemas import bus
+from schemas.keys import person_of
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, GatewayProcess, wait_for
 from tests.support.up import fleet_command
@@ -271,7 +272,7 @@ def test_a_person_goes_on_to_the_next_phase_stops_the_plan_and_restarts_it(cars:
     wait_for(lambda: len(events) == 4, "each request is an event")
     codes = [each.name.removeprefix("@coordinator ") for each in events]
     assert codes == ["plan_next", "plan_stopped", "plan_restarted", "plan_set"]
-    assert {each.message.split()[0] for each in events} == {default_sender()}
+    assert {each.message.split()[0] for each in events} == {person_of(default_sender())}
     assert plan("show").stderr.startswith("fleet: No plan is running. Start one: `fleet plan run FILE`, or")
 
 
