@@ -14,6 +14,7 @@ import click
 from fleet.commands.options import from_option, to_option
 from fleet.commands.output import progress_bar
 from fleet.commands.params import car_option, session_argument
+from schemas.printable import printable_lines
 from schemas.process import startup
 
 if TYPE_CHECKING:
@@ -55,13 +56,16 @@ def replay(
             )
         part = _part(found, cars, start, end)
         with tempfile.TemporaryDirectory() as scratch:
-            if found.damage:
-                # Copy the undamaged messages first: Rerun's own reader would also show chunks with a wrong checksum.
-                whole = _rescue(found, Path(scratch) / f"{found.name}.mcap")
-                click.echo(f"{found.damage_words}; showing only the intact part", err=True)
-                found = whole
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
-            _export(found, out, part, cars)
+            intact = True
+            try:
+                _export(found, out, part, cars)
+            except NoSession:  # it names the damage
+                intact = False
+                raise
+            finally:
+                if found.damage and intact:
+                    click.echo(printable_lines(f"{found.damage_words}; showing only the intact part"), err=True)
             if save is None:
                 sys.exit(_view(out))
     except NoSession as error:
@@ -92,16 +96,6 @@ def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str
     return Part(cars, selection.start_ns, selection.end_ns)
 
 
-def _rescue(session: "Session", out: Path) -> "Session":
-    try:
-        return session.rescue(out)
-    except OSError as error:
-        raise click.ClickException(
-            f"the intact part of {session.path} cannot be copied to {out.parent}: {error.strerror}; "
-            "set TMPDIR to a directory with room"
-        ) from None
-
-
 def quiet_rerun() -> None:
     """Turn off Rerun's log, which would mix with our output. Raises ModuleNotFoundError if Rerun is not installed."""
     os.environ.setdefault("RUST_LOG", "off")  # read when Rerun is imported
@@ -114,12 +108,17 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
 
     try:
         with _bar(session) as seen:
-            held = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", seen=seen)
+            replayed = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", seen=seen)
     except ExportFailed as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
-        raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
-    click.echo(f"{out}: {held.total()} messages on {len(held)} keys")
+        raise click.ClickException(
+            f"{out} cannot be written: {error.strerror}. It needs the size of the recording twice; "
+            "name another place (--save), or set TMPDIR to a directory with room."
+        ) from None
+    click.echo(f"{out}: {replayed.shown.total()} messages on {len(replayed.shown)} keys")
+    for line in replayed.left_out.words():
+        click.echo(f"not shown: {line}", err=True)
 
 
 @contextmanager

@@ -92,6 +92,8 @@ def _follow(
         lost = f"; {live.dropped} were dropped because the viewer was too slow" if live.dropped else ""
         words = f"{save}: " if save is not None else ""
         click.echo(f"{words}{live.sent} messages of {len(live.cars)} cars{lost}", err=save is None)
+        for line in live.left_out.words():
+            click.echo(f"not shown: {line}", err=True)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import rerun.chunk as rrc
 
 from fleet.replay import panels
 from fleet.replay.colors import OFF, rgb
-from fleet.replay.rerun.lenses import component, numbers, triples
+from fleet.replay.rerun.lenses import component, is_drawn, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
 from schemas.colors import Rgb, car_color
@@ -63,7 +63,7 @@ class Drawing:
             panels.ASSIGNMENT: self._roles,
         }
         self.counts: Counter[str] = Counter()
-        """Messages by key."""
+        """Drawn messages by key."""
         self.leds: set[str] = set()
         self.tracks: set[tuple[str, str]] = set()
         """(entity, name) of the derived tracks."""
@@ -79,9 +79,11 @@ class Drawing:
             if chunk.is_static:
                 continue
             key = panels.key_of(chunk.entity_path)
-            self.counts[key] += chunk.num_rows
             batch = chunk.to_record_batch()
             topic = panels.topic_of(key)
+            if not is_drawn(topic, batch.schema.names):
+                continue  # a stray message must not end a track, or make a tab for a car
+            self.counts[key] += chunk.num_rows
             if PUBLISH_TIMELINE in batch.schema.names:
                 self._extend_span(batch.column(PUBLISH_TIMELINE))
                 self._ends.add(chunk.entity_path, topic, batch)

@@ -18,17 +18,22 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.fleetfile.fleet_file import read_colors
+from fleet.recording.left_out import Cause, LeftOut
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.selection import Selection
 from fleet.recording.session_dir import FLEET_FILE
+from fleet.recording.tools.summary import total
+from fleet.recording.tools.tables import car_of
 from fleet.replay import panels
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
-from fleet.replay.rerun.lenses import MESSAGE_SUFFIX, lenses
+from fleet.replay.rerun.lenses import MESSAGE_SUFFIX, RAW, TEXT, is_drawn, lenses
+from fleet.replay.rerun.prepare import Prepared, as_recorded, copied, unreadable
 from schemas.topics import TOPICS
 
 APPLICATION: Final = "zenoh-car-fleet"
 _INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
-TEXT: Final = "TextLog:text"
+_TOPIC: Final = "McapChannel:topic"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
 
 
@@ -45,6 +50,16 @@ class Part:
     start_ns: int | None = None
     end_ns: int | None = None
     """Times of the recorder's clock, ns since the epoch; `end_ns` is excluded."""
+
+    @property
+    def selection(self) -> Selection:
+        """The time span as a selection."""
+        return Selection(None, self.start_ns, self.end_ns)
+
+    def has_key(self, key: str) -> bool:
+        """Return True if messages of this key are shown."""
+        car = car_of(key)
+        return not self.cars or car in self.cars or car.startswith("@")
 
     def reader(self, segment: Path) -> rrc.McapReader:
         """Return Rerun's reader for this part of a segment."""
@@ -69,6 +84,15 @@ class Part:
 WHOLE_SESSION: Final = Part()
 
 
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What became of each recorded message: recorded = shown + left out."""
+
+    shown: Counter[str]
+    """Messages by key."""
+    left_out: LeftOut
+
+
 def export(
     session: Session,
     out: Path,
@@ -76,63 +100,148 @@ def export(
     *,
     tab: str = "",
     seen: Callable[[int], None] = lambda _: None,
-) -> Counter[str]:
-    """Write `out`, and return its messages by key. Raises ExportFailed, and NoSession without a message of a fleet.
+) -> Replayed:
+    """Write `out`, and return its messages. Raises OSError, ExportFailed, and NoSession without a message of a fleet.
 
     `tab` names the car whose tab is in front. `seen` is called with the number of messages read since its last call.
     """
+    whole = part == WHOLE_SESSION
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
+        rrd = Path(scratch) / "whole.rrd"
+        prepared = as_recorded(session, part.selection, part.has_key, whole=whole)
+        readers = [part.reader(segment) for segment in prepared.files] if prepared is not None else []
+        replayed = _write(session, rrd, out, prepared, readers, part, tab, seen) if prepared is not None else None
+        if replayed is None:
+            # Rerun reads less than there is. A copy costs time and disk space, so it is not made for each session.
+            copies = copied(session, part.selection, part.has_key, Path(scratch))
+            if not copies.recorded:
+                damage = f": {session.damage_words}" if session.damage else ""
+                raise NoSession(f"{session.path} has no intact message{part.words}{damage}")
+            readers = [WHOLE_SESSION.reader(each) for each in copies.files]
+            replayed = _write(session, rrd, out, copies, readers, part, tab, seen, final=True)
+            assert replayed is not None
+        rrd.replace(out)
+    return replayed
+
+
+def _write(
+    session: Session,
+    rrd: Path,
+    out: Path,
+    prepared: Prepared,
+    readers: list[rrc.McapReader],
+    part: Part,
+    tab: str,
+    seen: Callable[[int], None],
+    *,
+    final: bool = False,
+) -> Replayed | None:
+    """Write an .rrd. Return None if Rerun did not read every message, unless it is the `final` attempt."""
     drawing = Drawing(car_colors=read_colors(session.path / FLEET_FILE))
-    readers = [part.reader(segment) for segment in session.segments]
+    tally = _Tally()
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
-    stream = rrc.LazyChunkStream.from_iter(drawing.follow(_count_rows(stream, seen))).lenses(
+    stream = rrc.LazyChunkStream.from_iter(drawing.follow(tally.follow(stream, seen))).lenses(
         lenses(), output_mode="forward_all"
     )
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
-        whole = Path(scratch) / "whole.rrd"
-        # Only the file of a recording stream carries a layout. The layout comes last: it depends on all messages.
-        recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
-        recording.save(whole)
-        try:
-            recording.send_chunks(stream)
-        except RuntimeError as error:
-            words = " ".join(str(error).split())
-            if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun passes on only the text
-                raise KeyboardInterrupt from None
-            raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
-        contents = drawing.contents()
-        if not contents.cars and not contents.services:
-            raise NoSession(f"{session.path} has no message of a fleet{part.words}")
-        recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), drawing.static())))
-        recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
+    # Only the file of a recording stream carries a layout. The layout comes last: it depends on all messages.
+    recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
+    recording.save(rrd)
+    try:
+        recording.send_chunks(stream)
+    except RuntimeError as error:
+        words = " ".join(str(error).split())
+        if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun passes on only the text
+            raise KeyboardInterrupt from None
+        raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
+    replayed, missed = tally.compare(prepared)
+    if missed and not final:
         recording.disconnect()
-        try:
-            # Rerun's writer does not report a full disk. So read the file back: a truncated one has no index.
-            with warnings.catch_warnings(action="ignore"):
-                rrc.RrdReader(whole).store()
-        except (RuntimeError, ValueError):
-            free = shutil.disk_usage(out.parent).free
-            raise ExportFailed(
-                f"{out} is incomplete: the disk is probably full ({free} bytes are free). Name another place."
-            ) from None
-        whole.replace(out)
-    return drawing.counts
+        return None
+    _name_missed(session, part, missed, replayed.left_out)
+    contents = drawing.contents()
+    if not contents.cars and not contents.services:
+        why = f": {'; '.join(replayed.left_out.words())}" if replayed.left_out.total else ""
+        raise NoSession(f"{session.path} has no message of a fleet{part.words}{why}")
+    recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), drawing.static())))
+    recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
+    recording.disconnect()
+    try:
+        # Rerun's writer does not report a full disk. So read the file back: a truncated one has no index.
+        with warnings.catch_warnings(action="ignore"):
+            rrc.RrdReader(rrd).store()
+    except (RuntimeError, ValueError):
+        free = shutil.disk_usage(rrd.parent).free
+        raise ExportFailed(
+            f"{out} is incomplete: the disk is probably full ({free} bytes are free). Name another place."
+        ) from None
+    return replayed
+
+
+def _name_missed(session: Session, part: Part, missed: Counter[str], left_out: LeftOut) -> None:
+    """Add the messages that Rerun did not read. It skips those that do not match their schema."""
+    bad = unreadable(session, part.selection, missed.__contains__) if missed else Counter[str]()
+    for key, count in missed.items():
+        known = min(count, bad[key])
+        left_out.add(key, Cause.UNREADABLE, known)
+        left_out.add(key, Cause.VIEWER, count - known)
+
+
+class _Tally:
+    """Counts the messages that Rerun's reader yields, by entity and by what became of them."""
+
+    def __init__(self) -> None:
+        self._shown: Counter[str] = Counter()
+        self._others: Counter[tuple[str, Cause]] = Counter()
+        self._keys: dict[str, set[str]] = {}
+        """Keys by entity. Rerun gives one entity to some that differ only in odd characters."""
+
+    def follow(self, chunks: Iterable[rrc.Chunk], seen: Callable[[int], None]) -> Iterator[rrc.Chunk]:
+        """Pass on chunks and count their messages."""
+        for chunk in chunks:
+            names = chunk.to_record_batch().schema.names
+            if not chunk.is_static:
+                if is_drawn(panels.topic_of(panels.key_of(chunk.entity_path)), names):
+                    self._shown[chunk.entity_path] += chunk.num_rows
+                else:
+                    cause = Cause.NOT_PROTOBUF if RAW in names else Cause.OTHER_TYPE
+                    self._others[chunk.entity_path, cause] += chunk.num_rows
+            elif _TOPIC in names:
+                (topic,) = chunk.to_record_batch().column(_TOPIC).to_pylist()
+                self._keys.setdefault(chunk.entity_path, set()).update(topic)
+            yield chunk
+            if not chunk.is_static:
+                seen(chunk.num_rows)
+
+    def compare(self, prepared: Prepared) -> tuple[Replayed, Counter[str]]:
+        """Return what became of the recorded messages, and those that Rerun did not yield, by key."""
+        replayed = Replayed(Counter(), LeftOut(Counter(prepared.left_out.counts)))
+        left = Counter(prepared.recorded)
+        left.subtract(prepared.left_out.by_key())
+        for entity, count in self._shown.items():
+            for key, part in self._spread(entity, count, left):
+                replayed.shown[key] += part
+        for (entity, cause), count in self._others.items():
+            for key, part in self._spread(entity, count, left):
+                replayed.left_out.add(key, cause, part)
+        return replayed, +left
+
+    def _spread(self, entity: str, count: int, left: Counter[str]) -> Iterator[tuple[str, int]]:
+        """Take the messages of an entity from those of its keys."""
+        for key in sorted(self._keys.get(entity, ())):
+            part = min(count, left[key])
+            if part > 0:
+                left[key] -= part
+                count -= part
+                yield key, part
 
 
 def count_of(session: Session) -> int:
-    """Return the number of messages of a session from the indexes of its files."""
-    channels = [channel for each in session.segments for channel in WHOLE_SESSION.reader(each).info().channels]
-    return sum(channel.message_count or 0 for channel in channels)
-
-
-def _count_rows(chunks: Iterable[rrc.Chunk], seen: Callable[[int], None]) -> Iterator[rrc.Chunk]:
-    for chunk in chunks:
-        yield chunk
-        if not chunk.is_static:
-            seen(chunk.num_rows)
+    """Return the number of messages of a session from the indexes of its files; 0 if unknown."""
+    return total(session) or 0
 
 
 def rows(path: Path) -> Counter[str]:
-    """Return the messages of an .rrd by key, counted with Rerun's reader."""
+    """Return the drawn messages of an .rrd by key, counted with Rerun's reader."""
     counted: Counter[str] = Counter()
     for chunk in rrc.RrdReader(path).store().stream():
         if chunk.is_static:
@@ -141,6 +250,6 @@ def rows(path: Path) -> Counter[str]:
         names = chunk.to_record_batch().schema.names
         own = any(name.endswith(MESSAGE_SUFFIX) for name in names)
         # Rerun converts foxglove.Log to text. Any other text comes from our lenses.
-        if own or (TEXT in names and key.endswith(_LOGS)):
+        if (own and is_drawn(panels.topic_of(key), names)) or (TEXT in names and key.endswith(_LOGS)):
             counted[key] += chunk.num_rows
     return counted

@@ -3,7 +3,7 @@
 They process whole batches, and single messages only for rare texts.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +20,11 @@ from schemas.topics import TOPICS
 MESSAGE_SUFFIX: Final = ":message"
 """Suffix of the component in which Rerun's reader stores a protobuf message."""
 
+TEXT: Final = "TextLog:text"
+"""Component to which Rerun's reader converts a foxglove.Log."""
+RAW: Final = "McapMessage:data"
+"""Component of a message that Rerun's reader cannot decode: its bytes."""
+
 _ARROW_M: Final = 0.25
 """Length of the arrow of a car."""
 _Pipe = Callable[[Any], Any]
@@ -28,6 +33,16 @@ _Pipe = Callable[[Any], Any]
 def component(topic: str) -> str:
     """Return the component with the messages of a topic."""
     return TOPICS[topic].message + MESSAGE_SUFFIX
+
+
+def is_drawn(topic: str, names: Iterable[str]) -> bool:
+    """Return True if a chunk with these components has messages of the own type of its topic.
+
+    Of a topic that is not ours, any type that Rerun decodes counts.
+    """
+    if topic not in TOPICS:
+        return RAW not in names
+    return component(topic) in names or (TOPICS[topic].message == "foxglove.Log" and TEXT in names)
 
 
 def lenses() -> list[Any]:

@@ -9,20 +9,23 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import rerun as rr
 import rerun.chunk as rrc
+from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, Writer
 
 from fleet.client.supervision import ask_colors
+from fleet.recording.left_out import Cause, LeftOut, has_unknown_enum, may_have_enum
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.export import APPLICATION
 from fleet.replay.rerun.lenses import lenses
-from schemas import keys, messages
+from schemas import keys, messages, topics
 from schemas.bus import Bus, Sample, sample_of
 
 VIEW_INTERVAL_S: Final = 0.5
@@ -63,6 +66,8 @@ class Live:
         self._scratch = tempfile.TemporaryDirectory(prefix="fleet-view-")
         self.dropped = 0
         """Messages dropped because the viewer stalled."""
+        self.left_out = LeftOut()
+        """Messages that Rerun does not show."""
         self._recording = rr.RecordingStream(
             APPLICATION, recording_id=f"live {time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
         )
@@ -88,7 +93,7 @@ class Live:
         if batch:
             path = Path(self._scratch.name) / f"{self._batch % 2}.mcap"
             self._batch += 1
-            _write(path, batch)
+            _write(path, batch, self.left_out)
             chunks = self._drawing.follow(rrc.McapReader(path).stream())
             self._recording.send_chunks(
                 rrc.LazyChunkStream.from_iter(chunks).lenses(lenses(), output_mode="forward_all")
@@ -161,27 +166,53 @@ class Live:
         return len(batch)
 
 
-def _write(path: Path, batch: list[Sample]) -> None:
-    """Write a batch of messages to an MCAP."""
+def _write(path: Path, batch: list[Sample], left_out: LeftOut) -> None:
+    """Write the messages of a batch that Rerun shows to an MCAP, and count the others."""
     now = time.time_ns()
     schemas: dict[str, int] = {}
-    channels: dict[tuple[str, str], int] = {}
+    channels: dict[str, tuple[str, int]] = {}
     with path.open("wb") as file:
         # Without compression and CRCs: we read the file back at once.
         writer: Any = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
         writer.start()
         for sample in batch:
+            if sample.deleted:
+                continue
             name = messages.name_in(sample.encoding)
-            if name is None or sample.deleted:
-                continue  # Rerun shows protobuf only
-            if name not in schemas:
-                try:
-                    descriptors = messages.descriptor_set(name)
-                except KeyError:
+            cause = _why_not_shown(sample, name)
+            if cause is None and name is not None:
+                if name not in schemas:
+                    schemas[name] = writer.register_schema(name, "protobuf", messages.descriptor_set(name))
+                if sample.key not in channels:
+                    channels[sample.key] = name, writer.register_channel(sample.key, "protobuf", schemas[name])
+                # Rerun reads all messages of a key with one schema, chosen at random.
+                first, channel = channels[sample.key]
+                if name == first:
+                    writer.add_message(channel, now, sample.payload, sample.time_ns, sample.sequence)
                     continue
-                schemas[name] = writer.register_schema(name, "protobuf", descriptors)
-            channel = (sample.key, name)
-            if channel not in channels:
-                channels[channel] = writer.register_channel(sample.key, "protobuf", schemas[name])
-            writer.add_message(channels[channel], now, sample.payload, sample.time_ns, sample.sequence)
+                cause = Cause.OTHER_TYPE
+            left_out.add(sample.key, cause or Cause.NOT_PROTOBUF)
         writer.finish()
+
+
+def _why_not_shown(sample: Sample, name: str | None) -> Cause | None:
+    if name is None:
+        return Cause.NOT_PROTOBUF
+    topic = topics.of_key(sample.key)
+    if topic is not None and name != topic.message:
+        return Cause.OTHER_TYPE
+    try:
+        message_class = messages.message_class(name)
+        message = message_class.FromString(sample.payload)
+        if _may_have_enum(name) and has_unknown_enum(message):
+            return Cause.UNKNOWN_ENUM
+    except KeyError:
+        return Cause.BAD_SCHEMA
+    except DecodeError:
+        return Cause.UNREADABLE
+    return None
+
+
+@cache
+def _may_have_enum(name: str) -> bool:
+    return may_have_enum(messages.message_class(name).DESCRIPTOR)

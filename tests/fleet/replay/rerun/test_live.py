@@ -19,13 +19,14 @@ import zenoh
 from click.testing import CliRunner
 
 from fleet.commands.view import view
+from fleet.recording.left_out import Cause
 from fleet.replay.rerun import export, live
 from fleet.replay.rerun.live import Live
 from fleet.replay.rerun.viewer import Viewer, free_port
 from schemas.bus import Bus, reply_message, router_config
 from schemas.colors import car_color
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.topics import TOPICS
+from schemas.topics import PROTOBUF, TOPICS, Qos
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, freeze, wait_for
 
@@ -111,6 +112,33 @@ def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path
     reader = rrc.RrdReader(out)
     (layout,) = {each.application_id for each in reader.blueprints()}
     assert layout == export.APPLICATION
+
+
+def test_strays_and_junk_on_the_bus_hide_no_message_and_are_counted(fleet: FleetProcesses, tmp_path: Path) -> None:
+    out = tmp_path / "now.rrd"
+    link, log = "fleet/red/state/link", "fleet/red/event/log"
+    with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
+
+        def put(key: str, payload: bytes, name: str, count: int = 1) -> None:
+            for _ in range(count):
+                bus.put_again(key, payload, f"{PROTOBUF};{name}" if name else "application/json", 0, Qos.READING)
+
+        # Rerun chooses a schema at random: one batch would prove nothing.
+        for number in range(1, 7):
+            put(link, pb.Link(state="online").SerializeToString(), "fleet.v1.Link", 10)
+            put(link, pb.Range(car="red", range_m=1).SerializeToString(), "fleet.v1.Range")
+            put(link, b"{}", "")
+            put(link, b"\xff", "fleet.v1.Link")
+            put(log, b"\x10\x4d", "foxglove.Log")  # a level without a name, on which Rerun aborts
+            given = 14 * number
+            wait_for(lambda: following.step() or following.sent + following.left_out.total == given, "all is counted")  # noqa: B023
+    assert following.left_out.counts == {
+        (link, Cause.OTHER_TYPE): 6,
+        (link, Cause.NOT_PROTOBUF): 6,
+        (link, Cause.UNREADABLE): 6,
+        (log, Cause.UNKNOWN_ENUM): 6,
+    }
+    assert export.rows(out) == {link: 60}
 
 
 def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) -> None:

@@ -1,0 +1,161 @@
+"""Prepares the files of a session for Rerun's MCAP reader, which shows only a part of some of them.
+
+Its reader picks one schema for each key at random, skips chunks without message indexes, refuses files without chunks,
+shows chunks that fail their checksum, and aborts the process on an enum number without a name. If a session has any of
+these, its messages are copied first: into one file for the first schema of each key, another for the second, and so on.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from fleet.recording.left_out import Cause, LeftOut, has_unknown_enum, may_have_enum
+from fleet.recording.reading.mcap_index import Index
+from fleet.recording.reading.mcap_reader import ChannelInfo, Row
+from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.reading.session import Session
+from fleet.recording.selection import Selection
+from fleet.recording.writing.mcap_copy import McapCopy
+
+Wanted = Callable[[str], bool]
+MAX_VARIANTS: Final = 16
+"""Maximum copies. More schemas on one key than this share the last."""
+
+
+@dataclass(slots=True)
+class Prepared:
+    """Files to give to Rerun, and what was recorded."""
+
+    files: list[Path]
+    recorded: Counter[str] = field(default_factory=Counter)
+    """Messages by key, of which `left_out` are not in the files."""
+    left_out: LeftOut = field(default_factory=LeftOut)
+
+
+def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole: bool) -> Prepared | None:
+    """Return the session's own files if Rerun can read them as they are, else None.
+
+    wanted: as for `copied`. whole: True if all of the session is selected.
+    """
+    indexes = list(session.indexes().values())
+    if session.damage or len(indexes) != len(session.segments):
+        return None
+    decoder = MessageDecoder()
+    enums: set[str] = set()
+    for index in indexes:
+        if index is None or not _is_plain(index):
+            return None
+        for channel in index.channels.values():
+            info = ChannelInfo(channel, index.schemas.get(channel.schema_id))
+            if _refusal(decoder, info) is not None:
+                return None
+            if _may_abort(decoder, info):
+                enums.add(channel.topic)
+    if enums and any(_aborts(decoder, row) for row in session.rows(Selection(tuple(enums)))):
+        return None
+    prepared = Prepared(list(session.segments))
+    if whole:
+        prepared.recorded.update(_total(indexes))
+    else:
+        prepared.recorded.update(
+            row[0].channel.topic for row in session.rows(selection) if wanted(row[0].channel.topic)
+        )
+    return prepared
+
+
+def copied(session: Session, selection: Selection, wanted: Wanted, scratch: Path) -> Prepared:
+    """Copy the messages into files that Rerun reads whole; raises OSError.
+
+    wanted: whether to copy a key. scratch: an existing directory.
+    """
+    prepared = Prepared([])
+    decoder = MessageDecoder()
+    variants: dict[str, list[tuple[str, str, bytes]]] = {}
+    copies: list[McapCopy] = []
+    known: dict[int, tuple[ChannelInfo, int, bool, Cause | None]] = {}
+    with ExitStack() as stack:
+        for row in session.rows(selection):
+            info = row[0]
+            key = info.channel.topic
+            if not wanted(key):
+                continue
+            prepared.recorded[key] += 1
+            entry = known.get(id(info))
+            if entry is None:
+                schemas = variants.setdefault(key, [])
+                schema = _schema_of(info)
+                if schema not in schemas:
+                    schemas.append(schema)
+                number = min(schemas.index(schema), MAX_VARIANTS - 1)
+                entry = known[id(info)] = (info, number, _may_abort(decoder, info), _refusal(decoder, info))
+            _, number, checked, cause = entry
+            if cause is None and checked and _aborts(decoder, row):
+                cause = Cause.UNKNOWN_ENUM
+            if cause is not None:
+                prepared.left_out.add(key, cause)
+                continue
+            while len(copies) <= number:
+                path = scratch / f"{len(copies) + 1:04d}.mcap"
+                copies.append(stack.enter_context(McapCopy(path)))
+                prepared.files.append(path)
+            copies[number].add(row)
+    return prepared
+
+
+def unreadable(session: Session, selection: Selection, wanted: Wanted) -> Counter[str]:
+    """Return the messages of the wanted keys that do not match their schema, by key."""
+    decoder = MessageDecoder()
+    found: Counter[str] = Counter()
+    for row in session.rows(selection):
+        key = row[0].channel.topic
+        if wanted(key) and decoder.class_of(row[0]) is not None and decoder.message(row[0], row[4]) is None:
+            found[key] += 1
+    return found
+
+
+def _is_plain(index: Index) -> bool:
+    """Return True if Rerun reads every message of a file with this index."""
+    if not (index.has_all_chunks and index.has_all_channels and all(chunk.table for chunk in index.chunks)):
+        return False
+    schemas: dict[str, tuple[str, str, bytes]] = {}
+    for channel in index.channels.values():
+        schema = _schema_of(ChannelInfo(channel, index.schemas.get(channel.schema_id)))
+        if schemas.setdefault(channel.topic, schema) != schema:
+            return False
+    return True
+
+
+def _schema_of(info: ChannelInfo) -> tuple[str, str, bytes]:
+    """Return what decides how Rerun reads a channel."""
+    schema = info.schema
+    return (info.channel.message_encoding, "", b"") if schema is None else (schema.encoding, schema.name, schema.data)
+
+
+def _refusal(decoder: MessageDecoder, info: ChannelInfo) -> Cause | None:
+    """Return why a channel must not reach Rerun. One bad schema would fail its reader for all keys."""
+    if info.schema is not None and info.schema.encoding == "protobuf":
+        if info.channel.message_encoding != "protobuf":
+            return Cause.NOT_PROTOBUF
+        if decoder.class_of(info) is None:
+            return Cause.BAD_SCHEMA
+    return None
+
+
+def _may_abort(decoder: MessageDecoder, info: ChannelInfo) -> bool:
+    message_class = decoder.class_of(info)
+    return message_class is not None and may_have_enum(message_class.DESCRIPTOR)
+
+
+def _aborts(decoder: MessageDecoder, row: Row) -> bool:
+    message: Any = decoder.message(row[0], row[4])
+    return message is not None and has_unknown_enum(message)
+
+
+def _total(indexes: list[Index | None]) -> Counter[str]:
+    total: Counter[str] = Counter()
+    for index in indexes:
+        total.update(index.counts if index is not None else {})
+    return total

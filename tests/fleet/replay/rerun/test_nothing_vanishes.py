@@ -1,0 +1,128 @@
+"""Every recorded message is shown by `fleet replay`, or named with its key, count and cause."""
+
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from mcap.writer import IndexType
+
+from fleet.commands.replay import replay
+from fleet.recording.left_out import Cause
+from fleet.recording.reading.session import NoSession, Session
+from fleet.replay.rerun import export
+from tests.support.random_session import LINK, LOG, RANGE, UNKNOWN_LEVEL, Mixed, make
+
+
+def replayed(path: Path) -> export.Replayed:
+    return export.export(Session(path), path.with_suffix(".rrd"))
+
+
+@pytest.mark.parametrize("first", ["fleet.v1.Link", "fleet.v1.Range"])
+def test_a_stray_message_does_not_hide_the_own_ones_of_a_key(tmp_path: Path, first: str) -> None:
+    # Rerun chooses a schema at random: once would prove nothing.
+    for number in range(8):
+        made = Mixed(path := tmp_path / f"{number}.mcap")
+        if first == "fleet.v1.Range":
+            made.stray(LINK, RANGE)
+        made.own(LINK, 25)
+        made.stray(LINK, RANGE)
+        made.own(LINK, 25)
+        made.close()
+        found = replayed(path)
+        assert found.shown == {LINK: 50}
+        assert found.left_out.counts == {(LINK, Cause.OTHER_TYPE): made.counts[LINK] - 50}
+        assert export.rows(path.with_suffix(".rrd")) == found.shown
+
+
+def test_junk_is_named_by_its_cause(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "x.mcap")
+    made.own(RANGE, 3)
+    made.put(RANGE, "fleet.v1.Range", b"\xff\xff")
+    made.put(RANGE, "", b"{}", "json")
+    made.put("/imu", "", b"{}", "json")
+    made.close()
+    found = replayed(path)
+    assert found.shown == {RANGE: 3}
+    assert found.left_out.counts == {
+        (RANGE, Cause.UNREADABLE): 1,
+        (RANGE, Cause.NOT_PROTOBUF): 1,
+        ("/imu", Cause.NOT_PROTOBUF): 1,
+    }
+
+
+def test_a_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "x.mcap")
+    made.own(LOG, 2)
+    made.put(LOG, "foxglove.Log", UNKNOWN_LEVEL)
+    made.close()
+    # Rerun would abort the process of the tests.
+    program = "import sys; from fleet.__main__ import main; sys.exit(main())"
+    save = ["replay", str(path), "--save", str(path.with_suffix(".rrd"))]
+    done = subprocess.run([sys.executable, "-c", program, *save], capture_output=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert export.rows(path.with_suffix(".rrd")) == {LOG: 2}
+
+
+@pytest.mark.parametrize("options", [{"use_chunking": False}, {"index_types": IndexType.NONE}])
+def test_files_that_reruns_reader_refuses_are_shown(tmp_path: Path, options: dict[str, object]) -> None:
+    made = Mixed(path := tmp_path / "x.mcap", **options)
+    made.own(RANGE, 5)
+    made.close()
+    found = replayed(path)
+    assert (found.shown, found.left_out.total) == ({RANGE: 5}, 0)
+
+
+def test_a_file_without_a_message_of_a_fleet_is_no_traceback(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "x.mcap", use_chunking=False)
+    made.put("/imu/\x1b]0;pwn\x07data", "J", b"{}", "json")
+    made.close()
+    result = CliRunner().invoke(replay, [str(path), "--save", str(tmp_path / "x.rrd")])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert "\x1b" not in result.output
+    assert not (tmp_path / "x.rrd").exists()
+
+
+def test_a_part_counts_only_what_is_asked(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "x.mcap")
+    made.own(LINK, 4)
+    made.stray(LINK, RANGE)
+    made.own("fleet/blue/state/mode", 4)
+    made.close()
+    part = export.Part(cars=("red",))
+    found = export.export(Session(path), tmp_path / "x.rrd", part)
+    assert (found.shown, found.left_out.by_key()) == ({LINK: 4}, {LINK: 1})
+
+
+def check(directory: Path, seed: int) -> None:
+    make(path := directory / f"{seed}.mcap", seed)
+    try:
+        session = Session(path)
+        recorded = Counter(row[0].channel.topic for row in session.rows())
+        session.check()
+        found = export.export(session, path.with_suffix(".rrd"))
+    except NoSession:
+        return
+    named = found.left_out.by_key()
+    assert {key: found.shown[key] + named.get(key, 0) for key in recorded} == recorded, seed
+    assert not found.left_out.by_key().keys() - recorded, seed
+    assert not found.shown.keys() - recorded, seed
+    assert export.rows(path.with_suffix(".rrd")).total() <= found.shown.total(), seed
+    path.unlink()
+    path.with_suffix(".rrd").unlink()
+
+
+@pytest.mark.parametrize("first", range(0, 60, 20))
+def test_recorded_is_shown_and_named_in_files_of_chance(tmp_path: Path, first: int) -> None:
+    for seed in range(first, first + 20):
+        check(tmp_path, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_recorded_is_shown_and_named_in_many_files(tmp_path: Path) -> None:
+    for seed in range(2000):
+        check(tmp_path, seed)
