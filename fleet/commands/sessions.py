@@ -16,6 +16,7 @@ from fleet.commands.redecode import redecode, vector
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
 from schemas.local_time import of_iso, with_offset
+from schemas.printable import printable_lines
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -313,5 +314,9 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
+        for line in done.left_out.words():
+            click.echo(f"not in the table of its key: {line}", err=True)
+        for table, count in done.undated.items():
+            click.echo(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
         if found.damage:
-            click.echo(f"only the intact part was exported: {found.damage_words}", err=True)
+            click.echo(printable_lines(f"only the intact part was exported: {found.damage_words}"), err=True)

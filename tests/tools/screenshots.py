@@ -95,7 +95,7 @@ def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
     made: dict[str, Shown] = {}
     with tempfile.TemporaryDirectory() as scratch:
         rrd = Path(scratch) / f"{found.name}.rrd"
-        held = export(found, rrd)
+        held = export(found, rrd).shown
         made["fleet.png"] = take(rrd, folder / "fleet.png")
         if any(view.startswith(WORLD) for view in made["fleet.png"].views):
             made["world.png"] = take(rrd, folder / "world.png", WORLD)

@@ -3,7 +3,9 @@
 A session is a directory (session_dir.py) or a single .mcap file of any writer. mcap_reader.py reads the files.
 """
 
+import errno
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator
 from copy import copy
@@ -16,11 +18,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal, overload
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
 from fleet.recording.reading.mcap_index import Index
-from fleet.recording.reading.mcap_reader import McapReader, NotMcap, Row
+from fleet.recording.left_out import Cause, LeftOut
+from fleet.recording.reading.mcap_reader import ChannelInfo, McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
-from fleet.recording.tools.analysis import arrow_table, data_frame, is_known, join_as_of, no_messages
+from fleet.recording.tools.analysis import arrow_table, data_frame, is_known, join_as_of, no_messages, stray_tables
 from fleet.recording.writing.mcap_copy import McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
@@ -92,6 +95,8 @@ class Session:
         """Damage that opening, checking or reading has found so far."""
         self.unended: set[Path] = set()
         """Segments that are only truncated, as a file still being written is."""
+        self.left_out = LeftOut()
+        """Messages by key and cause that the latest `messages(decode=True)` could not decode so far."""
         for segment in there:
             try:
                 McapReader(segment)
@@ -122,7 +127,7 @@ class Session:
     def part(self, segments: tuple[Path, ...]) -> "Session":
         """Return these segments as a session of their own."""
         part = copy(self)
-        part.segments, part.damage, part.unended = segments, {}, set()
+        part.segments, part.damage, part.unended, part.left_out = segments, {}, set(), LeftOut()
         return part
 
     @property
@@ -156,11 +161,18 @@ class Session:
 
         For truncated or damaged files: other readers stop at the damage, or show corrupted messages.
         """
-        with McapCopy(out) as copy:
-            for row in self.rows():
-                copy.add(row)
-        if not copy.messages:
-            raise NoSession(f"{self.path} has no intact message: {self.damage_words}")
+        if out.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(out))
+        part = out.with_name(f".{out.name}.part")
+        try:
+            with McapCopy(part) as copy:
+                for row in self.rows():
+                    copy.add(row)
+            if not copy.messages:
+                raise NoSession(f"{self.path} has no intact message: {self.damage_words}")
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
         return self.part((out,))
 
     @overload
@@ -197,8 +209,8 @@ class Session:
         (`red/sensor/range`, `fleet/red/**`). start_ns (included), end_ns (excluded): times of the recorder's clock, ns
         since the epoch. With an index only the chunks in question are read, so the last minute of a long session takes
         no longer than a minute's messages.
-        decode: True to yield readings, as `Fleet.watch` does, and to leave out what is not protobuf. False to yield
-        payloads as they were on the bus.
+        decode: True to yield readings, as `Fleet.watch` does; what cannot be decoded is counted in `left_out`. False to
+        yield payloads as they were on the bus.
         Raises NoTable if `keys` is one name without wildcards that neither we nor this session have.
         """
         selection = self.selection(keys, start_ns, end_ns)
@@ -215,10 +227,13 @@ class Session:
 
     def _readings(self, rows: Iterable[Row]) -> Iterator[Reading]:
         decoder = MessageDecoder()
+        self.left_out = LeftOut()
         for info, _, _, publish_ns, data in rows:
             value = decoder.message(info, data)
             if value is not None:
                 yield Reading.of(info.channel.topic, value, publish_ns)
+            else:
+                self.left_out.add(info.channel.topic, _why_not_decoded(decoder, info))
 
     def to_arrow(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pa.Table":
         """Return the messages of one type as a pyarrow.Table, one row for each message, in the order of publish_time.
@@ -228,9 +243,19 @@ class Session:
         Columns: key, car, log_time (recorder's clock) and publish_time (publisher's clock) as timestamp[ns, UTC],
         sequence, then the fields. A unit is in the column's name and in the field's metadata (`unit`). A value is null
         if it was not measured. The request of a command has a column for each field (`request_motion`).
+        Messages of other types on these keys are not in it: a warning counts them, `stray_tables` has them. Times
+        beyond the year 2262 are null, with a warning.
         Raises NoTable, and FormatMissing (an ImportError) without the extra `analysis`.
         """
         return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
+
+    def stray_tables(self, *, start_ns: int | None = None, end_ns: int | None = None) -> "dict[str, pa.Table]":
+        """Return the messages that are not of the type of their key, one pyarrow.Table each type.
+
+        The names are `stray.fleet.v1.Range`, and `other` for messages that are not protobuf. start_ns, end_ns: as for
+        `messages`. Raises FormatMissing without the extra `analysis`.
+        """
+        return stray_tables(self.rows(Selection(None, start_ns, end_ns)))
 
     def to_pandas(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pd.DataFrame":
         """Return the table of `to_arrow` as a pandas.DataFrame, with pd.NA for values that were not measured.
@@ -304,6 +329,13 @@ class Session:
         if reader.damage:
             self.damage[reader.path] = reader.words
             (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
+
+
+def _why_not_decoded(decoder: MessageDecoder, info: ChannelInfo) -> Cause:
+    if decoder.class_of(info) is not None:
+        return Cause.UNREADABLE
+    is_protobuf = info.channel.message_encoding == "protobuf" and message_of(info)
+    return Cause.BAD_SCHEMA if is_protobuf else Cause.NOT_PROTOBUF
 
 
 def _recorded(row: Row) -> Recorded:

@@ -7,11 +7,13 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
 
 from fleet.recording.reading.mcap_reader import Row
-from fleet.recording.tools.export import OTHER_TABLE, arrow_tables
+from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.tools.export import OTHER_TABLE, STRAY_PREFIX, arrow_tables, is_stray, own_type
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
 from schemas import messages, topics
 from schemas.commands import COMMANDS
+from schemas.printable import printable_lines
 from schemas.suggestion import did_you_mean
 
 if TYPE_CHECKING:
@@ -33,13 +35,23 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
     of, session: the names for errors. If `of` is a topic or a message of ours, the table may be empty.
     """
     tables, exported = arrow_tables(rows)
-    if exported.undecoded:
-        warnings.warn(
-            f"{exported.undecoded} messages of {session} do not match their schema and were skipped", stacklevel=3
-        )
+    strays = {name: tables.pop(name) for name in list(tables) if name.startswith(STRAY_PREFIX)}
     other = tables.pop(OTHER_TABLE, None)
+    others = other.num_rows - exported.undecoded if other is not None else 0
+    if exported.undecoded:
+        _warn(f"{exported.undecoded} messages of {session} do not match their schema and were skipped")
+    if exported.undated:
+        _warn(f"{sum(exported.undated.values())} times in {of} of {session} are beyond the year 2262: they are null")
+    if strays:
+        stray_types = ", ".join(name.removeprefix(STRAY_PREFIX) for name in sorted(strays))
+        count = sum(table.num_rows for table in strays.values())
+        _warn(f"{count} messages on keys of {of} are of another type ({stray_types}): Session.stray_tables() has them")
+    if tables and others:
+        _warn(f"{others} messages on keys of {of} are not protobuf: Session.stray_tables() has them")
     if not tables:
-        tables = {of: other if other is not None and not exported.undecoded else _empty_table(of, session)}
+        owners = {own_type(key) for table in strays.values() for key in table["key"].unique().to_pylist()}
+        name = owners.pop() if len(owners) == 1 else of
+        tables = {of: other if others and not exported.undecoded and not strays else _empty_table(name, session)}
     # A type whose fields changed within the session has several tables.
     types = sorted({name.partition("-")[0] for name in tables})
     if len(types) > 1:
@@ -48,6 +60,18 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
     if rest:
         first = import_pyarrow().concat_tables([first, *rest], promote_options="permissive")
     return first.sort_by(TIME)
+
+
+def _warn(words: str) -> None:
+    # The caller of `Session.to_arrow` or `to_pandas` sees its own line or one of ours, depending on the method.
+    warnings.warn(printable_lines(words), stacklevel=4)
+
+
+def stray_tables(rows: Iterable[Row]) -> "dict[str, pa.Table]":
+    """Return the tables of messages that are not of the type of their key, and of those that are not protobuf."""
+    decoder = MessageDecoder()
+    tables, _ = arrow_tables(row for row in rows if decoder.class_of(row[0]) is None or is_stray(row[0]))
+    return {name: table.sort_by(TIME) for name, table in tables.items()}
 
 
 def _empty_table(of: str, session: str) -> "pa.Table":

@@ -1,6 +1,7 @@
 """Exports a session to tables, one per message type: files, or Arrow in memory. tables.py defines their columns."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,15 +9,20 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError, Message
 
+from fleet.recording.left_out import Cause, LeftOut
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.tools import tables
 from fleet.recording.tools.table_formats import ArrowSink, FileSink, Sink
+from schemas import keys, topics
+from schemas.commands import COMMANDS
 
 BATCH_BYTES: Final = 4 << 20
 """Maximum buffered size of one table: its payloads, and ROW_BYTES per row."""
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
+STRAY_PREFIX: Final = "stray."
+"""Begin of the names of tables with messages that are not of the type of their key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +33,10 @@ class Exported:
     """Rows by name of the table."""
     undecoded: int
     """Messages that do not match their protobuf schema. Their bytes are in the table of other messages."""
+    left_out: LeftOut = field(default_factory=LeftOut)
+    """Messages that are not in the table of the type of their key, but in another."""
+    undated: Mapping[str, int] = field(default_factory=dict)
+    """Times that the format cannot hold, by name of the table. They are null there."""
 
 
 @dataclass(slots=True)
@@ -77,6 +87,7 @@ class _Table:
     layout: tables.Layout | None
     message_class: type[Message] | None
     name: str
+    stray: bool = False
     batch: _Batch = field(default_factory=_Batch)
     size: int = 0
     rows: int = 0
@@ -119,8 +130,9 @@ class _Export:
         self._open_sink = open_sink
         self._decoder = MessageDecoder()
         self._by_channel: dict[int, tuple[ChannelInfo, _Table]] = {}
-        self.tables: dict[type[Message] | None, _Table] = {}
+        self.tables: dict[tuple[type[Message] | None, bool], _Table] = {}
         self.undecoded = 0
+        self.left_out = LeftOut()
 
     def run(self, rows: Iterable[Row]) -> None:
         """Write every message."""
@@ -129,7 +141,9 @@ class _Export:
             # Look it up by identity, which is fast. Storing the object too keeps its id from being reused.
             known = by_channel.get(id(info))
             if known is None:
-                known = by_channel[id(info)] = (info, self._table_for(self._decoder.class_of(info)))
+                message_class = self._decoder.class_of(info)
+                stray = message_class is not None and is_stray(info)
+                known = by_channel[id(info)] = (info, self._table_for(message_class, stray=stray))
             table = known[1]
             batch = table.batch
             batch.infos.append(info)
@@ -142,37 +156,69 @@ class _Export:
                 self._write(table)
         for table in list(self.tables.values()):
             self._write(table)
-        if None in self.tables:
-            self.tables[None].write()
+        if (None, False) in self.tables:
+            self.tables[None, False].write()
 
     def _write(self, table: _Table) -> None:
+        infos = table.batch.infos
         bad = table.write()
         self.undecoded += len(bad.infos)
         if bad.infos:
-            self._table_for(None).batch.extend(bad)
+            self._table_for(None, stray=False).batch.extend(bad)
+        unreadable = Counter(info.channel.topic for info in bad.infos)
+        for key, count in unreadable.items():
+            self.left_out.add(key, Cause.UNREADABLE, count)
+        if table.stray:
+            for key, count in Counter(info.channel.topic for info in infos).items():
+                self.left_out.add(key, Cause.OTHER_TYPE, count - unreadable[key])
 
-    def _table_for(self, message_class: type[Message] | None) -> _Table:
-        if message_class not in self.tables:
-            self.tables[message_class] = self._open_table(message_class)
-        return self.tables[message_class]
+    def _table_for(self, message_class: type[Message] | None, *, stray: bool) -> _Table:
+        if (message_class, stray) not in self.tables:
+            self.tables[message_class, stray] = self._open_table(message_class, stray=stray)
+        return self.tables[message_class, stray]
 
-    def _open_table(self, message_class: type[Message] | None) -> _Table:
+    def _open_table(self, message_class: type[Message] | None, *, stray: bool) -> _Table:
         """Open a new table. Number it if fields of the type changed within the session."""
         stem = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
+        stem = f"{STRAY_PREFIX}{stem}" if stray else stem
         taken = {table.name.lower() for table in self.tables.values()}
         name = next(one for one in _table_names(re.sub(r"[^A-Za-z0-9._-]", "_", stem)) if one.lower() not in taken)
         layout = tables.Layout(message_class.DESCRIPTOR) if message_class is not None else None
         sink = self._open_sink(name, layout.columns if layout is not None else tables.OTHER_COLUMNS)
-        return _Table(sink, layout, message_class, name)
+        return _Table(sink, layout, message_class, name, stray)
 
     def close(self) -> None:
         """End every table."""
         for table in self.tables.values():
             table.sink.close()
 
+    def discard(self) -> None:
+        """Remove every table, whole or not."""
+        for table in self.tables.values():
+            table.sink.discard()
+
+
+def is_stray(info: ChannelInfo) -> bool:
+    """Return True if a channel has a protobuf type, and its key is ours and has another."""
+    own = own_type(info.channel.topic)
+    return bool(own) and message_of(info) not in ("", own)
+
+
+def own_type(key: str) -> str:
+    """Return the full name of the messages of a key; empty if the key is not ours."""
+    topic = topics.of_key(key)
+    if topic is not None:
+        return topic.message
+    parsed = keys.parse(key)
+    command = COMMANDS.get(parsed.topic.removeprefix("@cmd/")) if parsed is not None else None
+    return command.message if command is not None and parsed is not None and parsed.topic.startswith("@cmd/") else ""
+
 
 def export(rows: Iterable[Row], out: Path, sink: type[FileSink]) -> Exported:
-    """Write the tables of messages into an existing directory; raises OSError, FormatMissing."""
+    """Write the tables of messages into an existing directory; raises OSError, FormatMissing.
+
+    After an error none of its files are left.
+    """
     return _export(rows, lambda name, columns: sink(out / f"{name}{sink.ending}", columns))
 
 
@@ -187,9 +233,13 @@ def _export(rows: Iterable[Row], open_sink: Callable[[str, Sequence[tables.Colum
     writing = _Export(open_sink)
     try:
         writing.run(rows)
-    finally:
         writing.close()
-    return Exported({table.name: table.rows for table in writing.tables.values()}, writing.undecoded)
+    except BaseException:
+        writing.discard()
+        raise
+    tables = writing.tables.values()
+    undated = {table.name: table.sink.undated for table in tables if table.sink.undated}
+    return Exported({table.name: table.rows for table in tables}, writing.undecoded, writing.left_out, undated)
 
 
 def _table_names(stem: str) -> Iterator[str]:

@@ -7,13 +7,16 @@ microseconds by default: DuckDB subtracts no times in nanoseconds (docs/explanat
 import csv
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, Protocol
+from typing import IO, Any, ClassVar, Final, Literal, Protocol
 
 from fleet.recording.tools.tables import Column, ColumnKind, Values
 from schemas.suggestion import how_to_install
 
+MAX_ARROW_NS: Final = 2**63 - 1
+"""Last time that 64 bits of nanoseconds can hold: in the year 2262. The first is as long before 1970."""
 MAX_CACHED_SECONDS: Final = 4096
 """Maximum seconds cached as text."""
 
@@ -35,8 +38,15 @@ class Sink(Protocol):
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
 
+    @property
+    def undated(self) -> int:
+        """Times that the format cannot hold. They are null."""
+
     def close(self) -> None:
         """End the table."""
+
+    def discard(self) -> None:
+        """Remove the table, whole or not."""
 
 
 class FileSink(Sink, Protocol):
@@ -53,22 +63,50 @@ class CsvSink:
     ending: ClassVar[str] = ".csv"
 
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
-        self._file = path.open("w", encoding="utf-8", newline="")
+        self._path = path
+        self._file = _part(path).open("w", encoding="utf-8", newline="")
+        self.undated = 0
         self._writer = csv.writer(self._file)
         self._writer.writerow([column.name for column in columns])
         self._columns = columns
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
-        self._writer.writerows(csv_cells(self._columns, values))
+        cells = csv_cells(self._columns, values, self._count_undated)
+        self._writer.writerows(cells)
 
     def close(self) -> None:
-        """End the file."""
+        """End the file, and give it its name."""
         self._file.close()
+        _part(self._path).replace(self._path)
+
+    def discard(self) -> None:
+        """Remove the file."""
+        _remove(self._file, self._path)
+
+    def _count_undated(self, count: int) -> None:
+        self.undated += count
 
 
-def csv_cells(columns: Sequence[Column], values: Sequence[Values]) -> Iterator[tuple[Any, ...]]:
-    """Return the rows of a CSV table from the values of its columns."""
+def _part(path: Path) -> Path:
+    """Return the name of a file until it is whole."""
+    return path.with_name(f"{path.name}.part")
+
+
+def _remove(file: IO[Any], path: Path) -> None:
+    with suppress(OSError):  # the failed disk, which is why it is removed
+        file.close()
+    for each in (_part(path), path):
+        each.unlink(missing_ok=True)
+
+
+def csv_cells(
+    columns: Sequence[Column], values: Sequence[Values], undated: Callable[[int], None] = lambda _: None
+) -> Iterator[tuple[Any, ...]]:
+    """Return the rows of a CSV table from the values of its columns. undated: called with the number of bad times."""
+    for column, given in zip(columns, values, strict=True):
+        if column.kind is ColumnKind.TIME and (bad := sum(_text_of_time(each) is None for each in _suspects(given))):
+            undated(bad)
     texts = [_TO_TEXT.get(column.kind) for column in columns]
     return zip(
         *(column if text is None else text(column) for text, column in zip(texts, values, strict=True)), strict=True
@@ -89,8 +127,21 @@ def _times(column: Values) -> Values:
     seconds = _SecondTexts()
     try:
         return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}Z" for ns in column]
+    except (OverflowError, ValueError, OSError):  # some are not dates: the clock of another writer was wrong
+        return [None if ns is None else _text_of_time(ns) for ns in column]
+
+
+def _text_of_time(ns: int) -> str | None:
+    try:
+        words = datetime.fromtimestamp(ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     except (OverflowError, ValueError, OSError):
-        return column  # not a date: the clock of another writer was wrong
+        return None
+    return f"{words}.{ns % 1_000_000_000:09d}Z"
+
+
+def _suspects(column: Values) -> Values:
+    """Return the times that may have no text."""
+    return [ns for ns in column if ns is not None and not 0 <= ns <= MAX_ARROW_NS]
 
 
 def _each(text: Callable[[Any], str]) -> Callable[[Values], Values]:
@@ -131,7 +182,7 @@ class ArrowSink:
         }
         made = {ColumnKind.LIST: pa.list_, ColumnKind.MAP: lambda item: pa.map_(pa.string(), item)}
         time = pa.timestamp(time_unit, "UTC")
-        self._in_us = [column.kind is ColumnKind.TIME and time_unit == "us" for column in columns]
+        self._in_us = time_unit == "us"
         self._types = [
             made[column.kind](kinds.get(column.item, pa.string()))
             if column.kind in made
@@ -141,8 +192,11 @@ class ArrowSink:
             for column in columns
         ]
         self._maps = [column.kind is ColumnKind.MAP for column in columns]
+        self._times = [column.kind is ColumnKind.TIME for column in columns]
+        self._time_lists = [column.kind is ColumnKind.LIST and column.item is ColumnKind.TIME for column in columns]
         self._pa = pa
         self._batches: list[Any] = []
+        self.undated = 0
         self.schema = pa.schema(
             pa.field(column.name, kind, metadata={"unit": column.unit} if column.unit else None)
             for column, kind in zip(columns, self._types, strict=True)
@@ -154,11 +208,33 @@ class ArrowSink:
 
     def batch(self, values: Sequence[Values]) -> Any:
         """Return rows as an Arrow record batch."""
+        shapes = zip(self._types, self._maps, self._times, self._time_lists, values, strict=True)
         arrays = [
-            self._pa.array(_items(column) if is_map else _microseconds(column) if in_us else column, kind)
-            for kind, is_map, in_us, column in zip(self._types, self._maps, self._in_us, values, strict=True)
+            self._pa.array(
+                _items(column)
+                if is_map
+                else self._time(column)
+                if is_time
+                else [None if value is None else self._held(value) for value in column]
+                if is_time_list
+                else column,
+                kind,
+            )
+            for kind, is_map, is_time, is_time_list, column in shapes
         ]
         return self._pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+
+    def _time(self, times: Values) -> Values:
+        held = self._held(times)
+        return _microseconds(held) if self._in_us else held
+
+    def _held(self, times: Values) -> Values:
+        """Return times with None for those beyond 64 bits."""
+        if all(ns is None or -MAX_ARROW_NS <= ns <= MAX_ARROW_NS for ns in times):
+            return times
+        held = [None if ns is None or not -MAX_ARROW_NS <= ns <= MAX_ARROW_NS else ns for ns in times]
+        self.undated += held.count(None) - times.count(None)
+        return held
 
     def table(self) -> Any:
         """Return the rows as a pyarrow.Table."""
@@ -166,6 +242,10 @@ class ArrowSink:
 
     def close(self) -> None:
         """Keep the rows."""
+
+    def discard(self) -> None:
+        """Forget the rows."""
+        self._batches.clear()
 
 
 def _items(column: Values) -> Values:
@@ -186,7 +266,8 @@ class ParquetSink:
         self._arrow = ArrowSink(columns, self.time_unit)
         from pyarrow import parquet
 
-        self._file = path.open("wb")
+        self._path = path
+        self._file = _part(path).open("wb")
         self._writer = parquet.ParquetWriter(self._file, self._arrow.schema, compression="zstd")
 
     def add(self, values: Sequence[Values]) -> None:
@@ -194,11 +275,24 @@ class ParquetSink:
         self._writer.write_batch(self._arrow.batch(values))
 
     def close(self) -> None:
-        """End the file."""
+        """End the file, and give it its name."""
         try:
             self._writer.close()
         finally:
             self._file.close()
+        _part(self._path).replace(self._path)
+
+    def discard(self) -> None:
+        """Remove the file."""
+        # An open writer would write its footer when it is collected.
+        with suppress(OSError):
+            self._writer.close()
+        _remove(self._file, self._path)
+
+    @property
+    def undated(self) -> int:
+        """Times that the format cannot hold. They are null."""
+        return self._arrow.undated
 
 
 class ParquetNsSink(ParquetSink):

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from fleet.recording.left_out import Cause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.analysis import NoTable
+from tests.support.random_session import RANGE, Mixed
 
 
 def mcap(*sequences: int) -> bytes:
@@ -117,3 +119,15 @@ def test_a_name_that_nobody_has_is_refused_with_the_likely_one(tmp_path: Path) -
         assert list(session.messages(none)) == [], none
     (tmp_path / "0002.mcap").write_bytes(mcap(3)[:-20])
     assert list(Session(tmp_path).messages("sensor/rnge")) == [], "without an index it is not known"
+
+
+def test_what_cannot_be_decoded_is_counted_by_cause(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "0001.mcap")
+    made.own(RANGE, 3)
+    made.put(RANGE, "fleet.v1.Range", b"\xff")
+    made.put(RANGE, "", b"{}", "json")
+    made.close()
+    session = Session(path)
+    for _ in range(2):
+        assert len(list(session.messages(decode=True))) == 3
+        assert session.left_out.counts == {(RANGE, Cause.UNREADABLE): 1, (RANGE, Cause.NOT_PROTOBUF): 1}

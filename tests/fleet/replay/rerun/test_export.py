@@ -64,8 +64,8 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
     lanes: dict[str, list[object]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
         batch = chunk.to_record_batch()
-        if panels.key_of(chunk.entity_path) == "fleet/red/event/command" and export.TEXT in batch.schema.names:
-            texts += [row[0] for row in batch.column(export.TEXT).to_pylist()]
+        if panels.key_of(chunk.entity_path) == "fleet/red/event/command" and lenses.TEXT in batch.schema.names:
+            texts += [row[0] for row in batch.column(lenses.TEXT).to_pylist()]
         if panels.key_of(chunk.entity_path) == "fleet/red/state/mode":
             for name in ("mode asked", "mode inferred"):
                 if name in batch.schema.names:
