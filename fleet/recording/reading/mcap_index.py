@@ -23,6 +23,7 @@ The recorder accepts messages of up to 64 MiB, and ends a chunk with the message
 HEAD: Final = struct.Struct("<BQ")  # opcode, length
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, offset, length, bytes of the table of channels
+_EXTRA_INDEX: Final = struct.Struct("<QQ")  # offset, length of an attachment or a metadata record
 _CHANNEL_ENTRY: Final = struct.Struct("<HQ")  # of that table: channel, offset of its message index
 
 
@@ -49,6 +50,8 @@ class Index:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None
+    extras: list[tuple[int, int]] = field(default_factory=list)
+    """Offset and length of each attachment and metadata record."""
 
     @property
     def has_all_chunks(self) -> bool:
@@ -68,6 +71,12 @@ class Index:
             and self.statistics.channel_count == len(self.channels)
             and all(not channel.schema_id or channel.schema_id in self.schemas for channel in self.channels.values())
         )
+
+    @property
+    def has_all_extras(self) -> bool:
+        """True if it lists every attachment and metadata record."""
+        statistics = self.statistics
+        return statistics is not None and statistics.attachment_count + statistics.metadata_count == len(self.extras)
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -99,6 +108,8 @@ def read(file: IO[bytes], start: int, end: int) -> Index:
             case Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(body)))
                 index.channels[channel.id] = channel
+            case Opcode.ATTACHMENT_INDEX | Opcode.METADATA_INDEX:
+                index.extras.append(_EXTRA_INDEX.unpack_from(body))
             case Opcode.STATISTICS:
                 index.statistics = Statistics.read(ReadDataStream(BytesIO(body)))
             case _:

@@ -6,6 +6,7 @@ If the file has an index (mcap_index.py), the reader opens only the selected chu
 """
 
 import os
+import struct
 import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -15,7 +16,8 @@ from typing import IO, Final, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Footer, Header, Schema
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Metadata, Schema
+from mcap.stream_reader import CRCValidationError
 
 from fleet.recording.reading import mcap_index
 from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, Record, read
@@ -25,6 +27,7 @@ from fleet.recording.selection import EVERYTHING, Selection
 
 _FOOTER_SIZE: Final = HEAD.size + 20
 _DATA_END_SIZE: Final = HEAD.size + 4
+_CRC: Final = struct.Struct("<I")
 _BLOCK: Final = 2**20
 _HEADER_LIMIT: Final = 2**16
 
@@ -42,6 +45,10 @@ class ChannelInfo(NamedTuple):
 
 Row = tuple[ChannelInfo, int, int, int, bytes]
 """One message: channel, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
+
+
+Extra = Attachment | Metadata
+"""What a file has besides messages."""
 
 
 class McapReader:
@@ -98,6 +105,8 @@ class McapReader:
                         part.check()
                     except BROKEN as error:
                         self.damage.append(part.lost(error))
+                if not self.damage:
+                    self._read_extras(file, summary)
                 if footer is not None and not self.damage:
                     self._check_data(file, footer)
         except OSError as error:
@@ -128,6 +137,43 @@ class McapReader:
                     self.damage.append(Damage(strays[0], words))
         except OSError as error:
             self._unreadable(error)
+
+    def extras(self) -> list[Extra]:
+        """Return the intact attachments and metadata records. `damage` then lists only what is lost of them."""
+        self._begin()
+        try:
+            with self.path.open("rb") as file:
+                _, index = self._index(file)
+                self.damage.clear()
+                return self._read_extras(file, index)
+        except OSError as error:
+            self._unreadable(error)
+            return []
+
+    def _read_extras(self, file: IO[bytes], index: Index | None) -> list[Extra]:
+        found: list[Extra] = []
+        for part in self._extra_parts(file, index):
+            try:
+                found.append(_parse_extra(part))
+            except BROKEN as error:
+                self.damage.append(part.lost(error))
+        return found
+
+    def _extra_parts(self, file: IO[bytes], index: Index | None) -> Iterator[ChunkPart]:
+        if index is None or not index.has_all_extras:
+            yield from RecordScanner(file).parts(extras=True)
+            return
+        for at, length in index.extras:
+            if not HEAD.size <= length <= MAX_RECORD_BYTES:
+                words = f"the record there has {length} bytes, more than the limit of {MAX_RECORD_BYTES}"
+                self.damage.append(Damage(at, words))
+                continue
+            record = read(file, at, length)
+            opcode, size = HEAD.unpack_from(record) if len(record) == length else (0, 0)
+            if opcode not in (Opcode.ATTACHMENT, Opcode.METADATA) or size != length - HEAD.size:
+                self.damage.append(Damage(at, "the index gives an impossible place of an attachment or of metadata"))
+                continue
+            yield ChunkPart(at, opcode, record[HEAD.size :])
 
     def index(self) -> Index | None:
         """Return the index if it is intact and lists every chunk, else None; raises OSError."""
@@ -262,6 +308,20 @@ class _Channels:
             if self._schemas.get(schema.id) != schema:
                 self._schemas[schema.id] = schema
                 self._found.clear()
+
+
+def _parse_extra(part: ChunkPart) -> Extra:
+    """Parse an attachment or a metadata record; raises one of BROKEN."""
+    stream = ReadDataStream(BytesIO(part.body))
+    if part.opcode == Opcode.METADATA:
+        metadata: Metadata = Metadata.read(stream)
+        return metadata
+    attachment: Attachment = Attachment.read(stream)
+    (expected,) = _CRC.unpack(part.body[-_CRC.size :])
+    actual = zlib.crc32(part.body[: -_CRC.size])
+    if expected and expected != actual:
+        raise CRCValidationError(expected, actual, attachment)
+    return attachment
 
 
 def _is_mcap(file: IO[bytes]) -> bool:

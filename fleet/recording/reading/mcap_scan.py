@@ -17,6 +17,7 @@ from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _HOLDS_MESSAGES: Final = (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_EXTRAS: Final = (Opcode.ATTACHMENT, Opcode.METADATA)
 _FIXED_LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _PRIVATE: Final = 0x80
 """First opcode for records of other programs."""
@@ -45,8 +46,12 @@ class RecordScanner:
         self.cut = False
         """True if the end of the file is missing."""
 
-    def parts(self) -> Iterator[ChunkPart]:
-        """Yield the records that contain messages or describe channels, in order."""
+    def parts(self, *, extras: bool = False) -> Iterator[ChunkPart]:
+        """Yield the records that contain messages or describe channels, in order.
+
+        extras: True to yield the attachments and metadata instead.
+        """
+        wanted = _EXTRAS if extras else _HOLDS_MESSAGES
         size, at = self._size, len(MAGIC)
         in_data, chunks = True, False
         while at < size:
@@ -73,8 +78,8 @@ class RecordScanner:
                 self._check_end(end)
                 return
             in_data = in_data and opcode != Opcode.DATA_END
-            if opcode == Opcode.CHUNK or (in_data and opcode in _HOLDS_MESSAGES):
-                chunks = chunks or opcode == Opcode.CHUNK
+            chunks = chunks or opcode == Opcode.CHUNK
+            if opcode in wanted and (in_data or opcode == Opcode.CHUNK):
                 if length > MAX_RECORD_BYTES:
                     self._report(
                         at, f"the {named(opcode)} there has {length} bytes, more than the limit of {MAX_RECORD_BYTES}"

@@ -15,16 +15,18 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, overload
 
+from mcap.records import Metadata
+
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
-from fleet.recording.reading.mcap_index import Index
 from fleet.recording.left_out import Cause, LeftOut
-from fleet.recording.reading.mcap_reader import ChannelInfo, McapReader, NotMcap, Row
+from fleet.recording.reading.mcap_index import Index
+from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
 from fleet.recording.tools.analysis import arrow_table, data_frame, is_known, join_as_of, no_messages, stray_tables
-from fleet.recording.writing.mcap_copy import McapCopy
+from fleet.recording.writing.mcap_copy import SESSION_METADATA, McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
 
@@ -95,6 +97,8 @@ class Session:
         """Damage that opening, checking or reading has found so far."""
         self.unended: set[Path] = set()
         """Segments that are only truncated, as a file still being written is."""
+        self.lost_extras = ""
+        """Damage of attachments and metadata that the latest `extras` has found, in words."""
         self.left_out = LeftOut()
         """Messages by key and cause that the latest `messages(decode=True)` could not decode so far."""
         for segment in there:
@@ -157,7 +161,9 @@ class Session:
                 self._add_damage(reader)
 
     def rescue(self, out: Path) -> "Session":
-        """Copy every intact message into a new file, and return it as a session. Raises OSError, NoSession if empty.
+        """Copy every intact message, attachment and metadata record into a new file, and return it as a session.
+
+        Raises OSError, and NoSession if no message is intact.
 
         For truncated or damaged files: other readers stop at the damage, or show corrupted messages.
         """
@@ -166,6 +172,7 @@ class Session:
         part = out.with_name(f".{out.name}.part")
         try:
             with McapCopy(part) as copy:
+                copy.add_extras(self.extras())
                 for row in self.rows():
                     copy.add(row)
             if not copy.messages:
@@ -174,6 +181,27 @@ class Session:
         finally:
             part.unlink(missing_ok=True)
         return self.part((out,))
+
+    def extras(self) -> list[Extra]:
+        """Return the intact attachments and metadata records, each once. `lost_extras` then says what is lost of them.
+
+        Without the record that each of our own files has to say of which session it is a part.
+        """
+        found: list[Extra] = []
+        self.lost_extras = ""
+        for segment in self.segments:
+            try:
+                reader = McapReader(segment)
+            except NotMcap:  # removed since it was opened: reading its messages says so
+                continue
+            for extra in reader.extras():
+                own = isinstance(extra, Metadata) and extra.name == SESSION_METADATA and "format" in extra.metadata
+                if not own and extra not in found:
+                    found.append(extra)
+            if reader.damage:
+                words = f"{segment} {'; '.join(map(str, reader.damage))}"
+                self.lost_extras = f"{self.lost_extras}; {words}" if self.lost_extras else words
+        return found
 
     @overload
     def messages(

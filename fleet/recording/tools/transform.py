@@ -51,14 +51,14 @@ Progress = Callable[[Iterable[Row]], Iterable[Row]]
 
 
 def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int, str]:
-    """Write every intact message to a new session. Return their number, and the losses in words.
+    """Write every intact message, attachment and metadata record to a new session.
 
-    Raises Exists, OSError, and NoSession if no message is intact.
+    Return the number of messages, and the losses in words. Raises Exists, OSError, and NoSession if none is intact.
     """
     with atomic_directory(out) as new:
         count = _copy(watched(session.rows()), new, session)
         # Read the damage after reading: it names the lost times then. A check of all CRCs would add nothing.
-        words = session.damage_words
+        words = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
             raise NoSession(f"{session.path} has no intact message: {words or 'it is empty'}")
         if session.lacking(count) or (session.description is not None and not session.description.closed):
@@ -105,18 +105,20 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
 
     with atomic_directory(out) as new:
         count = _copy(watched(part()), new, session)
+        lost = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
             raise NoSession(f"nothing of {session.path} lies there")
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
-        about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": session.damage_words}
+        about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
         _describe(session, new, count, about)
     return count
 
 
 def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
-    """Write the segments, and return the number of messages."""
+    """Write the segments, and return the number of messages. Attachments and metadata are in the first one."""
     description = session.description
     about = {"made_from": session.name}
+    extras = session.extras()
     if description is not None:
         about |= {"fleet": description.fleet, "started": description.started, "host": description.host}
     remaining = iter(rows)
@@ -126,6 +128,7 @@ def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
         number += 1
         size = 0
         with McapCopy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT_VERSION)}) as copy:
+            copy.add_extras(extras if number == 1 else ())
             while row is not None and size < MAX_SEGMENT_PAYLOAD_BYTES:
                 copy.add(row)
                 size += len(row[4])

@@ -1,15 +1,18 @@
 """Copies messages of a session into a new MCAP file, unchanged, with their channels and schemas."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from mcap.records import Attachment
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
-from fleet.recording.reading.mcap_reader import ChannelInfo, Row
+from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 
+SESSION_METADATA: Final = "session"
+"""Name of the metadata record that says of which session a file is a part."""
 CHUNK_NS: Final = 1_000_000_000
 """Maximum time span of a chunk. The recorder uses the same: reading a short part decompresses little else."""
 
@@ -22,7 +25,7 @@ class McapCopy:
         self._writer: Any = Writer(self._file, enable_data_crcs=True)
         self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
         if about:
-            self._writer.add_metadata("session", dict(about))
+            self._writer.add_metadata(SESSION_METADATA, dict(about))
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[object, ...], int] = {}
         self._channel_ids: dict[int, tuple[ChannelInfo, int]] = {}
@@ -55,6 +58,14 @@ class McapCopy:
             self._chunk_ns = log_ns
         self._writer.add_message(entry[1], log_ns, data, publish_ns, sequence)
         self.messages += 1
+
+    def add_extras(self, extras: Iterable[Extra]) -> None:
+        """Write attachments and metadata records unchanged."""
+        for extra in extras:
+            if isinstance(extra, Attachment):
+                self._writer.add_attachment(extra.create_time, extra.log_time, extra.name, extra.media_type, extra.data)
+            else:
+                self._writer.add_metadata(extra.name, extra.metadata)
 
     def _channel(self, info: ChannelInfo) -> int:
         channel, schema = info
