@@ -13,6 +13,7 @@ from click.shell_completion import BashComplete, FishComplete, add_completion_cl
 
 from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
 from schemas import commands
+from schemas.printable import printable_lines
 from schemas.process import startup, stdio
 from schemas.suggestion import how_to_install, misspelled
 
@@ -189,11 +190,11 @@ def main() -> None:
         error.show()
         code = 2
     except click.UsageError as error:
-        sys.stderr.write(f"fleet: {_one_line(error)} (see {_command_path(error)} --help)\n")
+        sys.stderr.write(f"fleet: {printable_lines(_one_line(error))} (see {_command_path(error)} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
         own_form = getattr(error, "own_form", False) or "\n" in error.message
-        sys.stderr.write(f"{error.message}\n" if own_form else f"fleet: {_one_line(error)}\n")
+        sys.stderr.write(f"{error.message}\n" if own_form else f"fleet: {printable_lines(_one_line(error))}\n")
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = startup.INTERRUPTED

@@ -13,6 +13,7 @@ from fleet.commands.group import connect_option
 from fleet.commands.options import cli_errors, from_option, to_option
 from fleet.commands.params import Duration, Number, car_option, session_argument
 from schemas import keys
+from schemas.printable import printable, printable_lines
 from schemas.process import signals
 
 if TYPE_CHECKING:
@@ -68,7 +69,9 @@ def play(
     """
     from fleet.commands.sessions import part_of
     from fleet.recording import time_spec
+    from fleet.recording.left_out import Cause
     from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.selection import Selection
     from fleet.recording.tools.summary import of_session
     from fleet.replay.player.player import LOOP_PAUSE_NS, NameTaken, Player
     from fleet.replay.player.schedule import Schedule
@@ -111,7 +114,7 @@ def play(
                 raise click.UsageError(str(error)) from None
             click.echo(
                 f"{found.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
-                f"{', '.join(there) or 'no car'}; Ctrl-C ends"
+                f"{', '.join(map(printable, there)) or 'no car'}; Ctrl-C ends"
             )
             player.remember(found.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
             # The earliest time is not the first message's if the clock went back.
@@ -122,7 +125,8 @@ def play(
                 recorded = found.messages(expressions, from_ns, part.end_ns)
                 player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
                 if not player.published and not stop.is_set():
-                    raise click.ClickException(f"{session} holds nothing there that is published again")
+                    why = "".join(f"; {line}" for line in player.left_out.words())
+                    raise click.ClickException(f"{session} holds nothing there that is published again{why}")
                 if not loop or stop.is_set():
                     break
                 schedule.again(LOOP_PAUSE_NS)
@@ -137,8 +141,15 @@ def play(
     for note, count in notes.items():
         if count:
             click.echo(f"{count} {note}", err=True)
+    # What no selection takes never reached the player.
+    everything = Selection(tuple(_key_expressions((), cars_only=False)))
+    for key, count in about.keys.items():
+        if not everything.has_key(key):
+            player.left_out.add(key, Cause.COMMAND if "/@cmd/" in key else Cause.NO_FLEET, count)
+    for line in player.left_out.words():
+        click.echo(f"not published: {line}", err=True)
     if found.damage:
-        click.echo(f"only the intact part was published: {found.damage_words}", err=True)
+        click.echo(printable_lines(f"only the intact part was published: {found.damage_words}"), err=True)
 
 
 def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:

@@ -16,7 +16,7 @@ from fleet.commands.redecode import redecode, vector
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
 from schemas.local_time import of_iso, with_offset
-from schemas.printable import printable_lines
+from schemas.printable import printable, printable_lines
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -71,6 +71,11 @@ def _session_errors(out: Path | None = None) -> Iterator[None]:
         ) from None
 
 
+def _say(text: str, *, err: bool = False) -> None:
+    """Print text that may have names and words of a recording in it."""
+    click.echo(printable_lines(text), err=err)
+
+
 def _open(path: Path) -> "Session":
     from fleet.recording.reading.session import Session
 
@@ -116,16 +121,16 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     rows = [("session", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
-        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        _say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     for one in found:
         if one.words:
-            click.echo(f"{one.name}: {one.words}", err=True)
+            _say(f"{one.name}: {one.words}", err=True)
 
 
 def _row(one: "SessionSummary") -> tuple[str, ...]:
     from fleet.recording import time_spec
 
-    cars = ",".join(one.cars[:5]) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
+    cars = ",".join(map(printable, one.cars[:5])) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
     marks = str(len(one.marks)) + (" kept" if one.kept else "")
     length = time_spec.words(one.length_s)
     return one.name, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), marks, cars
@@ -144,8 +149,11 @@ def _size(count: int) -> str:
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
-    """Show what a session holds: versions, cars, keys with their rates, marks, lost messages."""
-    from fleet.recording.tools.summary import marks_of, of_session
+    """Show what a session holds: versions, cars, keys with their rates, marks, lost messages.
+
+    The exit code is 1 if no message could be read.
+    """
+    from fleet.recording.tools.summary import SessionState, marks_of, of_session
     from fleet.recording.tools.transform import origin_words
 
     with _session_errors():
@@ -153,18 +161,20 @@ def info(session: Path, *, as_json: bool) -> None:
         about = of_session(found)
         about.marks = marks_of(found, about)
         description = found.description
+        nothing = not about.messages and about.state in (SessionState.CUT, SessionState.DAMAGED)
     origin = description.origin if description is not None else {}
     if as_json:
         more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}
         click.echo(json.dumps({**about.to_dict(), **more, "origin": origin}))
-        return
-    click.echo(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
+        raise SystemExit(1 if nothing else 0)
+    _say(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
     if description is not None:
         versions = ", ".join(f"{name} {version}" for name, version in description.versions.items())
-        click.echo(f"  fleet {description.fleet}, recorded on {description.host or 'an unknown host'}; {versions}")
+        _say(f"  fleet {description.fleet}, recorded on {description.host or 'an unknown host'}; {versions}")
     if made := origin_words(origin):
-        click.echo(f"  made by {made}")
+        _say(f"  made by {made}")
     _say_contents(about)
+    raise SystemExit(1 if nothing else 0)
 
 
 def _say_contents(about: "SessionSummary") -> None:
@@ -175,14 +185,15 @@ def _say_contents(about: "SessionSummary") -> None:
     click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
     if about.clock_back_s:
         click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
-    click.echo(f"  cars: {', '.join(about.cars) or 'none'}")
+    click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}")
     for mark in about.marks:
         by = name_of(mark.get("by") or "") or "somebody"
-        click.echo(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
-    width = max((len(key) for key in about.keys), default=0)
+        _say(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
+    shown = {key: printable(key) for key in about.keys}
+    width = max(map(len, shown.values()), default=0)
     for key, count in about.keys.items():
         rate = f"  {count / about.length_s:7.2f} Hz" if about.length_s else ""
-        click.echo(f"  {key.ljust(width)}  {count:8}{rate}")
+        click.echo(f"  {shown[key].ljust(width)}  {count:8}{rate}")
 
 
 @sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n")
@@ -203,7 +214,7 @@ def verify(session: Path, *, as_json: bool) -> None:
         click.echo(json.dumps(verdict.to_dict()))
     else:
         for line in verdict.words():
-            click.echo(line)
+            _say(line)
     raise SystemExit(0 if verdict.whole else 1)
 
 
@@ -220,7 +231,7 @@ def recover(session: Path, out: Path | None) -> None:
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _session_errors(out):
         count, words = make(found, out, watched("recover", total(found)))
-    click.echo(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
+    _say(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
 
 
 @sessions.command(
@@ -251,7 +262,7 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
         selection = part_of(found, start, end, cars)
     with _session_errors(out):
         count = make(found, out, selection, cars, watched("cut", None))
-    click.echo(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
+    _say(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 
 def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
@@ -296,6 +307,7 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
     Units are in the columns' names, in Parquet also in the fields' metadata. Messages that are not protobuf are in
     `other`.
     """
+    from fleet.recording.reading.session import NoSession
     from fleet.recording.tools.export import export as write
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
@@ -311,12 +323,14 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
         with _session_errors(out), atomic_directory(out) as new:
             found = _open(session)
             done = write(watched(f"export {name}", total(found))(found.rows()), new, sink)
+            if not done.rows:
+                raise NoSession(f"{found.path} has no intact message: {found.damage_words or 'it is empty'}")
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
         for line in done.left_out.words():
             click.echo(f"not in the table of its key: {line}", err=True)
         for table, count in done.undated.items():
-            click.echo(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
+            _say(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
         if found.damage:
-            click.echo(printable_lines(f"only the intact part was exported: {found.damage_words}"), err=True)
+            _say(f"only the intact part was exported: {found.damage_words}", err=True)

@@ -24,7 +24,7 @@ class Cause(StrEnum):
     BAD_SCHEMA = "its schema is unreadable"
     UNKNOWN_ENUM = "has a number that its schema has no name for"
     VIEWER = "not read by Rerun"
-    NO_FLEET = "not a key of a fleet"
+    NO_FLEET = "not a key of a car or service that is replayed"
     COMMAND = "a command, which is never published again"
     BAD_KEY = "the bus cannot carry its key"
     LONG_ENCODING = "the bus cannot carry its encoding: over 255 bytes"

@@ -50,6 +50,8 @@ class Index:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None
+    statistics_at: int = 0
+    """Offset of the statistics."""
     extras: list[tuple[int, int]] = field(default_factory=list)
     """Offset and length of each attachment and metadata record."""
 
@@ -73,6 +75,15 @@ class Index:
         )
 
     @property
+    def counts_all_messages(self) -> bool:
+        """True if the counts by channel are complete, so that nothing need be read to know them."""
+        statistics = self.statistics
+        if statistics is None or not (self.has_all_chunks and self.has_all_channels):
+            return False
+        counts = statistics.channel_message_counts
+        return counts.keys() <= self.channels.keys() and sum(counts.values()) == statistics.message_count
+
+    @property
     def has_all_extras(self) -> bool:
         """True if it lists every attachment and metadata record."""
         statistics = self.statistics
@@ -93,14 +104,14 @@ class Index:
 def read(file: IO[bytes], start: int, end: int) -> Index:
     """Parse the index between two offsets; raises errors of the mcap library and struct if it is corrupted."""
     index = Index()
-    for opcode, body in _records(file, start, end):
+    for at, opcode, body in _records(file, start, end):
         match opcode:
             case Opcode.CHUNK_INDEX:
-                first, last, at, length, table = _CHUNK_INDEX.unpack_from(body)
+                first, last, chunk_at, length, table = _CHUNK_INDEX.unpack_from(body)
                 if table % _CHANNEL_ENTRY.size or _CHUNK_INDEX.size + table > len(body):
                     raise EndOfFile
                 index.chunks.append(
-                    ChunkPlace(at, length, first, last, body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + table])
+                    ChunkPlace(chunk_at, length, first, last, body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + table])
                 )
             case Opcode.SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(body)))
@@ -111,6 +122,7 @@ def read(file: IO[bytes], start: int, end: int) -> Index:
             case Opcode.ATTACHMENT_INDEX | Opcode.METADATA_INDEX:
                 index.extras.append(_EXTRA_INDEX.unpack_from(body))
             case Opcode.STATISTICS:
+                index.statistics_at = at
                 index.statistics = Statistics.read(ReadDataStream(BytesIO(body)))
             case _:
                 pass
@@ -118,7 +130,7 @@ def read(file: IO[bytes], start: int, end: int) -> Index:
     return index
 
 
-def _records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[int, bytes]]:
+def _records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
     file.seek(start)
     at = start
     while at < end:
@@ -126,4 +138,4 @@ def _records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[int, bytes
         at += HEAD.size + length
         if length > MAX_RECORD_BYTES or at > end:
             raise EndOfFile
-        yield opcode, file.read(length)
+        yield at - HEAD.size - length, opcode, file.read(length)

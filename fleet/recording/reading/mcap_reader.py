@@ -132,6 +132,12 @@ class McapReader:
                         self.damage.append(part.lost(error))
                         continue
                     yield from channels.rows(records, part.at, strays)
+                counted = channels.count + len(strays)
+                if selection == EVERYTHING and not self.damage and index is not None and index.statistics is not None:
+                    said = index.statistics.message_count
+                    if said != counted:
+                        words = f"the statistics there say {said} messages, {counted} are in the file"
+                        self.damage.append(Damage(index.statistics_at, words))
                 if strays:
                     words = f"{len(strays)} messages after it belong to channels whose description is lost"
                     self.damage.append(Damage(strays[0], words))
@@ -196,8 +202,7 @@ class McapReader:
         at = size - _FOOTER_SIZE - len(MAGIC)
         tail = read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))
         if at < len(MAGIC) or not tail.endswith(MAGIC):
-            self.cut = True
-            return None, None
+            return None, None  # the scan tells a cut file from one with bytes after its end
         if HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - HEAD.size):
             self.damage.append(Damage(at, "there is no footer"))
             return None, None
@@ -225,7 +230,7 @@ class McapReader:
                 scanner.damage.clear()
                 yield part
             self.damage += scanner.damage
-            self.cut = self.cut or scanner.cut
+            self.cut = scanner.cut
             return
         chunks = index.chunks
         if index.has_all_channels:
@@ -275,14 +280,19 @@ class _Channels:
         self._schemas = schemas
         self._selection = selection
         self._found: dict[int, ChannelInfo | None] = {}
+        self.count = 0
+        """Messages of known channels in the chunks so far, selected or not. Read it between chunks."""
 
     def rows(self, records: list[Record], at: int, strays: list[int]) -> Iterator[Row]:
         """Yield the selected messages of one chunk. For each message of an unknown channel add `at` to `strays`."""
         found, selection = self._found, self._selection
         timed = selection.start_ns is not None or selection.end_ns is not None
+        before = len(strays)
+        described = 0
         for number, sequence, log_ns, publish_ns, data in records:
             if number < 0:
                 self._describe(-number, data)
+                described += 1
                 continue
             try:
                 info = found[number]
@@ -295,6 +305,7 @@ class _Channels:
                 info = found[number] = ChannelInfo(channel, self._schemas[channel.schema_id]) if selected else None
             if info is not None and (not timed or selection.has_time(log_ns)):
                 yield info, sequence, log_ns, publish_ns, data
+        self.count += len(records) - described - (len(strays) - before)
 
     def _describe(self, opcode: int, body: bytes) -> None:
         stream = ReadDataStream(BytesIO(body))

@@ -43,8 +43,8 @@ class RecordScanner:
         self._next_chunk: tuple[int, int | None] | None = None
         """Result of the last search: its start, and the next intact chunk from there."""
         self.damage: list[Damage] = []
-        self.cut = False
-        """True if the end of the file is missing."""
+        self.cut = True
+        """True if the end of the file is missing: no footer was found so far, or the file ends in it."""
 
     def parts(self, *, extras: bool = False) -> Iterator[ChunkPart]:
         """Yield the records that contain messages or describe channels, in order.

@@ -87,19 +87,21 @@ def of_session(session: Session) -> SessionSummary:
     """Summarize an open session."""
     found = SessionSummary(session.name, str(session.path), SessionState.WHOLE)
     counts: dict[str, int] = {}
-    cut: list[Path] = []
+    read = session.part(())
     span = _Span()
     for segment, index in session.indexes().items():
-        if index is not None and index.statistics is not None:
+        if index is not None and index.counts_all_messages:
             for key, count in index.counts.items():
                 counts[key] = counts.get(key, 0) + count
             for chunk in index.chunks:
                 span.add(chunk.first_ns, chunk.last_ns)
             continue
-        cut.append(segment)
-        for info, _, log_ns, _, _ in session.part((segment,)).rows():
+        part = session.part((segment,))
+        for info, _, log_ns, _, _ in part.rows():
             counts[info.channel.topic] = counts.get(info.channel.topic, 0) + 1
             span.add(log_ns, log_ns)
+        read.damage |= part.damage
+        read.unended |= part.unended
     found.keys = dict(sorted(counts.items()))
     found.messages = sum(counts.values())
     parsed = (keys.parse(key) for key in counts)
@@ -117,7 +119,7 @@ def of_session(session: Session) -> SessionSummary:
         found.lost += missing if isinstance(missing, int) else 0
         found.marks = list(description.marks)
         found.kept = description.kept
-    found.state, found.words = _state(session, cut)
+    found.state, found.words = _state(session, read)
     if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
     if found.state is SessionState.WHOLE and (words := lost_words(session)):
@@ -196,7 +198,8 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
     return found
 
 
-def _state(session: Session, cut: Sequence[Path]) -> tuple[SessionState, str]:
+def _state(session: Session, read: Session) -> tuple[SessionState, str]:
+    """Return the state and why. read: the damage of the files that have no usable index, and were read."""
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words
@@ -208,8 +211,10 @@ def _state(session: Session, cut: Sequence[Path]) -> tuple[SessionState, str]:
             SessionState.CUT,
             description.error or "the recorder did not close it: `fleet sessions recover` makes it whole",
         )
-    if cut:
-        return SessionState.CUT, f"{cut[0].name} has no intact end: `fleet sessions recover` repairs it"
+    if damaged := sorted(read.damage.keys() - read.unended):
+        return SessionState.DAMAGED, f"{damaged[0].name} {read.damage[damaged[0]]}"
+    if read.unended:
+        return SessionState.CUT, f"{min(read.unended).name} has no intact end: `fleet sessions recover` repairs it"
     return SessionState.WHOLE, ""
 
 

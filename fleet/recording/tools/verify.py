@@ -14,6 +14,7 @@ from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
 from schemas.local_time import exact
+from schemas.printable import printable
 
 MAX_CLOCK_OFFSET_S: Final = 0.5
 """Maximum offset of a publisher's clock from the recorder's that is not reported."""
@@ -105,7 +106,8 @@ class SessionVerdict:
             more = len(self.missing) - MAX_LISTED_LINES
             yield f"  missing: {more} more gaps (--json has all); {self.missing_count} messages altogether"
         for one in self.twice[:MAX_LISTED_LINES]:
-            yield f"  twice: {one['key']} has {one['count']} messages of {_publisher_words(one)} more than once"
+            what = f"{one['count']} messages of {_publisher_words(one)}"
+            yield f"  twice: {printable(one['key'])} has {what} more than once"
         for what, counts in (
             ("dropped", self.dropped),
             ("missed on the bus", self.missed),
@@ -113,28 +115,28 @@ class SessionVerdict:
         ):
             if counts:
                 worst = max(counts, key=lambda key: counts[key])
-                yield f"  {what}: {sum(counts.values())} messages, most of {worst} ({counts[worst]})"
+                yield f"  {what}: {sum(counts.values())} messages, most of {printable(worst)} ({counts[worst]})"
         for name, words in self.schemas.items():
             if words != SAME_SCHEMA:
-                yield f"  schema: {name} {words}"
+                yield f"  schema: {printable(name)} {words}"
         for one in self.backwards[:MAX_LISTED_LINES]:
             yield f"  clock: the recorder's went back by {one['step_s']:.3f} s at {exact(one['at_ns'])}"
         for name, clock in self.clocks.items():
             if clock.backwards:
-                yield f"  clock: {name}'s went back {clock.backwards} times, by {clock.step_s:.3f} s at most"
+                yield f"  clock: {printable(name)}'s went back {clock.backwards} times, by {clock.step_s:.3f} s at most"
             if clock.least_s < -MAX_CLOCK_OFFSET_S or clock.least_s > MAX_CLOCK_OFFSET_S:
                 ahead = "ahead of" if clock.least_s < 0 else "behind"
-                yield f"  clock: {name}'s is {abs(clock.least_s):.3f} s {ahead} the recorder's"
+                yield f"  clock: {printable(name)}'s is {abs(clock.least_s):.3f} s {ahead} the recorder's"
 
 
 def _publisher_words(one: dict[str, Any]) -> str:
-    return f"publisher {one['publisher']}" if one["publisher"] else "a publisher"
+    return f"publisher {printable(one['publisher'])}" if one["publisher"] else "a publisher"
 
 
 def _missing_words(one: dict[str, Any]) -> str:
     numbers = f"number {one['first']}" if one["count"] == 1 else f"numbers {one['first']} to {one['last']}"
     when = f"between {exact(one['after_ns'])} and {exact(one['before_ns'])}"
-    return f"{one['key']} lacks {one['count']} of {_publisher_words(one)}: {numbers}, {when}"
+    return f"{printable(one['key'])} lacks {one['count']} of {_publisher_words(one)}: {numbers}, {when}"
 
 
 class _Verifier:

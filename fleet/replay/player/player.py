@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import zenoh
 
+from fleet.recording.left_out import Cause, LeftOut
 from fleet.recording.reading.session import Recorded
 from fleet.replay.player.schedule import Schedule
 from schemas import keys, messages, topics
@@ -28,6 +29,10 @@ _HUB_RESTART_DELAY_S: Final = 0.5
 _MAX_LISTED_TOKENS: Final = 4
 _MAX_PLAYER_QUERIES: Final = 256
 """Maximum queries in the queue."""
+MAX_KEY_BYTES: Final = 65_535
+MAX_ENCODING_BYTES: Final = 255
+"""Limits of the library: it panics beyond."""
+_NOT_IN_KEYS: Final = frozenset("*$#?")
 _RESERVED_CHARACTERS: Final = frozenset(" /*$#?")
 
 
@@ -47,6 +52,8 @@ class Player:
     published: int = 0
     late: int = 0
     """Messages published over MAX_LATENESS_S late: this machine or the bus was too slow for the rate."""
+    left_out: LeftOut = field(default_factory=LeftOut)
+    """Messages that were due and not published."""
     _cars: list[str] = field(default_factory=list)
     _polled_s: float = 0.0
     _hub_keeper: HubKeeper = field(init=False)
@@ -71,7 +78,7 @@ class Player:
         self.bus.token(
             f"{self.name}/{keys.REPLAY}/{''.join('_' if each in _RESERVED_CHARACTERS else each for each in session)}"
         )
-        self._cars = sorted(cars)
+        self._cars = sorted(car for car in cars if is_carried(keys.car_token(self.name, car)))
         for car in self._cars:
             self.bus.token(keys.car_token(self.name, car))
 
@@ -90,7 +97,8 @@ class Player:
     def remember(self, recorded: Iterable[Recorded]) -> None:
         """Store messages from before the start as latest values for queries."""
         for message in recorded:
-            if (key := self._key_of(message)) is not None:
+            key = self._key_of(message)
+            if not isinstance(key, Cause):
                 self._keep(key, message, _encoding(message))
 
     def play(
@@ -132,15 +140,23 @@ class Player:
             else:
                 self._answer(query)
 
-    def _key_of(self, message: Recorded) -> str | None:
+    def _key_of(self, message: Recorded) -> str | Cause:
+        """Return the key under which a message is published, or why it is not."""
         key = keys.parse(message.key)
-        if key is None or key.topic.startswith("@cmd/") or not key.topic:
-            return None
-        return f"{self.name}/{key.car}/{key.topic}"
+        if key is None or not key.topic:
+            return Cause.NO_FLEET
+        if key.topic.startswith("@cmd/"):
+            return Cause.COMMAND
+        written = f"{self.name}/{key.car}/{key.topic}"
+        if not is_carried(written):
+            return Cause.BAD_KEY
+        # Zenoh's library panics on a longer one.
+        return Cause.LONG_ENCODING if len(_encoding(message).encode()) > MAX_ENCODING_BYTES else written
 
     def _publish(self, message: Recorded) -> None:
         written = self._key_of(message)
-        if written is None:
+        if isinstance(written, Cause):
+            self.left_out.add(message.key, written)
             return
         encoding = _encoding(message)
         topic = topics.of_key(written)
@@ -185,6 +201,11 @@ class Player:
                 continue
             result = pb.Result(id=identity, car=car, status="rejected", reason="unsupported", words=self.refuse)
             reply_message(query, key, result, as_json=is_json_wanted(query))
+
+
+def is_carried(key: str) -> bool:
+    """Return True if Zenoh can publish on a key: no wildcards, no empty parts, none of # ? $, at most 65,535 bytes."""
+    return len(key.encode()) <= MAX_KEY_BYTES and all(key.split("/")) and not set(key) & _NOT_IN_KEYS
 
 
 def _encoding(message: Recorded) -> str:
