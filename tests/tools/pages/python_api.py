@@ -54,7 +54,10 @@ _HIDDEN = {"do", "ask", "call", "begin", "expression"}
 """Methods for the package's own use."""
 _INTERNAL = {
     *((Lease, name) for name in ("check", "checked")),
-    *((Session, name) for name in ("part", "lacking", "check", "rescue", "rows", "expected", "indexes", "selection")),
+    *(
+        (Session, name)
+        for name in ("part", "lacking", "check", "rescue", "rows", "expected", "extras", "indexes", "selection")
+    ),
 }
 
 
