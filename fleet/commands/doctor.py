@@ -19,6 +19,7 @@ from fleet.recording.session_dir import is_session
 from fleet.recording.tools.checkup import SessionCheckup
 from fleet.recording.tools.summary import growing, total
 from fleet.recording.tools.verify import verify
+from schemas.printable import printable_lines
 from schemas.suggestion import did_you_mean
 
 MAX_STOP_LINES: Final = 20
@@ -64,7 +65,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
         if as_json:
             click.echo(json.dumps(as_dict(evidence, hint_options())))
         elif name is None:
-            click.echo(_first_line(evidence.car, findings))
+            click.echo(printable_lines(_first_line(evidence.car, findings)))
         else:
             _show_car(evidence, findings)
     raise SystemExit(1 if any(odd) else 0)
@@ -77,7 +78,7 @@ def _session_of(name: str) -> Path | None:
 
 
 def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
-    click.echo(_first_line(evidence.car, findings))
+    click.echo(printable_lines(_first_line(evidence.car, findings)))
     _show(findings, describe(evidence))
 
 
@@ -96,11 +97,11 @@ def _show_session(path: Path, car: str, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(checkup.as_dict(verdict, session.name)))
     else:
-        click.echo(_first_line(session.name, findings))
+        click.echo(printable_lines(_first_line(session.name, findings)))
         _show(findings, checkup.facts(verdict))
         stops = checkup.unshown.stops
         for stop in stops[:MAX_STOP_LINES]:
-            click.echo(f"  {stop.describe()}")
+            click.echo(printable_lines(f"  {stop.describe()}"))
         if len(stops) > MAX_STOP_LINES:
             click.echo(f"  and {len(stops) - MAX_STOP_LINES} more: --json lists all")
     raise SystemExit(1 if findings else 0)

@@ -16,6 +16,7 @@ from fleet.recording.tools.csv_table import iso
 from fleet.supervisor.car_status import fit
 from schemas import topics
 from schemas.colors import parse_color
+from schemas.printable import printable_lines
 from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
@@ -63,6 +64,11 @@ def show_table(
     for row, dot in zip(rows, dots, strict=True):
         cells = "  ".join(_shortened(row[name], width) for name, width in widths.items())
         click.echo(f"{dot}{cells.rstrip()}")
+
+
+def echo_safely(text: str, *, err: bool = False) -> None:
+    """Print text that may have names and words of strangers in it, with control characters as escapes."""
+    click.echo(printable_lines(text), err=err)
 
 
 def _dot(color: str) -> str:

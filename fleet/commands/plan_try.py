@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.commands.options import cli_errors, json_option
+from fleet.commands.output import echo_safely
 from fleet.commands.params import Duration, SessionPath, session_argument
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def try_plan(session: Path, path: Path | None, fleet_file: Path | None, toleranc
         except NoSession as error:
             raise click.ClickException(str(error)) from None
     for each in compared.found:
-        click.echo(json.dumps(_fields(each, compared.origin_ns)) if as_json else _describe(each, compared.origin_ns))
+        echo_safely(json.dumps(_fields(each, compared.origin_ns)) if as_json else _describe(each, compared.origin_ns))
     compared.report(as_json=as_json)
     raise SystemExit(1 if compared.found else 0)
 
@@ -189,12 +190,12 @@ class _ReplanReport:
             return
         found = f"{len(self.found)} differences" if self.found else "no difference"
         times = ", ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
-        click.echo(f"{self._session.path}: {self._decisions} decisions from {times}: {found}")
+        echo_safely(f"{self._session.path}: {self._decisions} decisions from {times}: {found}")
         click.echo(f"the same decisions came at most {late_s:.2f} s apart", err=True)
         if partly:
             click.echo("a coordinator began before the recording, which lacks its earlier knowledge", err=True)
         if self._session.damage:
-            click.echo(f"only the intact part was used: {self._session.damage_words}", err=True)
+            echo_safely(f"only the intact part was used: {self._session.damage_words}", err=True)
 
 
 def _describe(each: "DecisionDifference", origin_ns: int) -> str:

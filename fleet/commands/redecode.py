@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fleet.commands.options import from_option, json_option, to_option
+from fleet.commands.output import echo_safely
 from fleet.commands.params import car_option, session_argument
 from schemas import keys
 
@@ -57,7 +58,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
         differences = 0
         for each in found.differences():
             differences += 1
-            click.echo(json.dumps(_fields(each, found.start_ns)) if as_json else _line(each, found.start_ns))
+            echo_safely(json.dumps(_fields(each, found.start_ns)) if as_json else _line(each, found.start_ns))
     except (NoSession, NoPlatform, BadVector) as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
@@ -136,7 +137,7 @@ class _RedecodeReport:
             click.echo(json.dumps(summary | {"unframed": self._unread.unframed, "broken": broken, "damage": damage}))
             return
         found = f"{differences} differences" if differences else "no difference"
-        click.echo(f"{self._path}: {frames} frames and {readings} readings of {', '.join(self.counts)}: {found}")
+        echo_safely(f"{self._path}: {frames} frames and {readings} readings of {', '.join(self.counts)}: {found}")
         notes = {
             "frames have several possible readings; the recorded one is among them": undecided,
             "published readings are not in the recording (see fleet sessions verify): not compared": absent,
@@ -145,9 +146,9 @@ class _RedecodeReport:
         }
         for words, count in notes.items():
             if count:
-                click.echo(f"{count} {words}", err=True)
+                echo_safely(f"{count} {words}", err=True)
         if damage:
-            click.echo(f"only the intact part was decoded: {damage}", err=True)
+            echo_safely(f"only the intact part was decoded: {damage}", err=True)
 
 
 def _line(each: "ReadingDifference", start_ns: int) -> str:
@@ -232,6 +233,6 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         raise click.UsageError(f"--out {out} exists already. Name a new file.") from None
     except OSError as error:
         raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
-    click.echo(f"{out}: {frames} frames")
+    echo_safely(f"{out}: {frames} frames")
     if found.damage:
-        click.echo(f"only the intact part was used: {found.damage_words}", err=True)
+        echo_safely(f"only the intact part was used: {found.damage_words}", err=True)

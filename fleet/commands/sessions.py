@@ -10,13 +10,13 @@ import click
 
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import progress_bar
+from fleet.commands.output import echo_safely, progress_bar
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
 from schemas.local_time import of_iso, with_offset
-from schemas.printable import printable, printable_lines
+from schemas.printable import printable
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -71,11 +71,6 @@ def _session_errors(out: Path | None = None) -> Iterator[None]:
         ) from None
 
 
-def _say(text: str, *, err: bool = False) -> None:
-    """Print text that may have names and words of a recording in it."""
-    click.echo(printable_lines(text), err=err)
-
-
 def _open(path: Path) -> "Session":
     from fleet.recording.reading.session import Session
 
@@ -121,10 +116,10 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     rows = [("session", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
-        _say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     for one in found:
         if one.words:
-            _say(f"{one.name}: {one.words}", err=True)
+            echo_safely(f"{one.name}: {one.words}", err=True)
 
 
 def _row(one: "SessionSummary") -> tuple[str, ...]:
@@ -167,12 +162,12 @@ def info(session: Path, *, as_json: bool) -> None:
         more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}
         click.echo(json.dumps({**about.to_dict(), **more, "origin": origin}))
         raise SystemExit(1 if nothing else 0)
-    _say(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
+    echo_safely(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
     if description is not None:
         versions = ", ".join(f"{name} {version}" for name, version in description.versions.items())
-        _say(f"  fleet {description.fleet}, recorded on {description.host or 'an unknown host'}; {versions}")
+        echo_safely(f"  fleet {description.fleet}, recorded on {description.host or 'an unknown host'}; {versions}")
     if made := origin_words(origin):
-        _say(f"  made by {made}")
+        echo_safely(f"  made by {made}")
     _say_contents(about)
     raise SystemExit(1 if nothing else 0)
 
@@ -188,7 +183,7 @@ def _say_contents(about: "SessionSummary") -> None:
     click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}")
     for mark in about.marks:
         by = name_of(mark.get("by") or "") or "somebody"
-        _say(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
+        echo_safely(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
     shown = {key: printable(key) for key in about.keys}
     width = max(map(len, shown.values()), default=0)
     for key, count in about.keys.items():
@@ -214,7 +209,7 @@ def verify(session: Path, *, as_json: bool) -> None:
         click.echo(json.dumps(verdict.to_dict()))
     else:
         for line in verdict.words():
-            _say(line)
+            echo_safely(line)
     raise SystemExit(0 if verdict.whole else 1)
 
 
@@ -231,7 +226,7 @@ def recover(session: Path, out: Path | None) -> None:
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _session_errors(out):
         count, words = make(found, out, watched("recover", total(found)))
-    _say(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
+    echo_safely(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
 
 
 @sessions.command(
@@ -262,7 +257,7 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
         selection = part_of(found, start, end, cars)
     with _session_errors(out):
         count = make(found, out, selection, cars, watched("cut", None))
-    _say(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
+    echo_safely(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 
 def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
@@ -329,8 +324,8 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
         for line in done.left_out.words():
-            click.echo(f"not in the table of its key: {line}", err=True)
+            echo_safely(f"not in the table of its key: {line}", err=True)
         for table, count in done.undated.items():
-            _say(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
+            echo_safely(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
         if found.damage:
-            _say(f"only the intact part was exported: {found.damage_words}", err=True)
+            echo_safely(f"only the intact part was exported: {found.damage_words}", err=True)

@@ -6,6 +6,7 @@ from typing import Final
 
 import click
 
+from fleet.commands.output import echo_safely
 from fleet.recording import time_spec
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
@@ -60,11 +61,11 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         return
     stops = timeline.nearest
     for stop in stops:
-        click.echo(stop.describe())
+        echo_safely(stop.describe())
     if not stops:
-        click.echo(f"{car}: no stop failed around {date_and_clock(begin_ns / 1e9)}.")
+        echo_safely(f"{car}: no stop failed around {date_and_clock(begin_ns / 1e9)}.")
     for entry in timeline.entries[:MAX_TIMELINE_LINES]:
-        click.echo(f"  {entry}")
+        echo_safely(f"  {entry}")
     if len(timeline.entries) > MAX_TIMELINE_LINES:
         click.echo(f"  and {len(timeline.entries) - MAX_TIMELINE_LINES} more: --json lists all")
 

@@ -6,13 +6,15 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.writer import IndexType
 
+from fleet.cli import cli
 from fleet.commands.sessions import sessions
 from fleet.recording.reading.session import Session
 from fleet.recording.tools.summary import SessionState, of_session
 from fleet.recording.tools.verify import verify
-from tests.support.random_session import RANGE, Mixed
+from tests.support.random_session import LOG, RANGE, START_NS, Mixed
 
 WRITERS: list[dict[str, Any]] = [
     {},
@@ -92,6 +94,18 @@ def test_exit_codes_say_whether_anything_was_read(tmp_path: Path) -> None:
     some = write(tmp_path / "some.mcap", chunk_size=1)
     some.write_bytes(some.read_bytes()[:-300])
     assert CliRunner().invoke(sessions, ["info", str(some)]).exit_code == 0
+
+
+def test_words_of_a_message_reach_the_terminal_escaped(tmp_path: Path) -> None:
+    made = Mixed(path := tmp_path / "x.mcap")
+    log: Any = Log(message="\x1b]0;pwn\x07", name="red \x9b2J")
+    log.timestamp.FromNanoseconds(START_NS)
+    made.put(LOG, "foxglove.Log", log.SerializeToString())
+    made.close()
+    result = CliRunner().invoke(cli, ["why", "red", "--session", str(path), "--at", "0s"])
+    assert result.exit_code == 0, result.output
+    assert all(each.isprintable() or each == "\n" for each in result.output)
+    assert "pwn" in result.output
 
 
 def test_nothing_of_a_file_reaches_the_terminal_raw(tmp_path: Path) -> None:
