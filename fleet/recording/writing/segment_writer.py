@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
+from fleet.recording.writing.mcap_copy import SESSION_METADATA
 from schemas import messages
 
-_SESSION_METADATA: Final = "session"
 _LOSS_METADATA: Final = "recording"
 
 
@@ -30,7 +30,7 @@ class Segment:
         """Adds (channel, log time, payload, publish time, sequence). A bound method: each call per message costs."""
         try:
             self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
-            self._writer.add_metadata(_SESSION_METADATA, dict(about))
+            self._writer.add_metadata(SESSION_METADATA, dict(about))
             self.flush()
         except OSError:
             self.cut()

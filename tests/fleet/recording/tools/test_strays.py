@@ -10,11 +10,11 @@ from click.testing import CliRunner
 from fleet.commands.sessions import sessions
 from fleet.recording.left_out import Cause
 from fleet.recording.reading.mcap_reader import Row
-from fleet.recording.reading.session import Session
+from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.export import export
 from fleet.recording.tools.table_formats import FORMATS
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.support.random_session import LINK, RANGE, START_NS, Mixed
+from tests.support.random_session import LINK, RANGE, START_NS, Mixed, make
 
 MODE, COMMAND = "fleet/red/state/mode", "fleet/red/event/command"
 NAMED = r"another type|not protobuf|2262"
@@ -141,3 +141,19 @@ def test_a_rescue_that_fails_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="intact"):
         session.rescue(tmp_path / "rescued.mcap")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["parquet", "csv"])
+def test_every_message_of_files_of_chance_is_in_a_table(tmp_path: Path, name: str) -> None:
+    for seed in range(60):
+        make(path := tmp_path / f"{seed}.mcap", seed)
+        try:
+            session = Session(path)
+        except NoSession:
+            continue
+        recorded = sum(1 for _ in session.rows())
+        (out := tmp_path / f"{seed}-{name}").mkdir()
+        done = export(session.rows(), out, FORMATS[name])
+        assert sum(done.rows.values()) == recorded, seed
+        decoded = sum(1 for _ in session.messages(decode=True))
+        assert decoded + session.left_out.total == recorded, seed
