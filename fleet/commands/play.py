@@ -12,6 +12,8 @@ import click
 from fleet.commands.group import connect_option
 from fleet.commands.options import cli_errors, from_option, to_option
 from fleet.commands.params import Duration, Number, car_option, session_argument
+from fleet.recording.left_out import LeftOutCause
+from fleet.recording.selection import Selection
 from schemas import keys
 from schemas.printable import printable, printable_lines
 from schemas.process import signals
@@ -69,9 +71,7 @@ def play(
     """
     from fleet.commands.sessions import part_of
     from fleet.recording import time_spec
-    from fleet.recording.left_out import Cause
     from fleet.recording.reading.session import NoSession, Session
-    from fleet.recording.selection import Selection
     from fleet.recording.tools.summary import of_session
     from fleet.replay.player.player import LOOP_PAUSE_NS, NameTaken, Player
     from fleet.replay.player.schedule import Schedule
@@ -145,7 +145,7 @@ def play(
     everything = Selection(tuple(_key_expressions((), cars_only=False)))
     for key, count in about.keys.items():
         if not everything.has_key(key):
-            player.left_out.add(key, Cause.COMMAND if "/@cmd/" in key else Cause.NO_FLEET, count)
+            player.left_out.add(key, LeftOutCause.COMMAND if "/@cmd/" in key else LeftOutCause.NO_FLEET, count)
     for line in player.left_out.words():
         click.echo(f"not published: {line}", err=True)
     if found.damage:

@@ -302,7 +302,6 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
     Units are in the columns' names, in Parquet also in the fields' metadata. Messages that are not protobuf are in
     `other`.
     """
-    from fleet.recording.reading.session import NoSession
     from fleet.recording.tools.export import export as write
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
@@ -319,7 +318,8 @@ def export(session: Path, csv: Path | None, parquet: Path | None, *, nanoseconds
             found = _open(session)
             done = write(watched(f"export {name}", total(found))(found.rows()), new, sink)
             if not done.rows:
-                raise NoSession(f"{found.path} has no intact message: {found.damage_words or 'it is empty'}")
+                why = found.damage_words or "it is empty"
+                raise click.ClickException(f"{found.path} has no intact message: {why}")
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)

@@ -22,7 +22,7 @@ REQUEST_RATE: Final = 50.0
 """HTTP requests of one person other than STOP: a page loads some 25 files."""
 COOLDOWN_S: Final = 15.0
 """Time for which a person whose page was closed opens no other one."""
-MAX_COMMANDS: Final = 16
+MAX_OPEN_COMMANDS: Final = 16
 """Maximum commands of one person without an outcome. One command may be for many cars."""
 MAX_PERSONS: Final = 256
 """Maximum number of remembered persons. The one that was idle the longest is forgotten."""
@@ -32,7 +32,7 @@ TOO_MUCH: Final = "This page has sent far more than a person can. STOP still wor
 
 
 @dataclass(slots=True)
-class Budget:
+class Allowance:
     """A token bucket."""
 
     burst: float
@@ -54,15 +54,15 @@ class Budget:
         return True
 
 
-def page_budget(now: float) -> Budget:
+def page_budget(now: float) -> Allowance:
     """Return the budget of messages of a new page."""
-    return Budget(PAGE_BURST, PAGE_RATE, at=now)
+    return Allowance(PAGE_BURST, PAGE_RATE, at=now)
 
 
 @dataclass(slots=True)
 class _PersonBudget:
-    messages: Budget
-    requests: Budget
+    messages: Allowance
+    requests: Allowance
     closed_until: float = float("-inf")
 
 
@@ -72,7 +72,7 @@ class Budgets:
 
     _persons: dict[Hashable, _PersonBudget] = field(default_factory=dict)
 
-    def may_send(self, person: Hashable, page: Budget, now: float) -> bool:
+    def may_send(self, person: Hashable, page: Allowance, now: float) -> bool:
         """Count a message. Return False if the page has to be closed: it, or its person, has sent too many."""
         one = self._of(person, now)
         if page.take(now) and one.messages.take(now):
@@ -92,7 +92,7 @@ class Budgets:
         found = self._persons.pop(person, None)
         if found is None:
             found = _PersonBudget(
-                Budget(PERSON_BURST, PERSON_RATE, at=now), Budget(REQUEST_BURST, REQUEST_RATE, at=now)
+                Allowance(PERSON_BURST, PERSON_RATE, at=now), Allowance(REQUEST_BURST, REQUEST_RATE, at=now)
             )
         self._persons[person] = found
         if len(self._persons) > MAX_PERSONS:

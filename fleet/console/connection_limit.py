@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
 
-from fleet.console.budgets import Budget
+from fleet.console.budgets import Allowance
 
 MAX_CONNECTIONS: Final = 640
 """Maximum number of connections from the network: forty devices that take all they may."""
@@ -40,12 +40,12 @@ class ConnectionLimit:
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
-    _total: Budget = field(default_factory=lambda: Budget(TOTAL_BURST, TOTAL_RATE))
-    _addresses: dict[str, Budget] = field(default_factory=dict)
+    _total: Allowance = field(default_factory=lambda: Allowance(TOTAL_BURST, TOTAL_RATE))
+    _addresses: dict[str, Allowance] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
         """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
-        budget = self._addresses.pop(address, None) or Budget(ADDRESS_BURST, ADDRESS_RATE, at=now)
+        budget = self._addresses.pop(address, None) or Allowance(ADDRESS_BURST, ADDRESS_RATE, at=now)
         self._addresses[address] = budget
         if len(self._addresses) > MAX_ADDRESSES:
             del self._addresses[next(iter(self._addresses))]

@@ -16,7 +16,7 @@ from fleet.client.client import default_sender
 from fleet.client.commands import CommandRequest, estop_request, pause_request, plain_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
-from fleet.console.budgets import MAX_COMMANDS, Budgets, StopMerge
+from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
 from fleet.console.connection_limit import LogLimit
@@ -427,7 +427,7 @@ class Console:
                 if request.verb in STOPS:
                     self._merged((page.operator.sender, request.verb, *cars), send)
                 elif page.operator.is_busy:
-                    raise BadPageMessage(f"{MAX_COMMANDS} commands have no result yet. Wait for them.")
+                    raise BadPageMessage(f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them.")
                 else:
                     send()
             case kind:

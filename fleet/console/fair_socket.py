@@ -4,12 +4,10 @@ uvicorn parses all that one read has brought, up to 256 KiB: thousands of small 
 """
 
 import asyncio
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from uvicorn._types import ASGIReceiveEvent
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-
-if TYPE_CHECKING:
-    from uvicorn._types import ASGIReceiveEvent
 
 PIECE_BYTES: Final = 1024
 """Bytes that are parsed at a time: some thirty of the smallest messages."""
@@ -53,7 +51,7 @@ class FairWebSocket(WebSocketsSansIOProtocol):
             self.read_paused = False
             self.transport.resume_reading()
 
-    async def receive(self) -> "ASGIReceiveEvent":
+    async def receive(self) -> ASGIReceiveEvent:
         """Return the next message. Read on when all are taken."""
         message = await self.queue.get()
         if self.queue.empty() and not self._waits:

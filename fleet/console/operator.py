@@ -11,7 +11,7 @@ from fleet.aio import Fleet
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
-from fleet.console.budgets import MAX_COMMANDS
+from fleet.console.budgets import MAX_OPEN_COMMANDS
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from fleet.policy.plan.parser import BadPlan, parse
@@ -129,7 +129,7 @@ class ConsoleOperator:
     @property
     def is_busy(self) -> bool:
         """True if too many commands of this person have no outcome yet."""
-        return self._commands >= MAX_COMMANDS
+        return self._commands >= MAX_OPEN_COMMANDS
 
     def take_lease(
         self, client: int, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 from schemas.printable import printable
 
-MAX_LISTED: Final = 20
+MAX_LEFT_OUT_LINES: Final = 20
 """Maximum keys to print."""
 
 
-class Cause(StrEnum):
+class LeftOutCause(StrEnum):
     """Why a message is left out."""
 
     OTHER_TYPE = "not of the type of its key"
@@ -34,9 +34,9 @@ class Cause(StrEnum):
 class LeftOut:
     """Number of messages by key and cause."""
 
-    counts: Counter[tuple[str, Cause]] = field(default_factory=Counter)
+    counts: Counter[tuple[str, LeftOutCause]] = field(default_factory=Counter)
 
-    def add(self, key: str, cause: Cause, count: int = 1) -> None:
+    def add(self, key: str, cause: LeftOutCause, count: int = 1) -> None:
         """Count messages; 0 adds nothing."""
         if count:
             self.counts[key, cause] += count
@@ -56,9 +56,9 @@ class LeftOut:
     def words(self) -> Iterator[str]:
         """Yield a line for each key and cause, those with the most messages first, fit for a terminal."""
         ordered = sorted(self.counts.items(), key=lambda each: (-each[1], each[0]))
-        for (key, cause), count in ordered[:MAX_LISTED]:
+        for (key, cause), count in ordered[:MAX_LEFT_OUT_LINES]:
             yield f"{count} of {printable(key)}: {cause}"
-        if rest := ordered[MAX_LISTED:]:
+        if rest := ordered[MAX_LEFT_OUT_LINES:]:
             yield f"{sum(count for _, count in rest)} of {len(rest)} more keys"
 
 

@@ -133,7 +133,7 @@ def test_what_a_car_can_show_is_found_out_and_said(cars: KindsUnderTest) -> None
         if all(found(kind) == kind.shows for kind in KINDS):
             break
     for kind in KINDS:
-        assert found(kind) == kind.shows, kind.name
+        assert found(kind) == kind.shows, f"{kind.name}: {cars.fleet.state('health', kind.name)}"
         code, outcome = outcomes[kind.name]
         assert (code, outcome["ok"]) == (0, True), str(outcome)
         assert outcome["basis"] == ("shown" if kind.shows == "yes" else "sent"), str(outcome)

@@ -19,7 +19,7 @@ from mcap.records import Metadata
 
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
-from fleet.recording.left_out import Cause, LeftOut
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
@@ -359,11 +359,11 @@ class Session:
             (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
 
 
-def _why_not_decoded(decoder: MessageDecoder, info: ChannelInfo) -> Cause:
+def _why_not_decoded(decoder: MessageDecoder, info: ChannelInfo) -> LeftOutCause:
     if decoder.class_of(info) is not None:
-        return Cause.UNREADABLE
+        return LeftOutCause.UNREADABLE
     is_protobuf = info.channel.message_encoding == "protobuf" and message_of(info)
-    return Cause.BAD_SCHEMA if is_protobuf else Cause.NOT_PROTOBUF
+    return LeftOutCause.BAD_SCHEMA if is_protobuf else LeftOutCause.NOT_PROTOBUF
 
 
 def _recorded(row: Row) -> Recorded:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError, Message
 
-from fleet.recording.left_out import Cause, LeftOut
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.tools import tables
@@ -167,10 +167,10 @@ class _Export:
             self._table_for(None, stray=False).batch.extend(bad)
         unreadable = Counter(info.channel.topic for info in bad.infos)
         for key, count in unreadable.items():
-            self.left_out.add(key, Cause.UNREADABLE, count)
+            self.left_out.add(key, LeftOutCause.UNREADABLE, count)
         if table.stray:
             for key, count in Counter(info.channel.topic for info in infos).items():
-                self.left_out.add(key, Cause.OTHER_TYPE, count - unreadable[key])
+                self.left_out.add(key, LeftOutCause.OTHER_TYPE, count - unreadable[key])
 
     def _table_for(self, message_class: type[Message] | None, *, stray: bool) -> _Table:
         if (message_class, stray) not in self.tables:

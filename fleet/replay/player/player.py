@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import zenoh
 
-from fleet.recording.left_out import Cause, LeftOut
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import Recorded
 from fleet.replay.player.schedule import Schedule
 from schemas import keys, messages, topics
@@ -98,7 +98,7 @@ class Player:
         """Store messages from before the start as latest values for queries."""
         for message in recorded:
             key = self._key_of(message)
-            if not isinstance(key, Cause):
+            if not isinstance(key, LeftOutCause):
                 self._keep(key, message, _encoding(message))
 
     def play(
@@ -140,22 +140,22 @@ class Player:
             else:
                 self._answer(query)
 
-    def _key_of(self, message: Recorded) -> str | Cause:
+    def _key_of(self, message: Recorded) -> str | LeftOutCause:
         """Return the key under which a message is published, or why it is not."""
         key = keys.parse(message.key)
         if key is None or not key.topic:
-            return Cause.NO_FLEET
+            return LeftOutCause.NO_FLEET
         if key.topic.startswith("@cmd/"):
-            return Cause.COMMAND
+            return LeftOutCause.COMMAND
         written = f"{self.name}/{key.car}/{key.topic}"
         if not is_carried(written):
-            return Cause.BAD_KEY
+            return LeftOutCause.BAD_KEY
         # Zenoh's library panics on a longer one.
-        return Cause.LONG_ENCODING if len(_encoding(message).encode()) > MAX_ENCODING_BYTES else written
+        return LeftOutCause.LONG_ENCODING if len(_encoding(message).encode()) > MAX_ENCODING_BYTES else written
 
     def _publish(self, message: Recorded) -> None:
         written = self._key_of(message)
-        if isinstance(written, Cause):
+        if isinstance(written, LeftOutCause):
             self.left_out.add(message.key, written)
             return
         encoding = _encoding(message)

@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.fleetfile.fleet_file import read_colors
-from fleet.recording.left_out import Cause, LeftOut
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.session_dir import FLEET_FILE
@@ -182,8 +182,8 @@ def _name_missed(session: Session, part: Part, missed: Counter[str], left_out: L
     bad = unreadable(session, part.selection, missed.__contains__) if missed else Counter[str]()
     for key, count in missed.items():
         known = min(count, bad[key])
-        left_out.add(key, Cause.UNREADABLE, known)
-        left_out.add(key, Cause.VIEWER, count - known)
+        left_out.add(key, LeftOutCause.UNREADABLE, known)
+        left_out.add(key, LeftOutCause.VIEWER, count - known)
 
 
 class _Tally:
@@ -191,7 +191,7 @@ class _Tally:
 
     def __init__(self) -> None:
         self._shown: Counter[str] = Counter()
-        self._others: Counter[tuple[str, Cause]] = Counter()
+        self._others: Counter[tuple[str, LeftOutCause]] = Counter()
         self._keys: dict[str, set[str]] = {}
         """Keys by entity. Rerun gives one entity to some that differ only in odd characters."""
 
@@ -203,7 +203,7 @@ class _Tally:
                 if is_drawn(panels.topic_of(panels.key_of(chunk.entity_path)), names):
                     self._shown[chunk.entity_path] += chunk.num_rows
                 else:
-                    cause = Cause.NOT_PROTOBUF if RAW in names else Cause.OTHER_TYPE
+                    cause = LeftOutCause.NOT_PROTOBUF if RAW in names else LeftOutCause.OTHER_TYPE
                     self._others[chunk.entity_path, cause] += chunk.num_rows
             elif _TOPIC in names:
                 (topic,) = chunk.to_record_batch().column(_TOPIC).to_pylist()

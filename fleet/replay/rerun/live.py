@@ -20,7 +20,7 @@ from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, Writer
 
 from fleet.client.supervision import ask_colors
-from fleet.recording.left_out import Cause, LeftOut, has_unknown_enum, may_have_enum
+from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, may_have_enum
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.export import APPLICATION
@@ -190,26 +190,26 @@ def _write(path: Path, batch: list[Sample], left_out: LeftOut) -> None:
                 if name == first:
                     writer.add_message(channel, now, sample.payload, sample.time_ns, sample.sequence)
                     continue
-                cause = Cause.OTHER_TYPE
-            left_out.add(sample.key, cause or Cause.NOT_PROTOBUF)
+                cause = LeftOutCause.OTHER_TYPE
+            left_out.add(sample.key, cause or LeftOutCause.NOT_PROTOBUF)
         writer.finish()
 
 
-def _why_not_shown(sample: Sample, name: str | None) -> Cause | None:
+def _why_not_shown(sample: Sample, name: str | None) -> LeftOutCause | None:
     if name is None:
-        return Cause.NOT_PROTOBUF
+        return LeftOutCause.NOT_PROTOBUF
     topic = topics.of_key(sample.key)
     if topic is not None and name != topic.message:
-        return Cause.OTHER_TYPE
+        return LeftOutCause.OTHER_TYPE
     try:
         message_class = messages.message_class(name)
         message = message_class.FromString(sample.payload)
         if _may_have_enum(name) and has_unknown_enum(message):
-            return Cause.UNKNOWN_ENUM
+            return LeftOutCause.UNKNOWN_ENUM
     except KeyError:
-        return Cause.BAD_SCHEMA
+        return LeftOutCause.BAD_SCHEMA
     except DecodeError:
-        return Cause.UNREADABLE
+        return LeftOutCause.UNREADABLE
     return None
 
 

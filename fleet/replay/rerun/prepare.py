@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from fleet.recording.left_out import Cause, LeftOut, has_unknown_enum, may_have_enum
+from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, may_have_enum
 from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 from fleet.recording.reading.message_decoder import MessageDecoder
@@ -75,7 +75,7 @@ def copied(session: Session, selection: Selection, wanted: Wanted, scratch: Path
     decoder = MessageDecoder()
     variants: dict[str, list[tuple[str, str, bytes]]] = {}
     copies: list[McapCopy] = []
-    known: dict[int, tuple[ChannelInfo, int, bool, Cause | None]] = {}
+    known: dict[int, tuple[ChannelInfo, int, bool, LeftOutCause | None]] = {}
     with ExitStack() as stack:
         for row in session.rows(selection):
             info = row[0]
@@ -93,7 +93,7 @@ def copied(session: Session, selection: Selection, wanted: Wanted, scratch: Path
                 entry = known[id(info)] = (info, number, _may_abort(decoder, info), _refusal(decoder, info))
             _, number, checked, cause = entry
             if cause is None and checked and _aborts(decoder, row):
-                cause = Cause.UNKNOWN_ENUM
+                cause = LeftOutCause.UNKNOWN_ENUM
             if cause is not None:
                 prepared.left_out.add(key, cause)
                 continue
@@ -134,13 +134,13 @@ def _schema_of(info: ChannelInfo) -> tuple[str, str, bytes]:
     return (info.channel.message_encoding, "", b"") if schema is None else (schema.encoding, schema.name, schema.data)
 
 
-def _refusal(decoder: MessageDecoder, info: ChannelInfo) -> Cause | None:
+def _refusal(decoder: MessageDecoder, info: ChannelInfo) -> LeftOutCause | None:
     """Return why a channel must not reach Rerun. One bad schema would fail its reader for all keys."""
     if info.schema is not None and info.schema.encoding == "protobuf":
         if info.channel.message_encoding != "protobuf":
-            return Cause.NOT_PROTOBUF
+            return LeftOutCause.NOT_PROTOBUF
         if decoder.class_of(info) is None:
-            return Cause.BAD_SCHEMA
+            return LeftOutCause.BAD_SCHEMA
     return None
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from fleet.recording.left_out import Cause
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.analysis import NoTable
 from tests.support.random_session import RANGE, Mixed
@@ -130,4 +130,4 @@ def test_what_cannot_be_decoded_is_counted_by_cause(tmp_path: Path) -> None:
     session = Session(path)
     for _ in range(2):
         assert len(list(session.messages(decode=True))) == 3
-        assert session.left_out.counts == {(RANGE, Cause.UNREADABLE): 1, (RANGE, Cause.NOT_PROTOBUF): 1}
+        assert session.left_out.counts == {(RANGE, LeftOutCause.UNREADABLE): 1, (RANGE, LeftOutCause.NOT_PROTOBUF): 1}

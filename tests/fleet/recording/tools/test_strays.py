@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from fleet.commands.sessions import sessions
-from fleet.recording.left_out import Cause
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.export import export
@@ -54,7 +54,7 @@ def test_strays_are_tables_of_their_own(mixed: Session, tmp_path: Path) -> None:
     (out := tmp_path / "out").mkdir()
     done = export(mixed.rows(), out, FORMATS["parquet"])
     assert done.rows == {"stray.fleet.v1.Range": 2, "fleet.v1.Link": 50, "other": 1, "fleet.v1.Range": 3}
-    assert done.left_out.counts == {(LINK, Cause.OTHER_TYPE): 2}
+    assert done.left_out.counts == {(LINK, LeftOutCause.OTHER_TYPE): 2}
     assert {path.stem: pq.read_table(path).num_rows for path in out.iterdir()} == done.rows
 
 

@@ -19,7 +19,7 @@ import zenoh
 from click.testing import CliRunner
 
 from fleet.commands.view import view
-from fleet.recording.left_out import Cause
+from fleet.recording.left_out import LeftOutCause
 from fleet.replay.rerun import export, live
 from fleet.replay.rerun.live import Live
 from fleet.replay.rerun.viewer import Viewer, free_port
@@ -133,10 +133,10 @@ def test_strays_and_junk_on_the_bus_hide_no_message_and_are_counted(fleet: Fleet
             given = 14 * number
             wait_for(lambda: following.step() or following.sent + following.left_out.total == given, "all is counted")  # noqa: B023
     assert following.left_out.counts == {
-        (link, Cause.OTHER_TYPE): 6,
-        (link, Cause.NOT_PROTOBUF): 6,
-        (link, Cause.UNREADABLE): 6,
-        (log, Cause.UNKNOWN_ENUM): 6,
+        (link, LeftOutCause.OTHER_TYPE): 6,
+        (link, LeftOutCause.NOT_PROTOBUF): 6,
+        (link, LeftOutCause.UNREADABLE): 6,
+        (log, LeftOutCause.UNKNOWN_ENUM): 6,
     }
     assert export.rows(out) == {link: 60}
 

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from mcap.writer import IndexType
 
 from fleet.commands.replay import replay
-from fleet.recording.left_out import Cause
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.replay.rerun import export
 from tests.support.random_session import LINK, LOG, RANGE, UNKNOWN_LEVEL, Mixed, make
@@ -33,7 +33,7 @@ def test_a_stray_message_does_not_hide_the_own_ones_of_a_key(tmp_path: Path, fir
         made.close()
         found = replayed(path)
         assert found.shown == {LINK: 50}
-        assert found.left_out.counts == {(LINK, Cause.OTHER_TYPE): made.counts[LINK] - 50}
+        assert found.left_out.counts == {(LINK, LeftOutCause.OTHER_TYPE): made.counts[LINK] - 50}
         assert export.rows(path.with_suffix(".rrd")) == found.shown
 
 
@@ -47,9 +47,9 @@ def test_junk_is_named_by_its_cause(tmp_path: Path) -> None:
     found = replayed(path)
     assert found.shown == {RANGE: 3}
     assert found.left_out.counts == {
-        (RANGE, Cause.UNREADABLE): 1,
-        (RANGE, Cause.NOT_PROTOBUF): 1,
-        ("/imu", Cause.NOT_PROTOBUF): 1,
+        (RANGE, LeftOutCause.UNREADABLE): 1,
+        (RANGE, LeftOutCause.NOT_PROTOBUF): 1,
+        ("/imu", LeftOutCause.NOT_PROTOBUF): 1,
     }
 
 
