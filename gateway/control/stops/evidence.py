@@ -344,6 +344,8 @@ class StopEvidence:
     def sent_motion(self) -> None:
         """Drop the evidence: the car may drive."""
         self._drop_pauses()
+        if self._pending is not None:  # nobody judges it any more, but it blocks the car
+            self._blocking.append(_Block(None, self.close_s, self._pending))
         self._pending = self.settles_at = None
         self._general = True
         self._leave_nothing()

@@ -1,6 +1,7 @@
 """What was learned of a car ends as it began: by its readings. Another program on the same link is learned again."""
 
 import json
+import random
 from typing import Any
 
 import pytest
@@ -121,3 +122,17 @@ def test_the_repeats_of_a_stop_give_way_at_once() -> None:
         after = [data for at, data in pair.sent if at > asked_at + 0.01]
         assert len(after) <= 1, "no frame of a repeat goes before it"
         assert pair.now <= max(asked_at, closed_at + 1.0) + 0.3
+
+
+def test_a_report_that_mode_00_has_delayed_is_no_rhythm_if_a_drive_follows_it() -> None:
+    """The drive takes the place of the stop, so its `MODE00` is not judged. The car blocks all the same."""
+    for seed in range(80):
+        moments = random.Random(seed)
+        pair = Pair(start_s=moments.uniform(0.0, 4.0), traits=CarTraits(interval_s=2.2), seed=seed)
+        pair.connect()
+        for _ in range(10):
+            pair.run(moments.uniform(0.2, 3.0))
+            pair.ask(Stop() if moments.random() < 0.4 else Drive(Motion.BACK, 0.3))
+        pair.run(6.0)
+        intervals_s = pair.control.model.learned.echo.intervals
+        assert all(abs(each - 2.2) < 0.1 for each in intervals_s), f"seed {seed}: {intervals_s}"
