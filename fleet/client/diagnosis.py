@@ -29,7 +29,7 @@ _OUT_OF_RANGE: Final = {
     "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
     "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
 }
-"""What a field that is always out of range may mean."""
+"""The likely cause by field, if its values are always out of range."""
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are no rejected frames."""

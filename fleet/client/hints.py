@@ -7,11 +7,19 @@ command that prints them knows how its user reaches the fleet.
 import re
 from typing import Final
 
+from schemas.keys import DEFAULT_FLEET
+
 WITHOUT_BUS: Final = frozenset(
     ("bind", "check", "demo", "example", "init", "plan try", "play", "replay", "scan", "schema", "sessions", "sim")
 )
 """Commands that take no --fleet."""
 _PROPOSED: Final = re.compile(r"`(fleet [a-z][^`]*)`")
+
+
+def fleet_options(connect: str | None, fleet: str) -> str:
+    """Return the options that select a fleet. connect: its bus; None: the one that is taken without an option."""
+    bus = f"--connect {connect}" if connect else ""
+    return " ".join(filter(None, (bus, "" if fleet == DEFAULT_FLEET else f"--fleet {fleet}")))
 
 
 def complete_hints(words: str, options: str) -> str:

@@ -19,6 +19,17 @@ def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
     return list(messages_of(answers))
 
 
+def fleets_on(bus: Bus) -> dict[str, set[str]]:
+    """Return the fleets that run on the bus, with their cars that have a gateway."""
+    found: dict[str, set[str]] = {}
+    for token in bus.tokens("*/*"):
+        name, _, car = token.partition("/")
+        found.setdefault(name, set()).add(car)
+    for token in bus.tokens(f"*/{keys.SUPERVISOR}"):
+        found.setdefault(token.partition("/")[0], set())
+    return found
+
+
 def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
     """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
     answers = ask_status(bus, fleet, COLORS_TIMEOUT_S)

@@ -12,6 +12,7 @@ from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe
 from fleet.commands.fleets import open_client
 from fleet.commands.group import hint_options, say
 from fleet.commands.options import bus_options, json_option
+from fleet.commands.output import echo_safely
 from fleet.commands.params import SessionPath, complete_car, no_cars
 from fleet.commands.sessions import watched
 from fleet.recording.reading.session import NoSession, Session
@@ -19,7 +20,6 @@ from fleet.recording.session_dir import is_session
 from fleet.recording.tools.checkup import SessionCheckup
 from fleet.recording.tools.summary import growing, total
 from fleet.recording.tools.verify import verify
-from schemas.printable import printable_lines
 from schemas.suggestion import did_you_mean
 
 MAX_STOP_LINES: Final = 20
@@ -65,7 +65,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
         if as_json:
             click.echo(json.dumps(as_dict(evidence, hint_options())))
         elif name is None:
-            click.echo(printable_lines(_first_line(evidence.car, findings)))
+            echo_safely(_first_line(evidence.car, findings))
         else:
             _show_car(evidence, findings)
     raise SystemExit(1 if any(odd) else 0)
@@ -78,7 +78,7 @@ def _session_of(name: str) -> Path | None:
 
 
 def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
-    click.echo(printable_lines(_first_line(evidence.car, findings)))
+    echo_safely(_first_line(evidence.car, findings))
     _show(findings, describe(evidence))
 
 
@@ -97,11 +97,11 @@ def _show_session(path: Path, car: str, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(checkup.as_dict(verdict, session.name)))
     else:
-        click.echo(printable_lines(_first_line(session.name, findings)))
+        echo_safely(_first_line(session.name, findings))
         _show(findings, checkup.facts(verdict))
         stops = checkup.unshown.stops
         for stop in stops[:MAX_STOP_LINES]:
-            click.echo(printable_lines(f"  {stop.describe()}"))
+            echo_safely(f"  {stop.describe()}")
         if len(stops) > MAX_STOP_LINES:
             click.echo(f"  and {len(stops) - MAX_STOP_LINES} more: --json lists all")
     raise SystemExit(1 if findings else 0)

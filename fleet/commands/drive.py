@@ -17,8 +17,7 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.outcome import Outcome
-from fleet.commands.fleets import in_all_fleets
-from fleet.commands.group import chosen_person
+from fleet.commands.fleets import client_in, in_all_fleets
 from fleet.commands.options import (
     bus_options,
     carry_out,
@@ -124,7 +123,7 @@ def _stop(
         request = request_for(named)
         return [*there.ask(request, named), *_strangers(there, request, cars)]
 
-    with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
+    with client_in(connect, fleet) as client:
         end_with(client, in_all_fleets(client, connect, cars, act), as_json=as_json)
 
 

@@ -10,21 +10,10 @@ from click.core import ParameterSource
 
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
+from fleet.client.supervision import fleets_on
 from fleet.commands.group import choose_fleet, chosen_person
 from fleet.commands.params import ALL_CARS
-from schemas import keys
 from schemas.bus import Bus
-
-
-def fleets_on(bus: Bus) -> dict[str, set[str]]:
-    """Return the fleets that run on the bus, with their cars that have a gateway."""
-    found: dict[str, set[str]] = {}
-    for token in bus.tokens("*/*"):
-        name, _, car = token.partition("/")
-        found.setdefault(name, set()).add(car)
-    for token in bus.tokens(f"*/{keys.SUPERVISOR}"):
-        found.setdefault(token.partition("/")[0], set())
-    return found
 
 
 def is_named() -> bool:
@@ -60,11 +49,29 @@ def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
     raise _ambiguous(could)
 
 
+def client_in(connect: str | None, fleet: str) -> Fleet:
+    """Open the client of the person whom --as or FLEET_AS names, in exactly this fleet."""
+    return Fleet(connect, fleet, kind="person", person=chosen_person())
+
+
 def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fleet:
-    """Open the client of the person whom --as or FLEET_AS names, in the fleet that the command means."""
-    client = Fleet(connect, fleet, kind="person", person=chosen_person())
+    """Open the client of `client_in` in the fleet that the command means. Raises click.UsageError."""
+    return _opened(connect, fleet, lambda bus: the_fleet(bus, fleet, cars))
+
+
+def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
+    """Open the client of `client_in` for a key expression as the user wrote it.
+
+    Raises click.UsageError if several fleets could fit.
+    """
+    return _opened(connect, fleet, lambda bus: _only_fleet(bus, fleet, keyexpr.partition("/")[0]))
+
+
+def _opened(connect: str | None, fleet: str, choose: Callable[[Bus], str]) -> Fleet:
+    """Open a client in the fleet that is chosen by what is on the bus."""
+    client = client_in(connect, fleet)
     try:
-        name = the_fleet(client.bus, fleet, cars)
+        name = choose(client.bus)
         if name == fleet:
             return client
         choose_fleet(connect, name)
@@ -72,27 +79,16 @@ def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fl
         client.close()
         raise
     client.close()
-    return Fleet(connect, name, kind="person", person=chosen_person())
+    return client_in(connect, name)
 
 
-def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
-    """Open a client for a key expression as the user wrote it. Raises click.UsageError if several fleets could fit."""
-    client = Fleet(connect, fleet, kind="person", person=chosen_person())
-    try:
-        _check_only(client.bus, fleet, keyexpr.partition("/")[0])
-    except BaseException:
-        client.close()
-        raise
-    return client
-
-
-def _check_only(bus: Bus, fleet: str, first: str) -> None:
-    """Fail if a key expression that begins with this chunk could be of another fleet."""
-    if is_named() or first in ("**", fleet):
-        return
-    could = candidates(bus, fleet, [first] if first and not set(first) & set("*$") else ())
-    if could != [fleet]:
-        raise _ambiguous(could)
+def _only_fleet(bus: Bus, fleet: str, first: str) -> str:
+    """Return this fleet. Fail if a key expression that begins with this chunk could be of another one."""
+    if not (is_named() or first in ("**", fleet)):
+        could = candidates(bus, fleet, [first] if first and not set(first) & set("*$") else ())
+        if could != [fleet]:
+            raise _ambiguous(could)
+    return fleet
 
 
 def _ambiguous(could: Iterable[str]) -> click.UsageError:

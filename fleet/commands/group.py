@@ -7,7 +7,7 @@ from typing import Any, Final
 import click
 from click.core import ParameterSource
 
-from fleet.client.hints import complete_hints
+from fleet.client.hints import complete_hints, fleet_options
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.suggestion import did_you_mean
 
@@ -78,15 +78,14 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
 
 def choose_fleet(connect: str | None, fleet: str) -> None:
     """Remember by which options the user reaches the fleet, for the commands that messages propose."""
-    click.get_current_context().meta[_BUS] = (f"--connect {connect}" if connect else "", fleet)
+    click.get_current_context().meta[_BUS] = connect, fleet
 
 
 def hint_options(fleet: str = "") -> str:
     """Return the options that a proposed command needs. fleet: another one than that of the running command."""
     context = click.get_current_context(silent=True)
-    connect, chosen = context.meta.get(_BUS, ("", DEFAULT_FLEET)) if context is not None else ("", DEFAULT_FLEET)
-    name = fleet or chosen
-    return " ".join(filter(None, (connect, "" if name == DEFAULT_FLEET else f"--fleet {name}")))
+    connect, chosen = (context.meta if context is not None else {}).get(_BUS, (None, DEFAULT_FLEET))
+    return fleet_options(connect, fleet or chosen)
 
 
 def say(words: str, *, err: bool = False, fleet: str = "") -> None:

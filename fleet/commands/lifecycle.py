@@ -12,9 +12,9 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client.claims import is_bad_rest
-from fleet.client.client import Fleet, default_sender
+from fleet.client.client import default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
-from fleet.commands.fleets import the_fleet
+from fleet.commands.fleets import client_in, the_fleet
 from fleet.commands.group import chosen_person, say
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running
@@ -62,7 +62,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
             for process in each.processes:
                 click.echo(_describe_process(process))
             continue
-        with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
+        with client_in(connect, fleet) as client:
             show_cars(client)
         for name, why in each.missing.items():
             if name == keys.RECORDER and each.unrecorded:

@@ -12,7 +12,7 @@ from click.shell_completion import CompletionItem
 
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
-from fleet.client.supervision import ask_status
+from fleet.client.supervision import ask_status, fleets_on
 from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
 from schemas import keys
 from schemas.bus import Bus, canon
@@ -312,8 +312,7 @@ def no_cars(client: Fleet) -> click.ClickException:
 
 def describe_other_fleets(client: Fleet) -> str:
     """Name the fleets on the bus. Empty if this one is among them, or if there is none."""
-    cars = {token.partition("/")[0] for token in client.bus.tokens("*/*")}
-    there = cars | {token.partition("/")[0] for token in client.bus.tokens(f"*/{keys.SUPERVISOR}")}
+    there = fleets_on(client.bus)
     if not there or client.name in there:
         return ""
     return f'No fleet "{client.name}" is on this bus. There is: {", ".join(sorted(there))}.'

@@ -141,7 +141,7 @@ def play(
     for note, count in notes.items():
         if count:
             click.echo(f"{count} {note}", err=True)
-    # What no selection takes never reached the player.
+    # Messages on keys that no selection takes never reached the player.
     everything = Selection(tuple(_key_expressions((), cars_only=False)))
     for key, count in about.keys.items():
         if not everything.has_key(key):

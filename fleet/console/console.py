@@ -53,6 +53,8 @@ KEPT_FOR_THIS_COMPUTER: Final = 8
 _MAX_EVENTS: Final = 4096
 MAX_PLOT_S: Final = 600
 """Maximum time that a plot shows, s."""
+_MAX_MERGES: Final = 256
+"""Number of remembered merges of stops, by person and cars."""
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
 
@@ -357,7 +359,7 @@ class Console:
 
     def _merged(self, who: tuple[str, ...], stop: Callable[[], object]) -> None:
         """Stop at once. Of further stops of the same kind in the next moment, one is sent at its end for all."""
-        if len(self._merges) >= _MAX_STOP_IDS:
+        if len(self._merges) >= _MAX_MERGES:
             del self._merges[next(iter(self._merges))]
         delay_s = self._merges.setdefault(who, StopMerge()).delay_s(time.monotonic())
         if delay_s == 0.0:

@@ -13,8 +13,6 @@ PIECE_BYTES: Final = 1024
 """Bytes that are parsed at a time: some thirty of the smallest messages."""
 CLOSED_INTERVAL_S: Final = 0.01
 """Interval of the pieces that come after the page was closed. Only its answer to the closing is of use."""
-
-
 CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout of that answer. A page that floods does not read it."""
 

@@ -230,7 +230,7 @@ class _Others:
     words: str
     """The same with the cars' names, truncated if there are many."""
     changes: str
-    """What would let each of them have it, with the cars' names, truncated likewise."""
+    """The change that would let each of them have it, with the cars' names, truncated likewise."""
     used: tuple[str, ...]
     has_able: bool
     """True if one of them could have it."""

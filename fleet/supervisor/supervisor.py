@@ -16,7 +16,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
-from fleet.client.hints import complete_hints
+from fleet.client.hints import complete_hints, fleet_options
 from fleet.client.services import why_unrecorded
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missing, describe_old_stops, describe_start
@@ -39,7 +39,7 @@ from fleet.supervisor.spec import (
 )
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.keys import DEFAULT_FLEET, name_of
+from schemas.keys import name_of
 from schemas.yaml_document.document import BadFile
 
 STATUS_INTERVAL_S: Final = 1.0
@@ -403,9 +403,7 @@ class Supervisor:
     @property
     def options(self) -> str:
         """The options that select this fleet in a command."""
-        name = "" if self._spec.fleet == DEFAULT_FLEET else f"--fleet {self._spec.fleet}"
-        connect = "" if self.endpoint == resolve_endpoint() else f"--connect {self.endpoint}"
-        return " ".join(filter(None, (name, connect)))
+        return fleet_options(None if self.endpoint == resolve_endpoint() else self.endpoint, self._spec.fleet)
 
     def _on_exit(self, process: ManagedProcess, requested: bool) -> None:  # noqa: FBT001 - called by ProcessSet
         if process.kind is ProcessKind.SIMULATOR:

@@ -59,6 +59,7 @@ class CarModel:
     missed_stop: bool = False
     """True if a stop on this link has had its time, and the car, which reported meanwhile, did not show it."""
     link_since: float = float("-inf")
+    """When the link was opened."""
     link_open: bool = False
     link_reason: str = "not connected yet"
 

@@ -48,7 +48,7 @@ Row = tuple[ChannelInfo, int, int, int, bytes]
 
 
 Extra = Attachment | Metadata
-"""What a file has besides messages."""
+"""The records of a file besides its messages."""
 
 
 class McapReader:

@@ -86,7 +86,7 @@ WHOLE_SESSION: Final = Part()
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What became of each recorded message: recorded = shown + left out."""
+    """The recorded messages by result: recorded = shown + left out."""
 
     shown: Counter[str]
     """Messages by key."""

@@ -31,7 +31,7 @@ class Prepared:
 
     files: list[Path]
     recorded: Counter[str] = field(default_factory=Counter)
-    """Messages by key, of which `left_out` are not in the files."""
+    """Messages by key, including those of `left_out`, which are not in the files."""
     left_out: LeftOut = field(default_factory=LeftOut)
 
 

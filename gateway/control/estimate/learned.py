@@ -46,8 +46,6 @@ ALWAYS: Final = 5
 """Minimum number of values out of range that are a finding, if none was in range."""
 UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
-
-
 REACTED: Final = 3
 """Number of consecutive reactions that end that finding."""
 MAX_KEPT_S: Final = 10.0

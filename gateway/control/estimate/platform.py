@@ -189,14 +189,12 @@ class PlatformDetector:
             return ()
         option = f"{HEAD}={head}"
         if self.auto:
-            self._options = self._without_head(self._options) | {option}
+            self._options = _without_head(self._options) | {option}
             self._apply_evidence()
             return ()
         # No other car sends such frames, so the option was written wrongly. With it, no reading could be read.
         named = self.profile.name
-        self.profile = parse_platform(
-            "+".join((self.profile.kind, *sorted(self._without_head(self.profile.options) | {option})))
-        )
+        self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
         return (words,) if self.note(words) else ()
 
@@ -231,17 +229,12 @@ class PlatformDetector:
         else:
             modes = Platform.STM32 if self._is_wide else Platform.ARDUINO
             kind = modes if self._with_modes else Platform.RASPBERRY_PI
-        options = self._options | self.configured.options
-        if any(each.startswith(HEAD) for each in self._options):  # the bytes know the head better
-            options = self._options | self._without_head(self.configured.options)
-        profile = parse_platform("+".join((kind, *sorted(options))))
+        knows_head = any(each.startswith(HEAD) for each in self._options)
+        configured = self.configured.options
+        profile = _profile_of(kind, self._options | (_without_head(configured) if knows_head else configured))
         if profile.name != self.profile.name:
             self.profile = profile
             self._against.clear()
-
-    @staticmethod
-    def _without_head(options: frozenset[str]) -> frozenset[str]:
-        return frozenset(each for each in options if not each.startswith(HEAD))
 
     def _why(self) -> tuple[str, ...]:
         if not self.auto:
@@ -257,3 +250,11 @@ class PlatformDetector:
         if self.is_remembered:
             return (f"{self.profile.name}: so it was detected before a mode was opened, and it may be in that mode",)
         return (f"not settled: it takes {EVIDENCE_FRAMES} readings running",)
+
+
+def _profile_of(kind: Platform, options: frozenset[str]) -> Profile:
+    return parse_platform("+".join((kind, *sorted(options))))
+
+
+def _without_head(options: frozenset[str]) -> frozenset[str]:
+    return frozenset(each for each in options if not each.startswith(HEAD))

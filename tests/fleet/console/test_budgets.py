@@ -1,4 +1,4 @@
-"""What one page and one person may ask of the console: far more than our page sends, and a flood costs only itself."""
+"""The budgets of a page and of a person: our page never exceeds them, and a flood costs nobody else anything."""
 
 import random
 from itertools import pairwise

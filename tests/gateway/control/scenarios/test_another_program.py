@@ -1,4 +1,4 @@
-"""What was learned of a car ends as it began: by its readings. Another program on the same link is learned again."""
+"""The gateway learns another program on the same link again, whatever it has learned of the car before."""
 
 import json
 import random
