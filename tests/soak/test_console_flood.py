@@ -3,16 +3,16 @@
 import contextlib
 import json
 import socket
-import ssl
 import threading
 import time
 import uuid
+from http.client import HTTPException, HTTPSConnection
 from pathlib import Path
 from statistics import median
 
 import psutil
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import WebSocketException
 
 from tests.fleet.console.test_server import ServerStage
 from tests.support.network_client import NetworkDevice, untrusting
@@ -33,7 +33,7 @@ def flood_socket(pupil: NetworkDevice, over: threading.Event) -> None:
     """Send frames, stops and whistles without a pause. Connect again when closed."""
     texts = ['{"t":"echo","n":1,"press":1}', '{"t":"do","id":1,"verb":"whistle","cars":["red"]}']
     while not over.is_set():
-        with contextlib.suppress(ConnectionClosed, InvalidStatus, OSError, TimeoutError), pupil.socket() as page:
+        with contextlib.suppress(WebSocketException, OSError), pupil.socket() as page:
             while not over.is_set():
                 for text in (*texts, json.dumps({"t": "stop", "id": uuid.uuid4().hex})):
                     page.send(text)
@@ -42,7 +42,7 @@ def flood_socket(pupil: NetworkDevice, over: threading.Event) -> None:
 def flood_requests(pupil: NetworkDevice, over: threading.Event) -> None:
     """Set plans of 60 kB, and stop without a pause."""
     while not over.is_set():
-        with contextlib.suppress(OSError, ssl.SSLError):
+        with contextlib.suppress(OSError, HTTPException):
             pupil.ask("POST", "/plan/check", PLAN)
             pupil.ask("POST", "/stop")
 
@@ -51,7 +51,7 @@ def flood_connections(pupil: NetworkDevice, over: threading.Event) -> None:
     """Open connections, and send half a request in each."""
     while not over.is_set():
         kept = []
-        with contextlib.suppress(OSError, ssl.SSLError):
+        with contextlib.suppress(OSError):
             for _ in range(100):
                 raw = socket.create_connection(("127.0.0.1", pupil.port), timeout=5)
                 kept.append(untrusting().wrap_socket(raw, server_hostname="127.0.0.1"))
@@ -60,6 +60,19 @@ def flood_connections(pupil: NetworkDevice, over: threading.Event) -> None:
         over.wait(1.0)
         for each in kept:
             each.close()
+
+
+def press(connection: HTTPSConnection, teacher: NetworkDevice) -> bool:
+    """Press STOP. Return False if the connection was closed: the next request opens another one."""
+    try:
+        connection.request("POST", "/stop", headers={"Origin": teacher.origin, "Cookie": teacher.cookie})
+        response = connection.getresponse()
+        response.read()
+    except (OSError, HTTPException):
+        connection.close()
+        return False
+    assert response.status == 204
+    return True
 
 
 @pytest.mark.soak
@@ -78,16 +91,14 @@ def test_a_stop_does_not_notice_three_pupils_that_flood(tmp_path: Path) -> None:
     threads = [threading.Thread(target=flood, args=(pupil, over)) for pupil in pupils for flood in floods]
     for thread in threads:
         thread.start()
-    took_s = []
+    took_s, again = [], 0
     try:
         connection = teacher.connection()
         for _ in range(PRESSES):
             time.sleep(FLOOD_S / PRESSES)
             count, began = len(written), time.monotonic()
-            connection.request("POST", "/stop", headers={"Origin": teacher.origin, "Cookie": teacher.cookie})
-            response = connection.getresponse()
-            response.read()
-            assert response.status == 204
+            while not press(connection, teacher):  # a browser opens another connection, too
+                again += 1
             wait_for(lambda count=count: len(written) > count, "a frame on the wire")
             took_s.append(written[count] - began)
         most_mb = server.memory_info().rss / 1e6
@@ -101,7 +112,7 @@ def test_a_stop_does_not_notice_three_pupils_that_flood(tmp_path: Path) -> None:
         f"\nSTOP, from the press to the first frame: p50 {1e3 * median(took_s):.0f} ms, p99 "
         f"{1e3 * took_s[int(0.99 * len(took_s))]:.0f} ms, max {1e3 * took_s[-1]:.0f} ms; "
         f"MB before {before_mb:.0f}, in the flood {most_mb:.0f}, a minute later {after_mb:.0f}; "
-        f"{server.num_threads()} threads"
+        f"{server.num_threads()} threads; the teacher's connection was opened again {again} times"
     )
     assert "Traceback" not in stage.log()
     assert after_mb < before_mb + MAX_GROWTH_MB
