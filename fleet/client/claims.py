@@ -30,7 +30,6 @@ _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
 """Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
-_OPEN: Final = ("online", "quiet", "stale")
 _STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
@@ -209,10 +208,26 @@ def claims_of(
     )
 
 
-def is_ready(claims: CarClaims, safety: Any) -> bool:
-    """Return True if a command to this car would wait for nothing now. What it has not shown delays none."""
+def why_not_ready(link: str, reason: str, waits_for: str) -> str:
+    """Return why a car is not ready; empty if it answers, and a command to it waits for nothing.
+
+    What a car has not shown delays no command. link, reason: of `state/link`. waits_for: of `state/safety`.
+    """
+    if link == "lost":
+        return f"link lost: {reason}" if reason else "link lost"
+    if link == "stale":  # it gets commands all the same
+        return "silent: is it switched on?"
+    return f"waits for {waits_for}" if waits_for else ""
+
+
+def readiness_of(states: Mapping[str, Any], claims: CarClaims) -> tuple[bool, str]:
+    """Return whether a car is ready by its claims, and why it is not, in words; empty if nothing tells."""
+    safety, link = states.get("state/safety"), states.get("state/link")
     is_old = claims.link.is_stale or claims.motors.is_stale  # such as those of a replay, or of a gateway that hangs
-    return safety is not None and claims.link.what in _OPEN and not safety.waits_for and not is_old
+    if safety is None or link is None or claims.link.what != link.state or is_old:
+        return False, ""
+    why = why_not_ready(link.state, link.reason, safety.waits_for)
+    return not why, why
 
 
 def describe_end_of_doubt(car: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Final
 import click
 
 from fleet.client import history
-from fleet.client.claims import claims_of, describe_end_of_doubt, is_ready
+from fleet.client.claims import claims_of, describe_end_of_doubt, readiness_of
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
@@ -122,6 +122,7 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
     values = {topic: reading.value for topic, reading in readings.items()}
     ages_s = {topic: reading.age_s() for topic, reading in readings.items()}
     claimed = claims_of(values, ages_s, present=present)
+    ready, why_not_ready = readiness_of(values, claimed)
     measured = readings.get("sensor/battery")
     link, motion = values.get("state/link"), values.get("state/motion") if present else None
     safety, battery = values.get("state/safety"), values.get("sensor/battery")
@@ -131,7 +132,8 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
         "car": car,
         "link": claimed.link.what if link or not present else "no answer",
         "reason": link.reason if link else "",
-        "ready": is_ready(claimed, safety),
+        "ready": ready,
+        "why_not_ready": why_not_ready,
         "waits_for": safety.waits_for if safety and present else None,
         "unheard": present and link is not None and _unheard(link.state, last_rx_s, safety.motors if safety else ""),
         "last_rx_s": None if last_rx_s is None else round(last_rx_s, 3),
@@ -189,19 +191,13 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
         silence = "no reading yet" if row["last_rx_s"] is None else f"silent for {row['last_rx_s']:.0f} s"
         return f"{row['link']} ({silence})"
     if name == "ready":
-        return _readiness(row)
+        return "ready" if row["ready"] else row["why_not_ready"] or "-"
     if name == "motors":
         return _cell(row, name)
     if name == "shows stops":
         return "in doubt" if row["doubted"] else _SHOWS.get(row["shows_stops"], "-")
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
-
-
-def _readiness(row: Mapping[str, Any]) -> str:
-    if row["ready"]:
-        return "ready"
-    return f"waits for {row['waits_for']}" if row["waits_for"] else "-"
 
 
 def _cell(row: Mapping[str, Any], name: str) -> str:

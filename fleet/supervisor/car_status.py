@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim
+from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim, why_not_ready
 from schemas import messages
 from schemas.keys import name_of
 from schemas.local_time import date_and_clock
@@ -169,19 +169,13 @@ def fit(widths: Mapping[str, int], width: int, optional: Sequence[str], gap: int
 
 
 def describe_missing(row: CarStatus) -> str:
-    """Return why a car is not ready, an empty string if it is: its link is open, and a command to it waits for nothing.
-
-    What the car has not shown delays no command.
-    """
+    """Return why a car is not ready (`why_not_ready`), or has not answered since its gateway began; empty if it is."""
     if not row.link:
         return "its gateway is starting"
-    if row.link == "lost":
-        return f"link lost: {row.reason}" if row.reason else "link lost"
-    if row.link == "stale":
-        return "silent: is it switched on?"
-    if row.motors in ("off", "on") or (row.heard and row.motors and not row.waits_for):
-        return ""
-    return f"waits for {row.waits_for}" if row.waits_for else "nothing was heard from it yet"
+    if why := why_not_ready(row.link, row.reason, row.waits_for):
+        return why
+    heard = row.motors in ("off", "on") or (row.heard and row.motors)
+    return "" if heard else "nothing was heard from it yet"
 
 
 def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str, console: str = "") -> str:

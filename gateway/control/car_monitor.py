@@ -67,7 +67,7 @@ class CarMonitor:
         model = self.model
         settled = not isinstance(event, Sensors) or model.evidence.is_settled(event)
         was_open = model.platform.open_mode
-        contradictions = model.platform.on_event(event) if settled else ()
+        contradictions = model.platform.on_event(event, counts=settled)
         if model.platform.open_mode and not was_open and model.profile.stop_style is StopStyle.GENERAL:
             self._stops.leave_open_mode(now)
         for words in contradictions:
@@ -206,6 +206,11 @@ class CarMonitor:
             return
         silent_s = model.mode.unheard_s(now)
         if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
+            return
+        if model.mode.heard_at < model.link_since and (found := model.platform.on_never_heard()):
+            self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {found}", now)
+            model.treat_as(model.platform.profile)
+            self._stops.change_case()
             return
         self._silent_since = model.mode.heard_at
         words = (

@@ -15,6 +15,7 @@ from gateway.control.car_monitor import CarMonitor
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import MAX_QUEUE_TIME_S, HeldMotion
 from gateway.control.commands import (
+    Action,
     Answer,
     Command,
     Drive,
@@ -157,6 +158,11 @@ class Controller:
     def is_free(self, now: float) -> bool:
         """Return True if a command of somebody who may command the car would be sent now."""
         return self.model.link_open and self._executor.accepts_commands(now)
+
+    def wait_s(self, what: Action, now: float) -> float:
+        """Return how long a drive or a mode would wait for its frame at most, as far as that is known, s."""
+        busy_s = self._busy_s(now)
+        return self._executor.opening_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
     def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
@@ -543,11 +549,14 @@ class Controller:
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:
-        """Return how long a drive waits for its frame, in words; empty if it does not."""
-        if pending.command.streamed or (busy_s := self._busy_s(now)) < LATE_DRIVE_S:
+        """Return how long a drive or a mode waits for its frame, in words; empty if it does not."""
+        command = pending.command
+        if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""
+        if isinstance(command.what, SetMode):
+            return f"opens in {wait_s:.1f} s at most: {self.car} is stopped first"
         what = "a stop" if self.stops.running is not None else "a command"
-        return f"begins in {busy_s:.1f} s at most: {self.car} is busy with {what}"
+        return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
         """Extend a held motion without another frame: its sender has sent the same drive again."""
@@ -598,8 +607,9 @@ class Controller:
         )
         if settled and self.model.mode.asked is mode:
             return self._done(pending, f"{self.car} is in mode {mode} already ({self.model.mode.verdict})", now)
+        wait = self._wait(pending, now)
         self._queue.mode_change = pending
-        return self._queued(pending, now)
+        return self._queued(pending, now, wait)
 
     # ------------------------------------------------------------------ answers
 

@@ -13,12 +13,12 @@ from gateway.control.estimate.learned import blocking_kind
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, TrustEvent
 from gateway.control.events import FrameOrigin, OutgoingFrame
-from gateway.control.pacing import FLIGHT_S
+from gateway.control.pacing import AWAKE_WAIT_S, FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.control.stop_executor import StopExecutor
 from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.control.stops.sequences import SOFT, STOP_FRAME, StopSequence
+from gateway.control.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
@@ -149,13 +149,24 @@ class Executor:
         self.stops.give_way(now)
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
+    def opening_wait_s(self, busy_s: float, now: float) -> float:
+        """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
+        model = self.model
+        if model.rest_is_sure and self.stops.running is None:
+            return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)
+        running, begin_s = self.stops.running, max(model.pacing.ready_at(Gate.FLIGHT) - now, 0.0)
+        if running is None or not self._full_stop_runs:
+            busy_s = max(busy_s, self.stops.worst_s(now), begin_s + self.stops.full(now).length_s)
+        # The last frame of the stop must have left the buffer of the car.
+        return busy_s + REPEAT_INTERVAL_S + (AWAKE_WAIT_S if model.can_show else 0.0)
+
     @property
     def _full_stop_runs(self) -> bool:
         """Return True if a stop runs that is more than the end of a drive, and that does not give way at once."""
         running = self.stops.running
         if running is None or running.sequence.rank <= SOFT.rank:
             return False
-        return running.frames_sent or not running.repeats
+        return running.sent_all or not running.repeats
 
     @property
     def _has_new_command(self) -> bool:

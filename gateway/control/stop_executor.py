@@ -147,6 +147,11 @@ class StopExecutor:
             case _:
                 return StopCase.MANUAL if model.can_show else StopCase.NO_REACTION
 
+    def change_case(self) -> None:
+        """Judge the running stop by the profile that is in force now."""
+        if self.running is not None:
+            self.running.case = self._case(self.running.sequence)
+
     # ------------------------------------------------------------------ link, shutdown
 
     def link_down(self, reason: str, now: float, *, cause: Reason) -> None:

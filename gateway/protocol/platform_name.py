@@ -21,7 +21,8 @@ class Platform(StrEnum):
 OPTIONS: Final = frozenset({"arm", "imu"})
 """Options that add a part to a car."""
 # Programs of one family differ in these (docs/reference/protocol.md#programs-that-people-have).
-VARIANTS: Final = ("text", "no_readings", "3s", "fan_level", "ptz_direct")
+NO_READINGS: Final = "no_readings"
+VARIANTS: Final = ("text", NO_READINGS, "3s", "fan_level", "ptz_direct")
 """Options that say in what this car's program differs."""
 HEAD: Final = "head"
 """The option with a value: the first word of the frames."""

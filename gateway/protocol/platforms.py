@@ -24,7 +24,7 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
-from gateway.protocol.platform_name import HEAD, OPTIONS, Platform, parse_name
+from gateway.protocol.platform_name import HEAD, NO_READINGS, OPTIONS, Platform, parse_name
 from gateway.protocol.sensors import ATTRIBUTES, Reject, Sensors
 from gateway.protocol.timing import (
     DIGITLESS_OPEN_S,
@@ -159,7 +159,7 @@ class Profile:
     @property
     def has_readings(self) -> bool:
         """False if the car never sends a reading, so that nothing shows what it does."""
-        return "no_readings" not in self.options
+        return NO_READINGS not in self.options
 
     @property
     def cells(self) -> int:

@@ -64,8 +64,6 @@ SHARP_S = 0.1
 """Maximum error of the start and the stop of a drive on the wire."""
 FALSE_S = 0.3
 MODE_STAYS_S = 8.0
-LONGEST_FULL_STOP_S = 2.3 + 1.1 + 0.25
-"""Length of the longest full stop, the time until its last frame is read, and the wait for a report."""
 LONGEST_FIRST_FRAMES_S = 1.1 + 1.2 + 4.3
 """Maximum time for which the first frames of a stop delay a command: their length, the block before and a turn."""
 
@@ -118,11 +116,12 @@ class UseEpisode:
         acts = [self._drive, self._drive, self._stop, self._light]
         return [*acts, self._mode, self._mode] if "mode" in self.pair.control.model.profile.capabilities else acts
 
-    def _ask(self, what: Action, extra_s: float = 0.0) -> float | None:
+    def _ask(self, what: Action) -> float | None:
         """Send a command. Return when its first frame was written, None if it was refused."""
         pair, control = self.pair, self.pair.control
         asked_at, count = pair.now, len(pair.records)
         free_at = max(asked_at, control.stops.free_at(asked_at))
+        wait_s = control.wait_s(what, asked_at)
         if free_at - asked_at > LONGEST_FIRST_FRAMES_S + pair.control.model.profile.block_s(ModeOpen(Mode.FOLLOWING)):
             self._violate(f"(5) {what} would wait for {free_at - asked_at:.1f} s")
         self.use.commands.append(f"{asked_at:.2f} {what}")
@@ -130,7 +129,7 @@ class UseEpisode:
         if answer.status is Phase.REJECTED:
             self._violate(f"(5) {what} was refused: {answer.words}")
             return None
-        bound = free_at + extra_s + WIRE_S
+        bound = asked_at + wait_s + WIRE_S
         while not self._is_sent(what, count) and pair.now < bound:
             self._run(0.01)
         if not self._is_sent(what, count) and not self._is_right:
@@ -187,7 +186,7 @@ class UseEpisode:
     def _mode(self) -> None:
         pair = self.pair
         mode = self._moments.choice([Mode.TRACKING, Mode.COLOR_LED, Mode.LIGHT_SEEKING, Mode.REMOTE_CONTROL])
-        if self._ask(SetMode(mode), LONGEST_FULL_STOP_S) is None:
+        if self._ask(SetMode(mode)) is None:
             return
         self._run(2.2 + MODE_STAYS_S * self._moments.random())
         if pair.car.truth.mode is not mode and self._is_right:

@@ -700,6 +700,7 @@ class Episode:
         if self._linked:
             for event in self.decoder.feed(data, max(at, 0.0)):
                 self.control.on_event(event, self.now)
+                self.decoder.use_head(self.control.model.profile.dialect.head)
 
     def _pump(self) -> None:
         if not self._linked:

@@ -167,6 +167,7 @@ class Pair:
                 for event in self.decoder.feed(data, at):
                     self._touched = True
                     self.control.on_event(event, self.now)
+                    self.decoder.use_head(self.control.model.profile.dialect.head)
         if linked:
             for event in self.decoder.tick(self.now):
                 self._touched = True

@@ -10,12 +10,16 @@ from typing import Final
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.modes import candidate_modes, only_candidate
-from gateway.protocol.platform_name import HEAD, Platform
+from gateway.protocol.platform_name import HEAD, NO_READINGS, Platform
 from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
 from gateway.protocol.sensors import Sensors, head_of
 
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
+
+OTHER_HEAD_FRAMES: Final = 12
+"""Number of consecutive frames with another head that replace one with which the car was read. A link that loses or
+changes bytes makes such a frame now and then, and a wrong head keeps every named frame from the car."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
@@ -74,9 +78,13 @@ class PlatformDetector:
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
     _readings: int = 0
+    _assumed_silent: bool = False
+    """True if the option `no_readings` of the profile comes from the silence of this link."""
     _head: str = ""
     _heads: int = 0
     """The first word of the last sensors frames if it is none of this profile, and their number."""
+    _is_read: bool = False
+    """True if a frame with the head of this profile has arrived on this link."""
 
     def __post_init__(self) -> None:
         self.profile = self.remembered or self.configured
@@ -107,19 +115,27 @@ class PlatformDetector:
         return self.profile.kind is not Platform.UNKNOWN or self._readings > EVIDENCE_FRAMES
 
     def begin_link(self) -> None:
-        """Forget what the readings of the last link showed of the mode."""
+        """Forget what the readings of the last link showed of the mode, and of the head."""
         self._open_mode = _PlatformEvidence()
+        self._is_read, self._heads = False, 0
 
     @property
     def evidence(self) -> tuple[str, ...]:
         """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
         return (*self._why(), *self.contradictions, *self.profile.not_observed)
 
-    def on_event(self, event: Event) -> tuple[str, ...]:
-        """Update the evidence, and with `auto` the profile. Return new contradictions, in words."""
+    def on_event(self, event: Event, *, counts: bool = True) -> tuple[str, ...]:
+        """Update the evidence, and with `auto` the profile. Return new contradictions, in words.
+
+        If a reading does not count, only its head does.
+        """
+        if isinstance(event, Sensors):
+            self._is_read, self._heads = True, 0
+            if not counts:
+                return ()
         match event:
             case Sensors():
-                self._heads = 0
+                self._end_silence()
                 self._open_mode.update(shown=Mode.MANUAL not in candidate_modes(event))
                 new = self._check_profile(event)
                 if self.auto:
@@ -136,6 +152,25 @@ class PlatformDetector:
             case _:
                 return ()
         return new
+
+    def on_never_heard(self) -> str:
+        """Take a raspberry_pi car that has sent nothing on this link as one that never sends readings.
+
+        Its reports show no stop in any case, so only words depend on them. Return what that contradicts, in words;
+        empty for any other car: its silence may be that of a mode.
+        """
+        if self.profile.kind is not Platform.RASPBERRY_PI or not self.profile.has_readings:
+            return ""
+        named = self.profile.name
+        self.profile = _profile_of(self.profile.kind, self.profile.options | {NO_READINGS})
+        self._assumed_silent = True
+        return f"no readings, which {named} cars send. It is treated as {self.profile.name} until one arrives"
+
+    def _end_silence(self) -> None:
+        """Return to the profile before `on_never_heard`: a reading has arrived."""
+        if self._assumed_silent:
+            self._assumed_silent = False
+            self.profile = _profile_of(self.profile.kind, self.profile.options - {NO_READINGS})
 
     def note(self, words: str) -> bool:
         """Add a contradiction that other evidence has shown. Return True if it is new."""
@@ -185,8 +220,9 @@ class PlatformDetector:
             return ()
         self._heads = self._heads + 1 if head == self._head else 1
         self._head = head
-        if self._heads != EVIDENCE_FRAMES:
+        if self._heads != (OTHER_HEAD_FRAMES if self._is_read else EVIDENCE_FRAMES):
             return ()
+        self._is_read = False
         option = f"{HEAD}={head}"
         if self.auto:
             self._options = _without_head(self._options) | {option}

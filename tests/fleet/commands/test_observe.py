@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from fleet.client.claims import why_not_ready
 from fleet.client.reading import Reading
 from fleet.commands.observe import CAR_COLUMNS, OPTIONAL_CAR_COLUMNS, row_of, shown
 from fleet.commands.output import show_table
@@ -80,6 +81,10 @@ def test_the_row_of_a_car_has_its_color_on_a_terminal(
     assert capsys.readouterr().out.splitlines()[1] == f"{dot}red"
 
 
+WHY_SILENT = why_not_ready("stale", "", "")
+"""As `fleet up` says it."""
+
+
 def states(**fields: Any) -> dict[str, Reading]:
     now = datetime.now(UTC)
     return {
@@ -97,6 +102,10 @@ def test_motors_have_their_basis_and_a_car_is_ready_or_waits() -> None:
     assert [shown(name, row) for name in ("ready", "motors", "shows stops")] == ["ready", "off (sent)", "no"]
     waiting = row_of("red", states(waits_for="its first stop, for 1.2 s at most"))
     assert (waiting["ready"], shown("ready", waiting)) == (False, "waits for its first stop, for 1.2 s at most")
+
+    silent = states() | {"state/link": replace(states()["state/link"], value=pb.Link(state="stale"))}
+    row = row_of("red", silent)
+    assert (row["ready"], row["why_not_ready"], shown("ready", row)) == (False, WHY_SILENT, WHY_SILENT)
 
 
 def test_of_old_states_no_car_is_ready() -> None:

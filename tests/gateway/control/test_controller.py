@@ -358,6 +358,16 @@ def test_one_shots_queue_so_many_and_no_more_each_once(desk: Workbench) -> None:
     assert [data[15:16] + data[7:8] for data in desk.frames] == [b"01", b"10"] * 4 + [b"01"]
 
 
+def test_a_mode_says_how_long_its_stop_delays_it(desk: Workbench) -> None:
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    wait_s, asked_at = desk.control.wait_s(SetMode(Mode.TRACKING), desk.now), desk.now
+    answer = desk.ask(SetMode(Mode.TRACKING), identity="it")
+    assert f" {wait_s:.1f} s " in answer.words
+    desk.until(lambda: SENT in desk.life("it"))
+    assert desk.now <= asked_at + wait_s
+
+
 def test_a_drive_waits_for_the_recovery_at_the_connect() -> None:
     desk = Workbench()
     desk.control.link_up(desk.now)
@@ -846,7 +856,7 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
         assert pair.car.truth.speed == pair.control.model.believed.speed
 
 
-@pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("raspberry_pi", False), ("raspberry_pi", True)])
+@pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("arduino", False), ("raspberry_pi", True)])
 def test_a_car_that_never_sends_a_reading_is_told_how_to_say_so(platform: str, *, heard: bool) -> None:
     desk = Workbench(platform)
     desk.control.link_up(desk.now)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.platform import EVIDENCE_FRAMES, PlatformDetector
+from gateway.control.estimate.platform import EVIDENCE_FRAMES, OTHER_HEAD_FRAMES, PlatformDetector
 from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
@@ -108,12 +108,27 @@ def test_auto_takes_another_head_from_three_readings() -> None:
     truth = PlatformDetector(parse_platform("unknown+text"), auto=True)
     hear_raw(truth, "BALA", "BALA", "4WD", "BALA", "BALA", "CART", "BALA", "BALA")
     assert truth.profile.name == "unknown+text", "never three running"
-    assert hear_raw(truth, "BALA") == []
+    truth.begin_link()
+    assert hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES) == []
     assert truth.profile.name == "unknown+head=BALA+text"
     hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES)
     assert truth.profile.name == "arduino+head=BALA+text"
-    hear_raw(truth, *["4WD"] * EVIDENCE_FRAMES)
+    hear_raw(truth, *["4WD"] * OTHER_HEAD_FRAMES)
     assert truth.profile.dialect.head == "4WD", "another program on the same link"
+
+
+@pytest.mark.parametrize("auto", [False, True])
+def test_damaged_frames_do_not_change_the_head_with_which_a_car_was_read(*, auto: bool) -> None:
+    """A link that loses every second frame's `4` made the gateway send `$WD,MODE00#`, which no car knows."""
+    truth = PlatformDetector(parse_platform("unknown" if auto else "arduino"), auto=auto)
+    for count in range(1, OTHER_HEAD_FRAMES):
+        hear_raw(truth, "4WD", *["WD"] * count)
+        assert truth.profile.dialect.head == "4WD"
+    unsettled = Decoder().feed(ARDUINO.encode(), 1.0)
+    for event in unsettled:
+        truth.on_event(event, counts=False)
+    hear_raw(truth, "WD")
+    assert truth.profile.dialect.head == "4WD"
 
 
 def test_the_bytes_know_the_head_better_than_an_option() -> None:

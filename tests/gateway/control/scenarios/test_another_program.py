@@ -136,3 +136,34 @@ def test_a_report_that_mode_00_has_delayed_is_no_rhythm_if_a_drive_follows_it() 
         pair.run(6.0)
         intervals_s = pair.control.model.learned.echo.intervals
         assert all(abs(each - 2.2) < 0.1 for each in intervals_s), f"seed {seed}: {intervals_s}"
+
+
+def test_a_raspberry_pi_car_that_never_sends_a_reading_is_taken_as_such_until_one_arrives() -> None:
+    pair = Pair("course", told="raspberry_pi", start_s=2.0)
+    pair.connect()
+    control = pair.control
+    pair.until(lambda: control.model.profile.name == "raspberry_pi+no_readings", 15.0)
+    pair.until(lambda: control.model.at_rest, 3.0)
+    pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
+    pair.run(2.0)
+    pair.ask(Stop(), identity="stop")
+    pair.run(3.0)
+    ends = [pair.last_of(each) for each in ("drive", "stop")]
+    assert [(end.phase, end.basis) for end in ends if end is not None] == [("sent", "sent")] * 2
+    assert "platform_contradicted" in {record.code for record in pair.logs}
+    assert not any(b"MODE" in data for _, data in pair.sent)
+    control.shut_down(pair.now)
+    pair.until(lambda: control.stops.finished, 2.0)
+    assert not control.stops.not_stopped
+
+
+def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
+    pair = Pair("raspberry_pi", start_s=2.0)
+    feed, pair.decoder.feed = pair.decoder.feed, lambda *_: []  # type: ignore[method-assign]
+    pair.decoder.feed = lambda *_: []  # type: ignore[method-assign]
+    pair.control.link_up(pair.now)
+    pair.until(lambda: pair.control.model.profile.name == "raspberry_pi+no_readings", 15.0)
+    pair.decoder.feed = feed  # type: ignore[method-assign]
+    pair.run(10.0)
+    assert pair.control.model.profile.name == "raspberry_pi"
+    assert not pair.control.model.platform.doubted
