@@ -181,12 +181,15 @@ class Bus:
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
         """Return the existing tokens. Empty also after a timeout."""
-        # While a watch receives its existing tokens, Zenoh answers a get for the same tokens only in part.
+        # In a session with a watch, Zenoh may leave the watched tokens out of the answer to a get: of 300 sessions that
+        # watched `fleet/*`, ten got `*/*` without them. So take those from the watch.
+        wanted = zenoh.KeyExpr(expression)
         with self._lock:
             if expression in self._alive:
                 return sorted(self._alive[expression])
+            watched = {key for alive in self._alive.values() for key in alive if wanted.intersects(zenoh.KeyExpr(key))}
         replies = self._session.liveliness().get(expression, timeout=timeout_s)
-        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+        return sorted(watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
         """Call back with (key, alive) for every existing token and every change, on a Zenoh thread."""
