@@ -535,6 +535,8 @@ class CarGateway:
         """Handle a gap of the loop, or a sleep: the process may have lost the bus, and stops a driven car."""
         if (slept_s := self._sleep.take()) > 0:
             self._publisher.on_bus_lost(now)
+            if not MONOTONIC_COUNTS_SLEEP:
+                self._publisher.on_slept(slept_s)
             self._control.on_sleep(slept_s, now, counted=MONOTONIC_COUNTS_SLEEP)
             self._wake.set()
         gap_s = now - self._alive_at - CHECK_INTERVAL_S

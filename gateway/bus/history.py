@@ -37,9 +37,9 @@ class BadRange(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One published value; `time_ns`: ns since the epoch."""
+    """One published value. `at`: s, monotonic."""
 
-    time_ns: int
+    at: float
     payload: bytes
 
 
@@ -49,18 +49,27 @@ class HistoryBuffer:
     def __init__(self, size: int) -> None:
         self._values: deque[Value] = deque(maxlen=size)
 
-    def add(self, time_ns: int, payload: bytes) -> None:
-        """Append a value. A full buffer drops the oldest one."""
-        self._values.append(Value(time_ns, payload))
+    def add(self, at: float, payload: bytes) -> None:
+        """Append a value of a monotonic time, s. A full buffer drops the oldest one."""
+        self._values.append(Value(at, payload))
 
-    def select(self, *, time_range: str | None, last: str | None, now_ns: int) -> list[Value]:
-        """Return the latest value, or those in a time range, or the last ones. Raises BadRange."""
+    def age(self, slept_s: float) -> None:
+        """Let the values be older by a sleep of the computer that the monotonic clock does not count, s."""
+        self._values = deque((Value(each.at - slept_s, each.payload) for each in self._values), self._values.maxlen)
+
+    def select(self, *, time_range: str | None, last: str | None, now: float, now_ns: int) -> list[Value]:
+        """Return the latest value, or those in a time range, or the last ones. Raises BadRange.
+
+        now: s, monotonic. now_ns: the wall clock then. A value is as old as the monotonic clock says, also if the wall
+        clock was set meanwhile.
+        """
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)
         if time_range is not None:
             begin, end = parse_range(time_range, now_ns)
-            values = [value for value in values if begin <= value.time_ns < end]
+            since_ns = now_ns - round(now * 1e9)
+            values = [value for value in values if begin <= since_ns + round(value.at * 1e9) < end]
         if last is not None:
             match = _COUNT.fullmatch(last)
             if match is None:

@@ -106,7 +106,8 @@ class CarPublisher:
                     voltage_v, loaded=loaded, cells=self.profile.cells
                 )
                 message.level = self._battery.level or battery.BatteryLevel.OK
-            self._put_reading(name, message, stamp_ns, published)
+            self._put_kept(name, message, event.at, stamp_ns)
+            published.append(name)
         if not self._raw.take(1, event.at):
             return False
         frame = _CLASSES["frame/rx"]()
@@ -116,9 +117,8 @@ class CarPublisher:
         self._publishers["frame/rx"].put(frame, stamp_ns)
         return True
 
-    def _put_reading(self, name: str, message: Any, stamp_ns: int, published: list[str]) -> None:
-        self._histories[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
-        published.append(name)
+    def _put_kept(self, name: str, message: Any, at: float, stamp_ns: int) -> None:
+        self._histories[name].add(at, self._publishers[name].put(message, stamp_ns))
 
     # ------------------------------------------------------------------ frames out, records
 
@@ -244,8 +244,12 @@ class CarPublisher:
 
     def _put_state(self, name: str, message: Any, now: float) -> None:
         self._published_at[name] = now
-        stamp_ns = self._wall.ns(now)
-        self._histories[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
+        self._put_kept(name, message, now, self._wall.ns(now))
+
+    def on_slept(self, slept_s: float) -> None:
+        """Count a sleep of the computer that the monotonic clock does not count, s."""
+        for history in self._histories.values():
+            history.age(slept_s)
 
     # ------------------------------------------------------------------ queries
 
@@ -266,12 +270,13 @@ class CarPublisher:
                 if self._publishers[name].topic.family == family
                 and query.key_expr.intersects(self._publishers[name].key)
             ]
-            time_range, last, now_ns = parameters.get("_time"), parameters.get("last"), time.time_ns()
+            time_range, last = parameters.get("_time"), parameters.get("last")
+            now, now_ns = time.monotonic(), time.time_ns()
             try:
                 values = [
                     (publisher, value)
                     for publisher, ring in matching
-                    for value in ring.select(time_range=time_range, last=last, now_ns=now_ns)
+                    for value in ring.select(time_range=time_range, last=last, now=now, now_ns=now_ns)
                 ]
             except BadRange as error:
                 query.reply_err(str(error), encoding="text/plain")

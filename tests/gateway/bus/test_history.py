@@ -10,6 +10,8 @@ from gateway.bus.history import BadRange, HistoryBuffer, parse_range
 from schemas.topics import HISTORY
 
 S = 1_000_000_000
+AT = 5_000.0
+"""The monotonic clock at `NOW`."""
 NOW = 1_800_000_000 * S
 EARLY = 0
 FOREVER = 1 << 63
@@ -68,7 +70,7 @@ def test_what_is_no_range_is_refused_with_how_to_write_one(text: str) -> None:
 def filled(count: int, size: int = 5) -> HistoryBuffer:
     ring = HistoryBuffer(size)
     for number in range(count):
-        ring.add(NOW - (count - number) * S, str(number).encode())
+        ring.add(AT - (count - number), str(number).encode())
     return ring
 
 
@@ -92,23 +94,37 @@ def filled(count: int, size: int = 5) -> HistoryBuffer:
 def test_the_ring_gives_the_latest_the_last_or_a_range_oldest_first(
     time_range: str | None, last: str | None, found: str
 ) -> None:
-    values = filled(8).select(time_range=time_range, last=last, now_ns=NOW)
+    values = filled(8).select(time_range=time_range, last=last, now=AT, now_ns=NOW)
     assert b"".join(value.payload for value in values).decode() == found
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_wall_clock_that_was_set_makes_no_value_older(step_s: int) -> None:
+    values = filled(8).select(time_range="[now(-2s)..]", last=None, now=AT, now_ns=NOW + step_s * S)
+    assert [value.payload for value in values] == [b"6", b"7"]
+
+
+def test_a_sleep_of_the_computer_makes_values_older() -> None:
+    ring = filled(8)
+    ring.age(3600.0)
+    ring.add(AT, b"8")
+    assert [each.payload for each in ring.select(time_range="[now(-60s)..]", last=None, now=AT, now_ns=NOW)] == [b"8"]
+    assert len(ring.select(time_range=None, last="99", now=AT, now_ns=NOW)) == 5
 
 
 @pytest.mark.parametrize("last", ["", "0", "-1", "1.5", "three", "³", "٣", "1_0", " 3", "inf", "0" * 5000])
 def test_a_last_that_is_no_count_is_refused(last: str) -> None:
     with pytest.raises(BadRange, match=f"whole number from 1 on. The history has at most {HISTORY} values"):
-        filled(3).select(time_range=None, last=last, now_ns=NOW)
+        filled(3).select(time_range=None, last=last, now=AT, now_ns=NOW)
 
 
 def test_a_count_of_thousands_of_digits_is_all_there_is() -> None:
-    assert len(filled(3).select(time_range=None, last="9" * 5000, now_ns=NOW)) == 3
+    assert len(filled(3).select(time_range=None, last="9" * 5000, now=AT, now_ns=NOW)) == 3
 
 
 def test_an_empty_ring_has_nothing_to_give() -> None:
     for time_range, last in [(None, None), ("[..]", None), (None, "3")]:
-        assert HistoryBuffer(3).select(time_range=time_range, last=last, now_ns=NOW) == []
+        assert HistoryBuffer(3).select(time_range=time_range, last=last, now=AT, now_ns=NOW) == []
 
 
 PIECES = st.sampled_from(["[", "]", "..", "now(", ")", "-", "1", "9" * 30, "s", "ms", "w", "Z", "T", ":", ";", "2026"])
@@ -117,4 +133,4 @@ PIECES = st.sampled_from(["[", "]", "..", "now(", ")", "-", "1", "9" * 30, "s", 
 @given(st.one_of(st.text(), st.lists(PIECES, max_size=12).map("".join)), st.one_of(st.none(), st.text()))
 def test_any_text_is_a_selection_or_a_bad_range(time_range: str, last: str | None) -> None:
     with contextlib.suppress(BadRange):
-        filled(3).select(time_range=time_range, last=last, now_ns=NOW)
+        filled(3).select(time_range=time_range, last=last, now=AT, now_ns=NOW)
