@@ -57,7 +57,7 @@ class CommandRequest:
             case "speed":
                 return str(self.message.step)
             case "fan":
-                return f"switched {self.message.state}" if self.message.state else "toggled"
+                return self.message.state or "toggle"
             case _:
                 return ""
 

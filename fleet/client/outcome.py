@@ -69,7 +69,7 @@ class Outcome:
     Of a drive: `shown` if a reading shows that the car moved, `sent` if none does.
     """
     effect: str = ""
-    """The effect of the command in words: `LED set`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""
+    """The effect of the command in words: `LED color sent`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""
     next_step: str = ""
     """How to end what the command began, such as the release of an e-stop. Empty if there is nothing to end."""
 

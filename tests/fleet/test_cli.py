@@ -352,7 +352,7 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
 def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
     done = run(cars.endpoint, "led", "red,purple,blue", "#0000ff")
     assert done.returncode == 1
-    assert done.stdout.splitlines() == ["blue: LED set", "red: LED set"]
+    assert done.stdout.splitlines() == ["blue: LED color sent", "red: LED color sent"]
     assert done.stderr == 'purple: No car named "purple". Connected: blue, green, red. [no_answer]\n'
     outcomes = lines(run(cars.endpoint, "led", "red,purple", "#000000", "--json"))
     assert [(each["car"], each["ok"], each["phase"]) for each in outcomes] == [
