@@ -78,7 +78,11 @@ class Pacing:
 
     @property
     def _interval_s(self) -> float:
-        return self.learned.interval_s(self.profile.interval_s)
+        """The interval of the reports, without the ranging, as far as it is known."""
+        expected_s, no_echo = self.profile.interval_s, self.learned.no_echo
+        if no_echo.is_known:  # without an echo a report takes longer by the whole ranging
+            expected_s = min(expected_s, no_echo.median_s - self.profile.ranging_s)
+        return self.learned.interval_s(expected_s)
 
     @property
     def awake_until(self) -> float:

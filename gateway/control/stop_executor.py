@@ -28,12 +28,8 @@ DOUBTED_PROBES: Final = 2
 """Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
 
 
-_PROBED: Final = {
-    Finding.REPORT: sequences.PROBE,
-    Finding.PAUSE: sequences.PROBE,
-    Finding.CONTROL: sequences.CONTROL,
-}
-"""The next frame of a stop that the car may still show, by what its last report was."""
+_PROBED: Final = (Finding.REPORT, Finding.PAUSE, Finding.CONTROL)
+"""The reports after which a stop that the car may still show goes on with its next frame."""
 
 
 class StopExecutor:
@@ -358,7 +354,9 @@ class StopExecutor:
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
         if self.running is running and finding in _PROBED and is_ready and self._may_probe(running):
             running.probes += 1
-            running.begin_try(_PROBED[finding], now)
+            is_control = finding is Finding.CONTROL
+            interval_s = self.model.evidence.interval_s
+            running.begin_try(sequences.control(interval_s) if is_control else sequences.PROBE, now)
 
     def on_contact(self, now: float, words: str) -> None:
         """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""

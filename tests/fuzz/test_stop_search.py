@@ -2,6 +2,7 @@
 
 import pytest
 
+from gateway.protocol.enums import Mode
 from gateway.sim.model.traits import CarTraits
 from tests.fuzz.stop_search import BYTES_PER_S, Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
 
@@ -39,6 +40,34 @@ FOUND = (
             LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, 1.5),
         ),
         rest_s=3.15,
+    ),
+    # Three readings lost the `4` of their head within some seconds. Control sent `$WD,MODE00#` from then on.
+    EpisodePlan(
+        21182, "arduino", "arduino", "echo", "light_seeking", 5.9169053636092634, Ending.STOP,
+        (
+            LinkFault(Kind.LOSSY, Way.TO_HOST, -0.1, 5.3515134040268055, 0.04),
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, 7.543339798198265),
+        ),
+        traits=CarTraits(interval_s=2.904947964776352, silent_modes=frozenset({Mode.FOLLOWING})),
+    ),
+    # A `MODE00` that lost its digits blocked, and a held report came late. An unjudged `MODE00` excused the late one.
+    EpisodePlan(
+        58636, "arduino", "arduino", "echo", "drive", 2.6050211160051737, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_CAR, 0.0109375, 0.0010416666666666667),
+            LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, 5.643802049812602),
+            LinkFault(Kind.STUCK, Way.TO_HOST, -0.27875963026975925, 1.3144714647492637),
+        ),
+        traits=CarTraits(interval_s=2.471312067781707, spread_s=0.0, close_s=0.0),
+    ),
+    # Each write muted the link for about one interval, and the car was deaf. Some reports came just after that.
+    EpisodePlan(
+        61846, "arduino", "arduino", "echo", "drive", 0.7420447949689872, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.1, 19.78799378740391),
+            LinkFault(Kind.HALF_DUPLEX, Way.TO_HOST, -0.1, 19.78799378740391, delay_s=1.2413365373202196),
+        ),
+        traits=CarTraits(spread_s=0.06858682185966497, silent_modes=frozenset({Mode.TRACKING}), text=True),
     ),
 )  # fmt: skip
 

@@ -22,9 +22,10 @@ them is longer than it should be (a slow link, or a report that the link held), 
 
 *Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
 `MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length
-tells. Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop at the
-same moment of an interval. It does not block, so the next report must come on time. If that one is missing too, the
-pauses were the link's.
+tells. Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop a
+third of an interval after a report. It does not block, so the next report must come on time. A link that was mute from
+a `MODE00` until the report after it is mute for so long again. So it hides this one for certain, however the intervals
+spread. If the report is missing or damaged, the pauses were the link's.
 
 *Why silence follows.* A link that holds reports makes gaps of any length. But the held report comes late, and the next
 one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
@@ -307,7 +308,8 @@ class StopEvidence:
         return self.learned.echo
 
     @property
-    def _interval_s(self) -> float:
+    def interval_s(self) -> float:
+        """Return the interval of this car's reports with an echo, s."""
         return self.learned.interval_s(self.profile.interval_s)
 
     @property
@@ -318,13 +320,13 @@ class StopEvidence:
     @property
     def _left_s(self) -> float:
         """Return the maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
-        latest_s = self.close_s + self._interval_s + self._rhythm.tolerance_s
+        latest_s = self.close_s + self.interval_s + self._rhythm.tolerance_s
         return min(latest_s + EARLY_S, self.profile.reopened_s + WIRE_S)
 
     @property
     def settling_s(self) -> float:
         """Return the time after the last pause in which a report that a link had held would be followed by another."""
-        return max(0.0, self._interval_s - self.close_s) + SETTLING_S
+        return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
 
@@ -412,7 +414,7 @@ class StopEvidence:
         self._last_at = at
         self.found_out = False
         # A report that comes a normal interval after the last pause was not held back by the link.
-        on_time = self.settles_at is not None and quiet_s >= self._interval_s - self._rhythm.tolerance_s
+        on_time = self.settles_at is not None and quiet_s >= self.interval_s - self._rhythm.tolerance_s
         if on_time and Mode.MANUAL in candidate_modes(event):
             self._before, self._blocking, self._general = at if event.range_cm else None, [], False
             self._fast_before = bool(event.range_cm)
@@ -481,6 +483,8 @@ class StopEvidence:
     def _without_mode_00(self, before: float | None, at: float, blocking: list[_Block], *, general: bool) -> Finding:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
         if before is None:
+            if general:
+                self._drop_pauses()  # the control has shown damage instead of a report
             return self._report
         gap_s = at - before
         if not blocking:
@@ -527,7 +531,8 @@ class StopEvidence:
         longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
             self._pending = None
-            if not matches:
+            # Nobody has judged an earlier `MODE00` that may have delayed this report.
+            if not matches or any(each.kind is None for each in blocking):
                 self._pauses_needed = PAUSES_IN_DOUBT
             return self._pause(at, delay_s, learn=not matches)
         if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:

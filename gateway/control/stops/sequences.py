@@ -35,7 +35,7 @@ class Gate(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a sequence. `after_s` is the minimum time since the previous frame was written."""
+    """One frame of a sequence. `after_s`: the minimum time since the previous frame was written, or the try began."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
@@ -135,8 +135,17 @@ BOTH_MANUAL: Final = StopSequence(
 # it, so the frame that is judged is the last one.
 PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE),))
 
-# Tests whether the link loses reports when it is written to: this frame does not block.
-CONTROL: Final = StopSequence("control", 3, (Step(STOP_FRAME, Gate.FLIGHT),))
+CONTROL_SHARE: Final = 0.35
+"""Part of an interval after which the control is written."""
+
+
+def control(interval_s: float) -> StopSequence:
+    """Return the test whether the link loses reports when it is written to: this frame does not block.
+
+    It comes later after a report than the `MODE00` that it controls. A mute time that hid a report from then until the
+    next one is due hides that one, too, however the intervals spread.
+    """
+    return StopSequence("control", 3, (Step(STOP_FRAME, Gate.FLIGHT, after_s=CONTROL_SHARE * interval_s),))
 
 
 def clearing(color: ColorLed) -> StopSequence:

@@ -170,7 +170,7 @@ class StopInProgress:
     def due_at(self, pacing: Pacing) -> float:
         """Return when the next step is due."""
         step = self.sequence.steps[self.index]
-        due = self.try_at if self.index == 0 else self.last_at + step.after_s
+        due = (self.try_at if self.index == 0 else self.last_at) + step.after_s
         self.due = max(due, pacing.ready_at(step.gate), pacing.named_at(step.frame))
         return self.due
 
