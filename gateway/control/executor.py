@@ -25,6 +25,9 @@ from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 
+NO_REPEAT_S: Final = 2 * FLIGHT_S
+"""Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends
+one meanwhile loses the stop behind the repeated motion."""
 LATE_DRIVE_S: Final = 0.1
 """Report that a drive has waited if its frame goes out later than this."""
 
@@ -133,7 +136,7 @@ class Executor:
                 return self._write(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
             return None
-        if model.believed.repeat and now >= model.pacing.repeat_at:
+        if self._repeats(now) and now >= model.pacing.repeat_at:
             return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
         return self._renew_stop(now)
 
@@ -187,6 +190,11 @@ class Executor:
         newer = change if change is not None and change.received_at >= running.began_at else None
         before = any(mode is not None and pending.received_at <= mode.received_at for mode in (running.before, newer))
         return pending.received_at >= running.began_at or before
+
+    def _repeats(self, at: float) -> bool:
+        """Return True if the motion is repeated then: it changed, and its drive does not end just after."""
+        held = self.queue.held
+        return self.model.believed.repeat and (held is None or held.ends_at - at > NO_REPEAT_S)
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
         """Repeat the stop of a car at rest that has not shown it: its frames may have been lost."""
@@ -400,7 +408,7 @@ class Executor:
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
-        if model.believed.repeat and stopped:
+        if stopped and self._repeats(model.pacing.repeat_at):
             times.append(max(model.pacing.repeat_at, model.left_until))
         if model.at_rest and not model.trust.shown and stopped and queue.mode_change is None:
             times.append(max(self.stops.renewal.due_at, model.ready_at))

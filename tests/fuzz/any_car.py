@@ -210,9 +210,12 @@ class UseEpisode:
         pair = self.pair
         answer = pair.ask(Stop(), verb="stop")
         self.use.commands.append(f"{pair.now:.2f} stop")
-        self._run(answer.worst_case_s + SHARP_S)
+        # Without an echo no report shows by how much longer this car blocks than expected.
+        unlearned_s = max(0.0, self.car.traits.close_s - pair.control.model.evidence.close_s)
+        within_s = answer.worst_case_s + unlearned_s + SHARP_S
+        self._run(within_s)
         if self._is_right and (pair.car.truth.driving or pair.car.truth.mode is not Mode.MANUAL):
-            self._violate(f"(2) drives {answer.worst_case_s + SHARP_S:.2f} s after a stop")
+            self._violate(f"(2) drives {within_s:.2f} s after a stop")
 
     def _run(self, seconds: float) -> None:
         """Let time pass, and judge the claims."""
