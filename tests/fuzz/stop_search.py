@@ -17,7 +17,7 @@ from typing import Any
 
 from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.estimate.learned import Shows
+from gateway.control.estimate.learned import KEPT_INTERVALS, Learned, Shows
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import CarTrust
 from gateway.control.events import CommandRecord
@@ -45,6 +45,8 @@ in transit."""
 READY_S = 25.0
 """Maximum time until the rest of a car is claimed, on a whole link. Of slow cars, and of such whose program blocks for
 another time than the vendor's, it takes longer to learn what they can show."""
+KEPT_SHARE = 0.25
+"""Share of the episodes in which the gateway knows the car from before."""
 EARLY_S = 3.0
 """Time before the request of a mode in which the link may already fail."""
 
@@ -135,6 +137,8 @@ class EpisodePlan:
     """True if the car drives when the mode is requested."""
     rest_s: float = 0.0
     """Additional rest before the load. A mode then opens at any moment between two reports, not only after one."""
+    kept: bool = False
+    """True if the gateway knows the car from an earlier session with an echo."""
 
 
 @dataclass(slots=True)
@@ -158,10 +162,27 @@ def draw(seed: int) -> EpisodePlan:
     """
     moments = random.Random(f"episode {seed}")
     plan = _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
+    plan = replace(plan, kept=random.Random(f"kept {seed}").random() < KEPT_SHARE)
     if seed // 2 % 2 == seed // 2 // len(THEMES) % 2:
         return plan
     car = draw_car(random.Random(f"car {seed}"), modes=plan.load in _MODE_WORDS)
     return replace(plan, platform=car.platform, told=car.told, traits=car.traits)
+
+
+def learned_of(traits: CarTraits, moments: random.Random) -> Learned:
+    """Return what a gateway keeps of an arduino car with these traits that stood before an echo."""
+    reacts = not traits.timer and traits.close_s > 0.0
+    spread_s = traits.spread_s
+    return Learned.restore(
+        {
+            "echo_s": [traits.interval_s + moments.uniform(-spread_s, spread_s) for _ in range(KEPT_INTERVALS)],
+            "no_echo_s": [],
+            "shows": "yes" if reacts else "no",
+            "doubted": False,
+            "reporting": ["manual"],
+            "blocks_s": {"mode_close": traits.close_s} if reacts else {},
+        }
+    )
 
 
 def _theme(seed: int, load: str, load_s: float, faults: tuple[LinkFault, ...], **more: Any) -> EpisodePlan:
@@ -469,7 +490,9 @@ class Episode:
             name="red",
             traits=plan.traits if plan.platform == "arduino" else None,
         )
-        self.control = Controller("red", parse_platform(plan.told))
+        is_known = plan.kept and plan.platform == "arduino" and plan.traits.readings
+        learned = learned_of(plan.traits, random.Random(f"learned {plan.seed}")) if is_known else None
+        self.control = Controller("red", parse_platform(plan.told), learned=learned)
         self.decoder = Decoder()
         self.now = 0.0
         self.zero = float("inf")

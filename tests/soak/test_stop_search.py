@@ -13,10 +13,6 @@ from tests.fuzz.stop_search import explain, found_at, search
 FIRST, BEHIND = (int(seed) for seed in os.environ.get("STOP_SEARCH", "1000:31000").split(":"))
 WITHIN = 1200
 """Maximum number of episodes until the search finds the fault that a rule prevents."""
-UNFOUND = {"a silent mode shows that it was left only if it was opened from a shown rest"}
-NOT_FOUND = pytest.mark.xfail(
-    strict=True, reason="not found in 13,200 episodes: the rule is redundant now, or the search is blind to it"
-)
 RARE = {"one pause is not enough": 14_000}
 """First seed for a rule whose fault is rare: since a pause is compared with the car's own block, one in 15,000."""
 
@@ -30,7 +26,7 @@ def test_thirty_thousand_episodes() -> None:
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("rule", [pytest.param(rule, marks=[NOT_FOUND] if rule in UNFOUND else []) for rule in RULES])
+@pytest.mark.parametrize("rule", RULES)
 def test_the_search_finds_what_each_rule_prevents(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     RULES[rule](monkeypatch.setattr)
     first = RARE.get(rule, 0)
