@@ -154,8 +154,9 @@ class CarMonitor:
         if not may_replace and not self._executor.accepts_commands(now):
             return
         model.treat_as(model.platform.profile)
-        words = f"{model.name} is a {model.profile.name} car: {model.platform.evidence[0]}"
-        self._log.log(Level.INFO, "platform_settled", words, now)
+        words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
+        if model.platform.auto:  # a named one was corrected, and its contradiction says so
+            self._log.log(Level.INFO, "platform_settled", words, now)
         if model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
             # It can show its stop, and half a named frame may lie in its buffer.
             if model.known:

@@ -80,6 +80,8 @@ class PlatformDetector:
     _readings: int = 0
     _assumed_silent: bool = False
     """True if the option `no_readings` of the profile comes from the silence of this link."""
+    _is_heard: bool = False
+    """True if readings have contradicted that option."""
     _head: str = ""
     _heads: int = 0
     """The first word of the last sensors frames if it is none of this profile, and their number."""
@@ -135,7 +137,8 @@ class PlatformDetector:
                 return ()
         match event:
             case Sensors():
-                self._end_silence()
+                if not self.profile.has_readings:
+                    return self._count_reading()
                 self._open_mode.update(shown=Mode.MANUAL not in candidate_modes(event))
                 new = self._check_profile(event)
                 if self.auto:
@@ -166,11 +169,19 @@ class PlatformDetector:
         self._assumed_silent = True
         return f"no readings, which {named} cars send. It is treated as {self.profile.name} until one arrives"
 
-    def _end_silence(self) -> None:
-        """Return to the profile before `on_never_heard`: a reading has arrived."""
-        if self._assumed_silent:
-            self._assumed_silent = False
-            self.profile = _profile_of(self.profile.kind, self.profile.options - {NO_READINGS})
+    def _count_reading(self) -> tuple[str, ...]:
+        """Count one reading of a car that counts as one without any. It counts as one with readings from the third on.
+
+        If only its silence had made it one, the first reading ends that.
+        """
+        self._frames[NO_READINGS] = self._frames.get(NO_READINGS, 0) + 1
+        if not self._assumed_silent and self._frames[NO_READINGS] < EVIDENCE_FRAMES:
+            return ()
+        named, was_named = self.profile.name, not self._assumed_silent
+        self._assumed_silent, self._is_heard = False, True
+        self.profile = _profile_of(self.profile.kind, self.profile.options - {NO_READINGS})
+        words = f"readings, which {named} cars do not send. It is treated as {self.profile.name}"
+        return (words,) if was_named and self.note(words) else ()
 
     def note(self, words: str) -> bool:
         """Add a contradiction that other evidence has shown. Return True if it is new."""
@@ -267,7 +278,8 @@ class PlatformDetector:
             kind = modes if self._with_modes else Platform.RASPBERRY_PI
         knows_head = any(each.startswith(HEAD) for each in self._options)
         configured = self.configured.options
-        profile = _profile_of(kind, self._options | (_without_head(configured) if knows_head else configured))
+        options = self._options | (_without_head(configured) if knows_head else configured)
+        profile = _profile_of(kind, options - {NO_READINGS} if self._is_heard else options)
         if profile.name != self.profile.name:
             self.profile = profile
             self._against.clear()

@@ -10,6 +10,7 @@ from gateway.control.commands import Drive, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import REACTED, Learned, Shows
 from gateway.protocol.enums import Motion
+from gateway.protocol.platform_name import parse_option
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
 from tests.support.virtual import Pair
@@ -167,3 +168,25 @@ def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
     pair.run(10.0)
     assert pair.control.model.profile.name == "raspberry_pi"
     assert not pair.control.model.platform.doubted
+
+
+@pytest.mark.parametrize(
+    ("platform", "told", "counts_as"),
+    [
+        ("arduino", "arduino+no_readings", "arduino"),
+        ("raspberry_pi", "raspberry_pi+no_readings", "raspberry_pi"),
+        ("arduino", "auto+no_readings", "arduino"),
+    ],
+)
+def test_readings_end_the_option_that_there_are_none(platform: str, told: str, counts_as: str) -> None:
+    pair = Pair(platform, told=counts_as, start_s=2.0)
+    name, auto = parse_option(told)
+    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.connect()
+    pair.run(30.0)
+    model = pair.control.model
+    assert (model.profile.name, model.platform.doubted) == (counts_as, False)
+    assert bool(model.platform.contradictions) is not auto
+    assert model.shows_stops[0] is (Shows.NO if platform == "raspberry_pi" else Shows.YES)
+    if platform == "raspberry_pi":
+        assert not any(b"MODE" in data for _, data in pair.sent), "it would end some programs"
