@@ -15,6 +15,8 @@ from schemas.commands import STOPS
 
 ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
+WAIT_SAID_S: Final = 1.0
+"""Time after which it is said that a command waits for a busy car."""
 _MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 
@@ -79,6 +81,8 @@ class PendingCommand:
         self._asked_at = time.monotonic()
         self._late_at: float | None = self._asked_at + ANSWER_TIMEOUT_S
         """Time of the warning about missing answers. None after the warning."""
+        self._waits_said: set[str] = set()
+        """Cars of which it was said that the command waits for them."""
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
             self._of(car)
@@ -103,6 +107,9 @@ class PendingCommand:
             if self._late_at is not None and now >= self._late_at:
                 self._late_at = None
                 self._warn_of_missing_answers(waiting)
+            waits_at = self._asked_at + WAIT_SAID_S
+            if now >= waits_at:
+                self._say_waits(waiting)
             for progress in waiting:
                 if now >= progress.deadline and self._hubs() != self._hubs_then:
                     progress.on_presence(now, alive=True)  # the hub was lost, not the gateway
@@ -110,6 +117,7 @@ class PendingCommand:
                     progress.give_up(now)
             until = min((each.deadline for each in waiting), default=now + ANSWER_TIMEOUT_S)
             until = until if self._late_at is None else min(until, self._late_at)
+            until = until if now >= waits_at else min(until, waits_at)
             try:
                 at, item = self.inbox.get(timeout=max(0.0, until - now))
             except queue.Empty:
@@ -123,6 +131,12 @@ class PendingCommand:
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
             log.warning("%s: no answer yet, still waiting. Computer or gateway may be overloaded.", ", ".join(late))
+
+    def _say_waits(self, waiting: list[Progress]) -> None:
+        for progress in waiting:
+            if progress.waits and progress.car not in self._waits_said:
+                self._waits_said.add(progress.car)
+                log.warning("%s: %s", progress.car, progress.waits)
 
     def _take(self, item: Any, at: float) -> None:
         if item is CLOSED:

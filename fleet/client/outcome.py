@@ -126,6 +126,8 @@ class Progress:
         self._timeout_from = asked_at
         self._worst_case_s = 0.0
         self._queued = False
+        self.waits = ""
+        """Why the command waits for its car, and how long at most, as the gateway said; empty once its frame is out."""
         self._sent_event = False
         self._gone_at: float | None = None
         self._is_supervised = False
@@ -259,6 +261,10 @@ class Progress:
             self._timeout_from = at
         self._last_event_at = at
         self._queued = self._queued or phase == QUEUED
+        if phase == QUEUED and not self._sent_event:
+            self.waits = words or self.waits
+        elif phase != "asked":
+            self.waits = ""
         if self._phase not in (SENT, COMPLETE) or phase not in ("asked", QUEUED):
             self._phase = phase
         if phase in _FAILED_PHASES:

@@ -1,12 +1,17 @@
 """The outcome of a command, by its answer and events in any order."""
 
+import time
 from collections.abc import Callable
 
 import pytest
 
+from fleet.client import command_tracker
+from fleet.client.command_tracker import PendingCommand, QueryEnded
+from fleet.client.commands import mode_request
 from fleet.client.effects import EFFECTS, STOP_VERBS
 from fleet.client.outcome import COMMAND_QUEUE_TIMEOUT_S, STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
+from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.message_length import MAX_LINES, count_lines
 
 # Each step: ("answer" | "event", phase, worst case), at 1, 2, 3 ... s after the request at 100.
@@ -203,6 +208,29 @@ def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str,
         progress.on_answer(phase, reason, words, 0.0, 101.0)
     assert str(progress.outcome) == f"red: {text}"
     assert count_lines(str(progress.outcome)) <= MAX_LINES
+
+
+def test_why_a_command_waits_is_known_until_its_frame_is_out() -> None:
+    progress = Progress("red", Until.SENT, 100.0, verb="mode")
+    progress.on_event("asked", "", "", 0.0, 100.1)
+    progress.on_event("queued", "", "opens in 3.6 s at most", 0.0, 100.1)
+    progress.on_answer("queued", "", "", 0.0, 100.2)
+    assert progress.waits == "opens in 3.6 s at most"
+    progress.on_event("sent", "", "", 0.0, 103.0)
+    assert progress.waits == ""
+
+
+def test_a_person_is_told_once_what_a_command_waits_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(command_tracker, "WAIT_SAID_S", 0.0)
+    pending = PendingCommand("it", mode_request("tracking"), ["red"], ["red"], tuple, lambda car: None)
+    for phase, words in (("queued", "opens later"), ("queued", "opens later"), ("sent", "")):
+        event = pb.CommandEvent(car="red", phase=phase, words=words)
+        pending.inbox.put((time.monotonic(), event))
+    pending.inbox.put((time.monotonic(), QueryEnded("red", "")))
+    pending.wait()
+    assert [record.getMessage() for record in caplog.records] == ["red: opens later"]
 
 
 def test_each_verb_has_a_text() -> None:
