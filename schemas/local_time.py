@@ -18,6 +18,11 @@ def date_and_clock(at_s: float) -> str:
     return _local(at_s).strftime("%Y-%m-%d %H:%M:%S %Z") if _is_date(at_s) else f"{at_s:.0f} s"
 
 
+def date(at_s: float, days_before: int = 0) -> str:
+    """Return the local date, such as `2026-11-25`, of so many days before a time."""
+    return (_local(at_s) - timedelta(days=days_before)).strftime("%Y-%m-%d")
+
+
 def exact(at_ns: int) -> str:
     """Return a date and a time with milliseconds, `2026-11-25 14:05:12.345 CET`. at_ns: ns since the epoch."""
     if not _is_date(at_ns / _NS):
@@ -44,15 +49,15 @@ def with_offset(at_ns: int) -> str:
     return _local(seconds).replace(microsecond=rest // 1000).isoformat(timespec="milliseconds")
 
 
-def clock_times(text: str, start_ns: int, end_ns: int) -> tuple[int, int] | None:
-    """Return when a local time of day (`14:05`, `14:05:12`) begins and ends, on a day from `start_ns` to `end_ns`.
+def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
+    """Return when a local time of day (`14:05`, `14:05:12`) begins on each day from `start_ns` to `end_ns`.
 
-    The first such day counts, or else the day of `start_ns`. None if the text is no time of day.
+    Only those that are not over at `start_ns` and begin by `end_ns`. None if the text is no time of day.
     """
     found = _CLOCK.fullmatch(text)
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3] or 0) > 59:
         return None
-    length_ns = (1 if found[3] else 60) * _NS
+    length_ns = clock_length_ns(text)
     first = _local(start_ns / _NS).replace(
         hour=int(found[1]), minute=int(found[2]), second=int(found[3] or 0), microsecond=0, tzinfo=None
     )
@@ -60,8 +65,12 @@ def clock_times(text: str, start_ns: int, end_ns: int) -> tuple[int, int] | None
         round((first + timedelta(days=day)).timestamp()) * _NS
         for day in range((end_ns - start_ns) // (86_400 * _NS) + 2)
     ]
-    begin_ns = next((each for each in days if each + length_ns > start_ns and each <= end_ns), days[0])
-    return begin_ns, begin_ns + length_ns
+    return [each for each in days if each + length_ns > start_ns and each <= end_ns]
+
+
+def clock_length_ns(text: str) -> int:
+    """Return how long a time as people type it lasts: a minute without seconds (`14:05`), else a second, ns."""
+    return (60 if text.count(":") == 1 else 1) * _NS
 
 
 def _local(at_s: float) -> datetime:

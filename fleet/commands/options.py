@@ -22,7 +22,10 @@ from schemas.bus import BadEndpoint, BusError
 _Function = Callable[..., Any]
 
 from_option = click.option(
-    "--from", "start", metavar="TIME", help="Begin here: 90s or 1m30s after the start, -60s before the end, or a date."
+    "--from",
+    "start",
+    metavar="TIME",
+    help="Begin here: 90s after the start, -5m before the end, a local time (14:05), or a date.",
 )
 to_option = click.option("--to", "end", metavar="TIME", help="End before this time, written as for --from.")
 json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object per line.")

@@ -12,6 +12,7 @@ import click
 from fleet.commands.group import connect_option
 from fleet.commands.options import cli_errors, from_option, to_option
 from fleet.commands.params import Duration, Number, car_option, session_argument
+from fleet.recording import time_spec
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.selection import Selection
 from schemas import keys
@@ -70,7 +71,6 @@ def play(
     No car moves: a replayed fleet takes no commands.
     """
     from fleet.commands.sessions import part_of
-    from fleet.recording import time_spec
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session
     from fleet.replay.player.player import LOOP_PAUSE_NS, NameTaken, Player
@@ -160,10 +160,8 @@ def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule:
 
 
 def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
-    from fleet.recording import time_spec
-
     try:
-        return time_spec.at_ns(text, start_ns, end_ns)
+        return time_spec.at_ns(text, start_ns, end_ns, time.time())
     except ValueError as error:
         raise click.UsageError(f"{option}: {error}") from None
 

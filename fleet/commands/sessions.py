@@ -1,6 +1,7 @@
 """`fleet sessions`: lists, verifies, recovers, cuts and exports recordings."""
 
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,10 @@ from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import echo_safely, progress_bar
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
+from fleet.recording import time_spec
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
-from schemas.local_time import of_iso, with_offset
+from schemas.local_time import date_and_clock, of_iso, with_offset
 from schemas.printable import printable
 
 if TYPE_CHECKING:
@@ -97,7 +99,33 @@ def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions in DIR (default: sessions): state, length, size, lost messages, marks and cars."""
+    """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, marks and cars."""
+    _show(_summaries(directory), as_json=as_json)
+
+
+@sessions.command(
+    epilog="\b\nexamples:\n  fleet sessions at 14:05\n  fleet sessions at 'yesterday 14:05' /media/disk/sessions\n"
+)
+@click.argument("time_text", metavar="TIME")
+@click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
+@json_option
+def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
+    """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date.
+
+    The exit code is 1 if there is none.
+    """
+    now_s = time.time()
+    try:
+        ran = [one for one in _summaries(directory) if time_spec.is_within(time_text, one.start_ns, one.end_ns, now_s)]
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    if not ran:
+        raise click.ClickException(f"No session ran at {time_text}. `fleet sessions` lists all, with their start.")
+    _show(ran, as_json=as_json)
+    click.echo(f"Open one there: `fleet replay {ran[-1].name} --from '{time_text}'`", err=True)
+
+
+def _summaries(directory: Path | None) -> list["SessionSummary"]:
     from fleet.recording.tools.summary import overviews
 
     place = directory or sessions_place()
@@ -106,14 +134,19 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     except OSError as error:
         why = f"{place} cannot be listed: {error.strerror}." if place.exists() else f"There is no directory {place}."
         raise click.ClickException(f"{why} `fleet sessions` without a name lists those here.") from None
+    if not found:
+        click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
+    return found
+
+
+def _show(found: list["SessionSummary"], *, as_json: bool) -> None:
     if as_json:
         for one in found:
             click.echo(json.dumps(one.to_dict()))
         return
     if not found:
-        click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
         return
-    rows = [("session", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
+    rows = [("session", "start", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -123,12 +156,11 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
 
 
 def _row(one: "SessionSummary") -> tuple[str, ...]:
-    from fleet.recording import time_spec
-
     cars = ",".join(map(printable, one.cars[:5])) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
     marks = str(len(one.marks)) + (" kept" if one.kept else "")
     length = time_spec.words(one.length_s)
-    return one.name, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), marks, cars
+    start = date_and_clock(one.start_ns / 1e9) if one.messages else "-"
+    return one.name, start, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), marks, cars
 
 
 def _size(count: int) -> str:
@@ -173,8 +205,6 @@ def info(session: Path, *, as_json: bool) -> None:
 
 
 def _say_contents(about: "SessionSummary") -> None:
-    from fleet.recording import time_spec
-
     size = f"{about.messages} messages, {_size(about.bytes)}"
     began = of_iso(about.started) or "an unknown time"
     click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
@@ -262,7 +292,6 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
 
 def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
     """Return the selected part of a session. Raises UsageError for a car or time that is not in the session."""
-    from fleet.recording import time_spec
     from fleet.recording.selection import Selection
     from fleet.recording.tools.summary import of_session
 
@@ -272,9 +301,10 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
             f"--car: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
         )
     bounds: list[int | None] = []
+    now_s = time.time()
     for name, text in (("--from", start), ("--to", end)):
         try:
-            bounds.append(None if text is None else time_spec.at_ns(text, about.start_ns, about.end_ns))
+            bounds.append(None if text is None else time_spec.at_ns(text, about.start_ns, about.end_ns, now_s))
         except ValueError as error:
             raise click.UsageError(f"{name}: {error}") from None
     selection = Selection(None, *bounds)

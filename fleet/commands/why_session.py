@@ -1,6 +1,7 @@
 """`fleet why CAR --session S --at TIME`: what happened to a car around a time of a recording."""
 
 import json
+import time
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +23,7 @@ from fleet.recording.tools.car_timeline import (
 )
 from fleet.recording.tools.summary import of_session
 from schemas import keys
-from schemas.local_time import clock_times, date_and_clock
+from schemas.local_time import date_and_clock
 from schemas.suggestion import did_you_mean
 
 MAX_TIMELINE_LINES: Final = 60
@@ -36,7 +37,10 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
     except NoSession as error:
         raise click.ClickException(str(error)) from None
     summary = of_session(session)
-    begin_ns, end_ns = _times(at, summary.start_ns, summary.end_ns)
+    try:
+        begin_ns, end_ns = time_spec.span_ns(at, summary.start_ns, summary.end_ns, time.time())
+    except ValueError as error:
+        raise click.UsageError(f"--at: {error}") from None
     span = f"{date_and_clock(summary.start_ns / 1e9)} to {date_and_clock(summary.end_ns / 1e9)}"
     if end_ns <= summary.start_ns or begin_ns > summary.end_ns:
         raise click.ClickException(f"{at} is not in {session.name}: it is from {span}.")
@@ -68,11 +72,3 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         echo_safely(f"  {entry}")
     if len(timeline.entries) > MAX_TIMELINE_LINES:
         click.echo(f"  and {len(timeline.entries) - MAX_TIMELINE_LINES} more: --json lists all")
-
-
-def _times(at: str, start_ns: int, end_ns: int) -> tuple[int, int]:
-    found = clock_times(at, start_ns, end_ns)
-    if found is not None:
-        return found
-    at_ns = time_spec.at_ns(at, start_ns, end_ns)
-    return at_ns, at_ns + 1_000_000_000

@@ -22,7 +22,7 @@ def test_an_exact_time_is_local_and_can_be_typed_again(where: str, date: str, of
     with zone(where):
         assert local_time.exact(AT_NS) == date
         assert local_time.with_offset(AT_NS) == offset
-        assert time_spec.at_ns(local_time.with_offset(AT_NS), 0, 0) == AT_NS // 1_000_000 * 1_000_000
+        assert time_spec.at_ns(local_time.with_offset(AT_NS), 0, 0, 0.0) == AT_NS // 1_000_000 * 1_000_000
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-03-14T15:16:17"])

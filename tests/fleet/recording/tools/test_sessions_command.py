@@ -76,8 +76,14 @@ def test_the_list_says_how_each_is(session: Path) -> None:
     listed = fleet(root)
     assert {line.partition(": ")[0] for line in listed.stderr.splitlines()} == {"cut", "damaged", "newer"}
     lines = listed.stdout.splitlines()
-    assert lines[0].split() == ["session", "state", "length", "size", "messages", "lost", "marks", "cars"]
+    assert lines[0].split() == ["session", "start", "state", "length", "size", "messages", "lost", "marks", "cars"]
     assert len(lines) == 6
+    then = of_iso("2026-09-21T14:13:20Z").split()[1]
+    ran = {json.loads(line)["name"] for line in fleet("at", then, root, "--json").stdout.splitlines()}
+    assert ran == {name for name, one in found.items() if one["messages"]}
+    never = fleet("at", "2020-01-01 12:00", root)
+    assert (never.returncode, never.stdout) == (1, "")
+    assert fleet("at", "90s", root).returncode == 2
     nothing = fleet(cwd=root.parent)
     assert (nothing.returncode, nothing.stdout) == (0, "")
     assert "No recordings here yet (in sessions)." in nothing.stderr

@@ -7,7 +7,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.recording.tools.stop_findings import StopFindings
-from schemas import local_time
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.zones import zone
 
@@ -75,17 +74,3 @@ def test_a_stop_that_ended_as_sent_is_no_finding() -> None:
     found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="sent", basis="sent"))
     found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="complete", basis="shown"))
     assert found.stops == []
-
-
-@pytest.mark.parametrize(
-    ("text", "begins", "length_s"),
-    [("13:05", NOON + 300, 60), ("13:05:10", NOON + 310, 1), ("12:59", NOON - 60, 60), ("0:30", NOON + 41_400, 60)],
-)
-def test_a_time_of_day_is_local_and_within_the_session(text: str, begins: int, length_s: int) -> None:
-    found = local_time.clock_times(text, NOON * 10**9, (NOON + 43_200) * 10**9)
-    assert found == (begins * 10**9, (begins + length_s) * 10**9)
-
-
-@pytest.mark.parametrize("text", ["90s", "25:00", "1m30s", "12:60"])
-def test_other_texts_are_no_time_of_day(text: str) -> None:
-    assert local_time.clock_times(text, NOON * 10**9, (NOON + 60) * 10**9) is None
