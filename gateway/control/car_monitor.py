@@ -208,7 +208,8 @@ class CarMonitor:
         silent_s = model.mode.unheard_s(now)
         if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
             return
-        if model.mode.heard_at < model.link_since and (found := model.platform.on_never_heard()):
+        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting  # now, or by an earlier gateway
+        if not was_heard and (found := model.platform.on_never_heard()):
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {found}", now)
             model.treat_as(model.platform.profile)
             self._stops.change_case()

@@ -168,6 +168,12 @@ def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
     pair.run(10.0)
     assert pair.control.model.profile.name == "raspberry_pi"
     assert not pair.control.model.platform.doubted
+    pair.lose()
+    pair.decoder.feed = lambda *_: []  # type: ignore[method-assign]
+    pair.control.link_up(pair.now)
+    pair.run(20.0)
+    assert pair.control.model.profile.name == "raspberry_pi", "it reported before: its silence is odd"
+    assert not pair.control.model.is_heard
 
 
 @pytest.mark.parametrize(
