@@ -5,6 +5,7 @@ import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from typing import Any, Final
 
 from fleet.client.commands import CommandRequest
@@ -123,6 +124,11 @@ class PendingCommand:
             except queue.Empty:
                 continue
             self._take(item, at)
+
+    def abandon(self) -> None:
+        """Let `wait` return at once: nobody needs the outcome any more. What was sent is carried out."""
+        with suppress(queue.Full):
+            self.inbox.put_nowait((time.monotonic(), CLOSED))
 
     def concerns(self, car: str) -> bool:
         """Return True if the command is, or may be, for this car. May run on any thread."""

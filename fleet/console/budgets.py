@@ -20,6 +20,11 @@ PERSON_RATE: Final = 320.0
 REQUEST_BURST: Final = 1000.0
 REQUEST_RATE: Final = 50.0
 """HTTP requests of one person other than STOP: a page loads some 25 files."""
+CHECK_BURST: Final = 20.0
+CHECK_RATE: Final = 1.0
+"""Checks of plans of one person: a person who writes one asks for one in ten seconds."""
+MAX_OPEN_CHECKS: Final = 2
+"""Maximum number of checks of one person that wait. Others wait for those of each person before them."""
 COOLDOWN_S: Final = 15.0
 """Time for which a person whose page was closed opens no other one."""
 MAX_OPEN_COMMANDS: Final = 16
@@ -29,6 +34,8 @@ MAX_PERSONS: Final = 256
 MERGE_S: Final = 0.1
 """Time for which further STOPs of one person are merged into one that follows."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
+
+TOO_MANY_PLANS: Final = "Too many plans of this person wait for a check. Try again in a few seconds."
 
 
 @dataclass(slots=True)
@@ -63,6 +70,7 @@ def page_budget(now: float) -> Allowance:
 class _PersonBudget:
     messages: Allowance
     requests: Allowance
+    checks: Allowance
     closed_until: float = float("-inf")
 
 
@@ -88,11 +96,17 @@ class Budgets:
         """Count an HTTP request. Return False if there were too many."""
         return self._of(person, now).requests.take(now)
 
+    def may_check(self, person: Hashable, now: float) -> bool:
+        """Count a check of a plan. Return False if there were too many."""
+        return self._of(person, now).checks.take(now)
+
     def _of(self, person: Hashable, now: float) -> _PersonBudget:
         found = self._persons.pop(person, None)
         if found is None:
             found = _PersonBudget(
-                Allowance(PERSON_BURST, PERSON_RATE, at=now), Allowance(REQUEST_BURST, REQUEST_RATE, at=now)
+                Allowance(PERSON_BURST, PERSON_RATE, at=now),
+                Allowance(REQUEST_BURST, REQUEST_RATE, at=now),
+                Allowance(CHECK_BURST, CHECK_RATE, at=now),
             )
         self._persons[person] = found
         if len(self._persons) > MAX_PERSONS:

@@ -26,6 +26,7 @@ from fleet.console.operators import Operators
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
 from fleet.console.permissions import management_refusal, rights_of
+from fleet.console.plan_checks import PlanChecks
 from fleet.console.plan_process import PlanProcess
 from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
@@ -58,6 +59,8 @@ _MAX_MERGES: Final = 256
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
 
+OnOutcomes = Callable[[list[dict[str, Any]]], object]
+
 log = logging.getLogger("fleet")
 
 
@@ -84,11 +87,14 @@ class Console:
         """The course of the last STOP."""
         self.budgets = Budgets()
         self._merges: dict[tuple[str, ...], StopMerge] = {}
+        self._waiting_stops: dict[tuple[str, str], list[tuple[tuple[str, ...], OnOutcomes]]] = {}
+        """The cars of stops of some cars that are merged, by sender and verb, with what answers each stop."""
         self._bad_messages = LogLimit()
         self._stop_ids: dict[str, None] = {}
         self._stops = 0
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
+        self.plan_checks = PlanChecks()
         self._plan_process = PlanProcess(fleet, file)
         self._coordinators: set[str] = set()
         """Tokens of the coordinator."""
@@ -327,12 +333,13 @@ class Console:
                 log.warning("%s", shown)
             page.answer(t="bad", words=str(error))
 
-    async def set_plan(self, text: str, sender: str) -> tuple[bool, str]:
-        """Put a plan in force under this name. Return whether it is, and words, or the faults, one per line.
+    async def set_plan(self, text: str, person: PagePerson | None) -> tuple[bool, str]:
+        """Put a plan in force for this person. Return whether it is, and words, or the faults, one per line.
 
-        If no plan runs, the console starts a coordinator.
+        If no plan runs, the console starts a coordinator. Raises TooManyChecks.
         """
-        ok, words = await self.operator.check_plan(text)
+        sender = self.sender_of(person)
+        ok, words = await self.plan_checks.check(text, person and person.name)
         if not ok:
             return ok, words
         ask = partial(self.operator.ask_coordinator, "plan", text, sender)
@@ -376,6 +383,17 @@ class Console:
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
         self._report = StopReport(self._stops, request.verb, sender, present, now, at_ms)
         operator.stop(request, self._report)
+
+    def _stop_cars(self, operator: ConsoleOperator, request: CommandRequest, who: tuple[str, str]) -> None:
+        """Send one stop for all cars whose stops wait, and answer each with the outcomes of its own cars."""
+        if not (waiting := self._waiting_stops.pop(who, [])):
+            return  # the merge was forgotten, and an earlier call has sent these
+
+        def answer_all(outcomes: list[dict[str, Any]]) -> None:
+            for cars, answer in waiting:
+                answer([outcome for outcome in outcomes if outcome["car"] in cars])
+
+        operator.command(request, sorted({car for cars, _ in waiting for car in cars}), answer_all)
 
     def _on_message(self, page: PageLink, message: PageMessage) -> None:
         now = time.monotonic()
@@ -425,13 +443,14 @@ class Console:
                 request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
                 if request.verb in (*STOPS, "mode"):
                     self._stop_presses(set(cars), "The car was stopped.")
-                send = partial(page.operator.command, request, cars, answer)
                 if request.verb in STOPS:
-                    self._merged((page.operator.sender, request.verb, *cars), send)
+                    who = (page.operator.sender, request.verb)
+                    self._waiting_stops.setdefault(who, []).append((cars, answer))
+                    self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
                 elif page.operator.is_busy:
                     raise BadPageMessage(f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them.")
                 else:
-                    send()
+                    page.operator.command(request, cars, answer)
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
 
@@ -471,5 +490,6 @@ class Console:
         for press in self._presses.alive:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
+        await self.plan_checks.close()
         await self._plan_process.close()
         await self.sessions.close()

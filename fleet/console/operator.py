@@ -8,13 +8,13 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
 from fleet.console.budgets import MAX_OPEN_COMMANDS
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
-from fleet.policy.plan.parser import BadPlan, parse
 from schemas import keys, messages
 from schemas.bus import Failure
 from schemas.commands import COMMANDS
@@ -41,6 +41,8 @@ class ConsoleOperator:
         """The cars that a page has taken, and the page."""
         self._commands = 0
         """Number of commands without an outcome, apart from stops of all."""
+        self._stops: dict[tuple[str, str], PendingCommand] = {}
+        """The newest stop of all cars without an outcome, by sender and verb."""
         self._renewals: set[str] = set()
         """Cars whose lease is being renewed."""
 
@@ -105,7 +107,18 @@ class ConsoleOperator:
         self.spawn(self._stop(request, report))
 
     async def _stop(self, request: CommandRequest, report: StopReport) -> None:
-        outcomes = await self._fleet.ask(request)
+        command = self._fleet.sync.send(request)
+        # A person who stops again asks for the outcome of the newest stop, which concerns the same cars. A wait takes a
+        # thread, for as long as the slowest car needs to stand: ten stops a second would take 60 of them.
+        who = (report.sender, request.verb)
+        if (earlier := self._stops.get(who)) is not None:
+            earlier.abandon()
+        self._stops[who] = command
+        try:
+            outcomes = await self._fleet.outcomes(command)
+        finally:
+            if self._stops.get(who) is command:
+                del self._stops[who]
         report.on_outcomes(outcomes, time.monotonic())
 
     # ------------------------------------------------------------------ the rest
@@ -181,10 +194,6 @@ class ConsoleOperator:
             return None
         return not isinstance(answer, Failure) and answer.status == "sent", answer.words
 
-    async def check_plan(self, text: str) -> tuple[bool, str]:
-        """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""
-        return await self._fleet.call(_check_plan, text)
-
     def spawn(self, work: Any) -> None:
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""
         task = asyncio.ensure_future(work)
@@ -200,11 +209,3 @@ class ConsoleOperator:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             log.error("a command of the console failed: %s", error)
-
-
-def _check_plan(text: str) -> tuple[bool, str]:
-    try:
-        parse(text)
-    except BadPlan as error:
-        return False, str(error)
-    return True, ""

@@ -4,7 +4,7 @@ import asyncio
 from typing import Final
 
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 
 BODY_TIMEOUT_S: Final = 10.0
 """Timeout of a body, from its first wait on."""
@@ -12,6 +12,7 @@ BODY_TIMEOUT_S: Final = 10.0
 
 async def read_start(request: Request, size: int) -> bytes:
     """Return the first `size` bytes of the body. The rest is not read. Raises HTTPException if it does not come."""
+    # Half a request that ends is no error of the console. uvicorn would log each with a traceback.
     body = b""
     try:
         async with asyncio.timeout(BODY_TIMEOUT_S):
@@ -21,6 +22,8 @@ async def read_start(request: Request, size: int) -> bytes:
                     break
     except TimeoutError:
         raise HTTPException(408, "the body of the request did not come", {"connection": "close"}) from None
+    except ClientDisconnect:
+        raise HTTPException(400, "the request ended before its body") from None
     return body[:size]
 
 

@@ -12,11 +12,13 @@ from fleet.client import commands
 from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
 from gateway.protocol.enums import Light, Mode, Motion
 from schemas import keys
+from schemas.commands import STOPS
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum length of the reason of an e-stop."""
+_STOP_KINDS: Final = ("stop", "estop", "pause")
 _MAX_NUMBER: Final = 2**53
 MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
 
@@ -154,6 +156,15 @@ def _resume(message: PageMessage) -> commands.CommandRequest:
     if not isinstance(ids, list) or len(ids) > MAX_CARS or not all(isinstance(each, str) for each in ids):
         raise BadPageMessage("ids is not a list of ids")
     return commands.resume_request([each[:64] for each in ids])
+
+
+def is_stop(text: str) -> bool:
+    """Return True if a page's message stops cars, all or some."""
+    try:
+        message = PageMessage.of(text)
+        return message.kind in _STOP_KINDS or (message.kind == "do" and message.fields.get("verb") in STOPS)
+    except BadPageMessage:
+        return False
 
 
 _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]] = {

@@ -8,7 +8,6 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,12 +21,15 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleet.aio import Fleet
 from fleet.client.commands import stop_request
-from fleet.console.budgets import TOO_MUCH, page_budget
+from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
 from fleet.console.fair_socket import FairWebSocket
 from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
+from fleet.console.pairing import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
+from fleet.console.plan_checks import TooManyChecks
 from fleet.console.request_body import read_text
+from fleet.console.requests import is_stop
 from schemas.bus import LARGEST_PAYLOAD, BusError
 from schemas.process import signals
 
@@ -45,6 +47,10 @@ HELLO: Final = "fleet console"
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Room for what a message contains beside the text of a plan, bytes."""
+_LAST_READ_MESSAGES: Final = 10_000
+"""Messages of a page over its budget that may still stop cars: one read, 256 KiB, has 8,000 of the smallest."""
+_LAST_READ_S: Final = 2.0
+"""Timeout of these messages. Alone they take 0.4 s, beside other pages that flood some times that."""
 TRY_AGAIN_LATER: Final = 1013
 SENT_TOO_MUCH: Final = 4008
 """Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
@@ -175,13 +181,13 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:
-        return await _answer_plan(request, console.operator.check_plan)
+        return await _answer_plan(request, console, console.plan_checks.check)
 
     async def set_plan(request: Request) -> Response:
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
-        return await _answer_plan(request, partial(console.set_plan, sender=console.sender_of(person)))
+        return await _answer_plan(request, console, console.set_plan)
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
@@ -196,6 +202,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
                     text = await socket_.receive_text()
                     if not console.budgets.may_send(name, budget, time.monotonic()):
                         log.warning("a page of %s was closed: it sent too much", name or "this computer")
+                        await _carry_out_stops(socket_, text, on_text)
                         await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
                         return
                     on_text(text)
@@ -227,20 +234,35 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         if scope["type"] == "http" and scope["path"] != STOP_PATH:
             person = scope.get(PERSON)
             if not console.budgets.may_ask(person and person.name, time.monotonic()):
-                words = "This device asks for far more than a page does. Wait a few seconds."
-                await PlainTextResponse(words, 429, {"connection": "close"})(scope, receive, send)
+                await _too_much("This device asks for far more than a page does. Wait a few seconds.")(
+                    scope, receive, send
+                )
                 return
         await app(scope, receive, send)
 
     return limited
 
 
-async def _answer_plan(request: Request, ask: Callable[[str], Awaitable[tuple[bool, str]]]) -> Response:
+def _too_much(words: str) -> Response:
+    """Answer a request over its person's budget. The rest of it is not read."""
+    return JSONResponse({"ok": False, "words": words}, 429, {"connection": "close"})
+
+
+async def _answer_plan(
+    request: Request, console: Console, ask: Callable[[str, PagePerson | None], Awaitable[tuple[bool, str]]]
+) -> Response:
     """Answer a request with the text of a plan."""
+    person: PagePerson | None = request.scope.get(PERSON)
+    may_check = console.budgets.may_check(person and person.name, time.monotonic())
+    if not may_check or console.plan_checks.is_busy(person):
+        return _too_much(TOO_MANY_PLANS)
     text = await read_text(request, LARGEST_PAYLOAD - _PLAN_MESSAGE_ROOM)
     if text is None:
         return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
-    ok, words = await ask(text)
+    try:
+        ok, words = await ask(text, person)
+    except TooManyChecks:  # others of this person came while the body did
+        return _too_much(TOO_MANY_PLANS)
     return JSONResponse({"ok": ok, "words": words})
 
 
@@ -272,6 +294,17 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
     finally:
         console.remove_page(page)
         sending.cancel()
+
+
+async def _carry_out_stops(socket_: WebSocket, text: str, on_text: Callable[[str], None]) -> None:
+    """Carry out the stops among the messages that came with the one that was too much. All others are dropped."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_LAST_READ_S):
+            for _ in range(_LAST_READ_MESSAGES):
+                if is_stop(text):
+                    on_text(text)
+                await asyncio.sleep(0)
+                text = await socket_.receive_text()
 
 
 async def _close(socket_: WebSocket) -> None:

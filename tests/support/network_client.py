@@ -60,14 +60,14 @@ class NetworkDevice:
 
     def __init__(self, port: int, host: str = "127.0.0.1", source: str | None = None) -> None:
         self.host, self.port = host, port
-        self._source = None if source is None else (source, 0)
+        self.source = None if source is None else (source, 0)
         self.origin = f"https://{host}:{port}"
         self.cookie = ""
 
     def connection(self) -> http.client.HTTPSConnection:
         """Return a connection for several requests."""
         return http.client.HTTPSConnection(
-            self.host, self.port, timeout=30, context=untrusting(), source_address=self._source
+            self.host, self.port, timeout=30, context=untrusting(), source_address=self.source
         )
 
     def ask(self, verb: str, path: str, body: str | None = None, **headers: str) -> tuple[int, bytes]:
@@ -101,7 +101,7 @@ class NetworkDevice:
             proxy=None,
             open_timeout=30,
             close_timeout=1,  # this client does not read the answer to its closing behind messages that nobody took
-            source_address=self._source,
+            source_address=self.source,
         )
 
 

@@ -44,17 +44,20 @@ MAX_GROWTH_MB_PER_THOUSAND = 2.0
 
 
 class ServerStage:
-    """One car, its gateway, and a console that also serves the network."""
+    """Cars, red before all, their gateways, and a console that also serves the network."""
 
-    def __init__(self, fleet: FleetProcesses) -> None:
+    def __init__(self, fleet: FleetProcesses, *more: str) -> None:
         self.fleet = fleet
-        _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
+        cars = ("red", *more)
+        _, links = fleet.simulate(*(f"{car}:arduino:tcp" for car in cars), truth=True)
         people = [word for name in PEOPLE for word in ("--person", name)]
-        fleet.gateway(link, *people, car="red", platform="arduino")
+        for car, link in zip(cars, links, strict=True):
+            fleet.gateway(link, *people, car=car, platform="arduino")
         self.judge = Judge.follow(fleet.bus, "red")
         self.console = ConsoleProcess(fleet, "--lan", "--lan-port", "0")
         self.lan_port = network_port(self.console)
-        fleet.ready("red")
+        for car in cars:
+            fleet.ready(car)
         self.person = Client(fleet.endpoint, sender="mia", kind="person")
 
     def run(self, *arguments: str) -> str:
@@ -67,9 +70,9 @@ class ServerStage:
         """Return a new pairing code."""
         return self.run("pair", *arguments).split(" type ")[1][:9]
 
-    def device(self, *arguments: str) -> NetworkDevice:
-        """Return a paired device."""
-        made = NetworkDevice(self.lan_port)
+    def device(self, *arguments: str, source: str | None = None) -> NetworkDevice:
+        """Return a paired device. source: its address, of loopback."""
+        made = NetworkDevice(self.lan_port, source=source)
         assert made.pair(self.code(*arguments))["ok"]
         return made
 
