@@ -7,6 +7,7 @@ import secrets
 import socket
 import ssl
 import time
+from asyncio import sslproto
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
@@ -32,6 +33,8 @@ from fleet.console.people_file import PeopleFile
 
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
+TLS_BUFFER_BYTES: Final = 16 * 1024
+"""Size of the buffer of a TLS connection, and of one read: a record. asyncio's own are 256 KiB, 160 MB for 640."""
 ADDRESS_INTERVAL_S: Final = 60.0
 """Interval at which this computer's addresses are read."""
 
@@ -111,6 +114,8 @@ class Lan:
         self.addresses = own_addresses()
         self.names = frozenset(own_names())
         self.certificate: Certificate = ensure_certificate((*self.addresses, *own_names()))
+        # asyncio has no parameter for it. Each TLS connection of this process has such a buffer.
+        sslproto.SSLProtocol.max_size = TLS_BUFFER_BYTES
         self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
         self.certificate.load_into(self.context)

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import itertools
 import json
 import math
 import socket
@@ -9,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import psutil
@@ -23,14 +23,19 @@ from websockets.typing import Origin
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
+from fleet.console.budgets import PAGE_BURST, PAGE_RATE
+from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.people_file import PeopleFile, people_path
+from fleet.console.request_body import BODY_TIMEOUT_S
 from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
-from schemas.bus import reply_message
+from schemas.bus import Sample, reply_message
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.keys import person_of
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
+from tests.support.page_flood import HALF_REQUESTS, half_request, start_flood
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
@@ -38,6 +43,11 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 """The people who may drive red."""
 FLOOD = 40_000
 """Messages of a page that floods."""
+STOPS_AT_ONCE = 40
+INFLATED = 10_000_000
+"""Size of a message that has some 10 kB when it is compressed: less than a page may send."""
+MAX_BOMB_MB = 5.0
+"""Half of an inflated message."""
 WARM_UP = 2000
 """Connections until TLS and the allocator need no more memory. The first thousand take 17 MB, the next one about 1."""
 MAX_GROWTH_MB_PER_THOUSAND = 2.0
@@ -429,6 +439,128 @@ def test_a_page_that_floods_is_closed_and_costs_nobody_a_stop(stage: ServerStage
     assert "Traceback" not in stage.log()
 
 
+def test_a_stop_behind_the_message_that_closes_its_page_is_carried_out(stage: ServerStage) -> None:
+    begun: list[str] = []
+    subscribed: Any = stage.fleet.bus.subscribe("fleet/red/event/command", lambda sample: note_stop(sample, begun))
+    with stage.device("hasty").socket() as page:
+        with page.protocol_mutex:
+            # More than the page may send, also with what it gains meanwhile, and the stop in the same bytes.
+            for _ in range(int(PAGE_BURST + 4 * PAGE_RATE)):
+                page.protocol.send_text(b'{"t":"echo","n":1,"press":1}')
+            page.protocol.send_text(b'{"t":"stop","id":"last"}')
+            page.socket.sendall(b"".join(page.protocol.data_to_send()))
+        assert close_code(page) == SENT_TOO_MUCH
+    wait_for(lambda: "hasty" in begun, "red's gateway has got it")
+    subscribed.undeclare()
+
+
+@pytest.mark.parametrize("parts", [1, 1000])
+def test_a_message_that_inflates_a_thousandfold_is_refused_by_its_size(stage: ServerStage, parts: int) -> None:
+    bomber, server = stage.device("bomber"), psutil.Process(stage.console.process.pid)
+    with bomber.socket() as page:
+        assert page.protocol.extensions, "it is compressed"
+        before_mb = server.memory_info().rss / 1e6
+        text = "x" * (INFLATED // parts)
+        with contextlib.suppress(ConnectionClosed):
+            page.send(text if parts == 1 else itertools.repeat(text, parts))
+        read_to_the_end(page)
+        assert page.close_code == 1009
+    assert server.memory_info().rss / 1e6 < before_mb + MAX_BOMB_MB
+
+
+def test_stops_of_some_cars_are_merged_and_each_is_answered(stage: ServerStage) -> None:
+    begun: list[str] = []
+    subscribed: Any = stage.fleet.bus.subscribe("fleet/red/event/command", lambda sample: note_stop(sample, begun))
+    with stage.device("merger").socket() as page:
+        for number in range(STOPS_AT_ONCE):
+            cars = ["red", f"ghost{number}"]  # no two are alike
+            page.send(json.dumps({"t": "do", "id": number, "verb": "stop", "cars": cars}))
+        answered: dict[int, set[str]] = {}
+        while len(answered) < STOPS_AT_ONCE:
+            message = json.loads(page.recv(30))
+            if message["t"] == "done":
+                answered[message["id"]] = {outcome["car"] for outcome in message["outcomes"]}
+    subscribed.undeclare()
+    assert answered == {number: {"red", f"ghost{number}"} for number in range(STOPS_AT_ONCE)}
+    assert 1 <= len(begun) <= STOPS_AT_ONCE / 4
+
+
+def note_stop(sample: Sample, begun: list[str]) -> None:
+    """Note the person of a stop that a gateway has got."""
+    event: Any = sample.message()
+    if (event.verb, event.phase) == ("stop", "asked"):
+        begun.append(person_of(event.sender))
+
+
+def test_a_person_who_stops_again_and_again_takes_no_thread_for_each(stage: ServerStage) -> None:
+    server = psutil.Process(stage.console.process.pid)
+    with stage.device("nervous").socket() as page:
+        page.recv(30)
+        stage.drive()  # after a drive, a stop is over when the car's readings show it: in some seconds
+        threads, sent = server.num_threads(), 0
+        reports: list[Any] = []
+        while sent < STOPS_AT_ONCE or not reports or reports[-1]["cars"][0]["state"] not in ("shown", "sent"):
+            message = json.loads(page.recv(30))
+            if message["t"] == "tick" and sent < STOPS_AT_ONCE:  # ten a second
+                page.send(json.dumps({"t": "stop", "id": f"nervous {sent}"}))
+                sent += 1
+                threads_now = server.num_threads()
+            elif message["t"] == "state" and message["stop"] is not None:
+                reports.append(message["stop"])
+    assert threads_now < threads + STOPS_AT_ONCE / 2
+
+
+def test_192_half_requests_of_one_cookie_lock_nobody_out(stage: ServerStage) -> None:
+    greedy, calm = stage.device("greedy", source="127.0.0.20"), stage.device("calm")
+    with greedy.socket() as page, contextlib.ExitStack() as kept:
+        halves = []
+        for _ in range(HALF_REQUESTS):
+            with contextlib.suppress(OSError):  # it opens too many at once
+                halves.append(half_request(greedy, kept))
+        assert len(halves) >= MAX_PER_DEVICE
+        assert calm.ask("GET", "/hello")[0] == 200
+        assert answer(stage.console.port, "GET", "/hello")[0] == 200
+        stage.drive()
+        assert calm.ask("POST", "/stop")[0] == 204
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        stage.drive()
+        page.send(json.dumps({"t": "stop", "id": "greedy"}))  # its own page, too
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        for each in halves:  # the console ends each of them
+            each.settimeout(BODY_TIMEOUT_S + 30.0)
+            with contextlib.suppress(OSError):
+                while each.recv(4096):
+                    pass
+        kept.close()  # until it has closed them, too, they take the places of its device
+        assert greedy.ask("GET", "/hello")[0] == 200
+    assert "Traceback" not in stage.log()
+
+
+def test_pupils_that_flood_in_every_way_cost_nobody_else_anything(stage: ServerStage) -> None:
+    """The soak measures times. Here a page stays live, a drive goes on, and a STOP arrives."""
+    pupils = [stage.device(f"pupil{number}", source=f"127.0.0.{30 + number}") for number in range(2)]
+    calm = stage.device("calm")
+    with calm.socket() as page:
+        floods = [start_flood(stage.fleet, pupil, "messages", "plans", "halves") for pupil in pupils]
+        for number in range(len(pupils)):
+            wait_for(lambda number=number: f"a page of pupil{number} was closed" in stage.log(), "it floods")
+        ticks = [json.loads(page.recv(30))["t"] for _ in range(40)]
+        assert ticks.count("tick") >= 10
+        stage.drive()
+        assert calm.ask("POST", "/stop")[0] == 204
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        stage.drive()
+        page.send(json.dumps({"t": "stop", "id": "calm"}))
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        assert calm.ask("POST", "/plan/check", "roles:\n  guide: {mode: tracking}\n")[0] == 200
+        for each in floods:
+            assert each.end() == 0, each.stderr
+            counts = each.line()
+            assert counts["plans 200"] > 0
+            assert counts["half requests"] > 0
+    assert "Traceback" not in stage.log()
+
+
 def test_one_device_has_so_many_pages_and_others_still_come(stage: ServerStage) -> None:
     greedy, calm = stage.device("mia"), stage.device("calm")
     with contextlib.ExitStack() as pages:
@@ -477,7 +609,7 @@ def test_floods_and_half_open_connections_stop_no_stop(stage: ServerStage) -> No
                 sizes_mb.append(server.memory_info().rss / 1e6)
             connect_and_leave(stage, 100)
         assert server.num_threads() <= before_threads + 8
-    grown_mb = [after - before for before, after in pairwise(sizes_mb)]
+    grown_mb = [after - before for before, after in itertools.pairwise(sizes_mb)]
     print(f"\n{settled_fds} descriptors; MB after the warm-up {sizes_mb[0]:.1f}, more after each thousand {grown_mb}")
     assert max(grown_mb) < MAX_GROWTH_MB_PER_THOUSAND
     assert "Traceback" not in stage.log()
