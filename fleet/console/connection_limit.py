@@ -17,11 +17,12 @@ MAX_STRANGERS_PER_ADDRESS: Final = 24
 STRANGER_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that has shown no cookie of a paired device."""
 # A TLS handshake takes a millisecond or two of the loop that stops the cars.
-ADDRESS_BURST: Final = 40.0
-"""New connections of one address at once: a page needs about ten."""
+ADDRESS_BURST: Final = 300.0
+"""New connections of one address at once: a class behind one address opens forty pages, with seven connections each."""
 ADDRESS_RATE: Final = 10.0
 """New connections per second of one address."""
-TOTAL_BURST: Final = 200.0
+TOTAL_BURST: Final = 1000.0
+"""The same of all addresses. Three that flood leave some for the others."""
 TOTAL_RATE: Final = 50.0
 MAX_ADDRESSES: Final = 1024
 """Maximum number of remembered addresses. More are forgotten, the oldest first."""

@@ -46,12 +46,13 @@ class LimitedListener(socket.socket):
 
     limit: ConnectionLimit
     _accepted: dict[Hashable, socket.socket]
+    _takes_turns: bool
 
     @classmethod
     def on_port(cls, port: int) -> "LimitedListener":
         """Listen on all IPv4 addresses. Raises OSError if the port is in use."""
         made = cls(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # for TCP_NODELAY, as in `listen`
-        made.limit, made._accepted = ConnectionLimit(), {}
+        made.limit, made._accepted, made._takes_turns = ConnectionLimit(), {}, False
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             made.bind(("0.0.0.0", port))  # noqa: S104 - `--lan` asks for it
@@ -63,6 +64,11 @@ class LimitedListener(socket.socket):
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept a connection. Raises ConnectionAbortedError for one too many, which asyncio expects."""
+        # asyncio accepts all that wait, and then begins TLS with all at once: some tenths of a second for a class.
+        # So every other call ends its turn. Between two handshakes, a STOP is carried out.
+        self._takes_turns = not self._takes_turns
+        if not self._takes_turns:
+            raise BlockingIOError
         connection, address = super().accept()
         self._forget_closed()
         admitted, ended = self.limit.admit(address, address[0], time.monotonic())

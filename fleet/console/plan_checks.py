@@ -16,11 +16,12 @@ from contextlib import suppress
 from typing import Final
 
 from fleet.console.budgets import MAX_OPEN_CHECKS
+from fleet.policy.plan.parser import BadPlan, parse
 
-CHECK_TIMEOUT_S: Final = 20.0
+PLAN_CHECK_TIMEOUT_S: Final = 20.0
 """Timeout of a check. The largest plan takes 0.14 s, at the lowest share of a busy processor ten times that, and the
 start of the process as long as that of a coordinator: 1 s, on a busy machine 10 s."""
-IDLE_S: Final = 60.0
+IDLE_CHECKER_S: Final = 60.0
 """Time after the last check for which the process stays: a person who writes a plan checks it once in a while."""
 NICENESS: Final = 10
 """The console, the gateways and the recorder go first."""
@@ -64,13 +65,13 @@ class PlanChecks:
         if self._idle is not None:
             self._idle.cancel()
         try:
-            async with asyncio.timeout(CHECK_TIMEOUT_S):
+            async with asyncio.timeout(PLAN_CHECK_TIMEOUT_S):
                 # The process may have died since the last check: then a new one answers.
                 found = await self._answer(text) or await self._answer(text)
         except TimeoutError:
             found = None
-        self._idle = asyncio.get_running_loop().call_later(IDLE_S, self._kill)
-        return found or (False, f"The plan could not be checked within {CHECK_TIMEOUT_S:g} s.")
+        self._idle = asyncio.get_running_loop().call_later(IDLE_CHECKER_S, self._kill)
+        return found or (False, f"The plan could not be checked within {PLAN_CHECK_TIMEOUT_S:g} s.")
 
     async def _answer(self, text: str) -> tuple[bool, str] | None:
         """Return what the process answers. None if it has died."""
@@ -124,8 +125,6 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of the terminal
     if hasattr(os, "nice"):
         os.nice(NICENESS)
-    from fleet.policy.plan.parser import BadPlan, parse  # the console needs no parser
-
     for line in sys.stdin:
         try:
             parse(json.loads(line))

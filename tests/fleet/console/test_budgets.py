@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.console.budgets import COOLDOWN_S, MAX_PERSONS, MERGE_S, Budgets, StopMerge, page_budget
+from fleet.console.budgets import (
+    CHECK_BURST,
+    CHECK_RATE,
+    COOLDOWN_S,
+    MAX_PERSONS,
+    MERGE_S,
+    Budgets,
+    StopMerge,
+    page_budget,
+)
 
 OWN_RATE = 15.0
 """Messages a second of our own page while a car is driven: an echo of each tick, and a few presses."""
@@ -51,6 +60,15 @@ def test_requests_have_a_budget_and_few_persons_are_remembered() -> None:
     for number in range(5000):
         assert budgets.may_ask(number, 0.0)
     assert len(budgets._persons) == MAX_PERSONS
+
+
+def test_checks_of_plans_have_a_budget_of_their_own() -> None:
+    budgets = Budgets()
+    assert sum(budgets.may_check("mia", 0.0) for _ in range(1000)) == CHECK_BURST
+    assert budgets.may_check("mia", 1.0 / CHECK_RATE)
+    assert not budgets.may_check("mia", 1.0 / CHECK_RATE)
+    assert budgets.may_check("bob", 0.0)
+    assert budgets.may_ask("mia", 0.0)
 
 
 @given(st.lists(st.floats(0.0, 0.3), min_size=1, max_size=200))

@@ -66,7 +66,7 @@ async def test_a_check_that_is_given_up_or_dies_spoils_no_other(checks: PlanChec
 async def test_the_process_ends_when_nothing_was_checked_for_a_while(
     checks: PlanChecks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan_checks, "IDLE_S", 0.0)
+    monkeypatch.setattr(plan_checks, "IDLE_CHECKER_S", 0.0)
     assert await checks.check(GOOD, "mia") == (True, "")
     await asyncio.to_thread(wait_for, lambda: not workers(), "it has ended")
     assert await checks.check(GOOD, "mia") == (True, "")
