@@ -31,6 +31,7 @@ FLOOD_S = float(os.environ.get("FLOOD_S", "300"))
 PRESSES = int(os.environ.get("FLOOD_PRESSES", "300"))
 DRIVE_S = min(60.0, FLOOD_S)
 """Time for which a car is driven in a flood without stops: each STOP would end the drive, as it has to."""
+CALM_PRESSES = min(60, PRESSES)
 SETTLED_NS = 1_000_000_000
 MORE_CARS = ("blue", "green", "black", "white", "pink")
 PUPILS = 3
@@ -66,6 +67,26 @@ def press(connection: HTTPSConnection, teacher: NetworkDevice) -> bool:
         return False
     assert response.status == 204
     return True
+
+
+def stop_times(teacher: NetworkDevice, stops: PersonStops, presses: int) -> list[float]:
+    """Press STOP so many times, at the pace of the flood. Return how long each took, s, the shortest first."""
+    connection, took_s, began = teacher.connection(), [], time.monotonic()
+    for number in range(presses):
+        time.sleep(max(0.0, began + number * FLOOD_S / PRESSES - time.monotonic()))  # the pace of the presses
+        count, pressed = len(stops.sent_at), time.monotonic()
+        while not press(connection, teacher):  # a browser opens another connection, too
+            pass
+        wait_for(lambda count=count: len(stops.sent_at) > count, "the teacher's stop is on the wire")
+        took_s.append(stops.sent_at[count] - pressed)
+    connection.close()
+    return sorted(took_s)
+
+
+def describe(took_s: list[float]) -> str:
+    """Describe sorted times."""
+    p50, p99, most = (round(1e3 * each) for each in (median(took_s), took_s[int(0.99 * len(took_s))], took_s[-1]))
+    return f"{len(took_s)} presses, p50 {p50} ms, p99 {p99} ms, max {most} ms"
 
 
 @contextmanager
@@ -114,30 +135,22 @@ def test_a_stop_a_drive_and_the_recorder_do_not_notice_three_pupils_that_flood(
     server, stops = psutil.Process(stage.console.process.pid), PersonStops(stage, "teacher")
     calm_pauses = pauses_of_a_drive(stage, teacher)
     before_mb = server.memory_info().rss / 1e6
-    took_s, again, most_mb, began, used = [], 0, before_mb, time.monotonic(), sum(server.cpu_times()[:2])
+    calm_s = stop_times(teacher, stops, CALM_PRESSES)
+    began, used = time.monotonic(), sum(server.cpu_times()[:2])
     with flood(stage, pupils, "stops", "posts", "halves"):
-        connection = teacher.connection()
-        for number in range(PRESSES):
-            time.sleep(max(0.0, began + number * FLOOD_S / PRESSES - time.monotonic()))  # the pace of the presses
-            count, pressed = len(stops.sent_at), time.monotonic()
-            while not press(connection, teacher):  # a browser opens another connection, too
-                again += 1
-            wait_for(lambda count=count: len(stops.sent_at) > count, "the teacher's stop is on the wire")
-            took_s.append(stops.sent_at[count] - pressed)
-            most_mb = max(most_mb, server.memory_info().rss / 1e6)
+        took_s = stop_times(teacher, stops, PRESSES)
+        most_mb = server.memory_info().rss / 1e6
         share = (sum(server.cpu_times()[:2]) - used) / (time.monotonic() - began)
         load = os.getloadavg()[0]
     with flood(stage, pupils, "messages", "plans", "halves"):
         pauses = pauses_of_a_drive(stage, teacher)
     recorded = recording.end()
     time.sleep(QUIET_S)  # memory comes back by itself
-    after_mb, took_s = server.memory_info().rss / 1e6, sorted(took_s)
+    after_mb = server.memory_info().rss / 1e6
     print(
-        f"\nSTOP, from the press to its record after the frame, {PRESSES} presses: p50 {1e3 * median(took_s):.0f} ms, "
-        f"p99 {1e3 * took_s[int(0.99 * len(took_s))]:.0f} ms, max {1e3 * took_s[-1]:.0f} ms; console {share:.0%} of a "
-        f"core; MB before {before_mb:.0f}, in the flood {most_mb:.0f}, later {after_mb:.0f}; "
-        f"{server.num_threads()} threads; the teacher's connection was opened again {again} times; driven for "
-        f"{DRIVE_S:.0f} s, {pauses} pauses, {calm_pauses} without a flood; "
+        f"\nSTOP, from the press to the record of its frame: {describe(took_s)}; without a flood {describe(calm_s)}; "
+        f"console {share:.0%} of a core; MB before {before_mb:.0f}, in the flood {most_mb:.0f}, later {after_mb:.0f}; "
+        f"{server.num_threads()} threads; driven for {DRIVE_S:.0f} s, {pauses} pauses, {calm_pauses} without a flood; "
         f"{recorded['messages']} recorded, missed {recorded['missed']}, dropped {recorded['drops']}; load {load:.1f}"
     )
     stage.person.close()
