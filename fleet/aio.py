@@ -15,7 +15,6 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
 from fleet.client import lease as leases
-from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import (
     CarCommands,
     CommandRequest,
@@ -155,11 +154,7 @@ class Fleet:
 
     async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Send a command to the cars and return their outcomes. It is sent at once, whatever the threads wait for."""
-        return await self.outcomes(self.sync.send(request, cars))
-
-    async def outcomes(self, command: PendingCommand) -> list[Outcome]:
-        """Wait and return the outcomes of a command that `sync.send` has sent."""
-        return await self.call(self.sync.outcomes, command)
+        return await self.call(self.sync.outcomes, self.sync.send(request, cars))
 
 
 class Car(CarCommands[Coroutine[Any, Any, Outcome]]):

@@ -115,7 +115,7 @@ class ConsoleOperator:
             earlier.abandon()
         self._stops[who] = command
         try:
-            outcomes = await self._fleet.outcomes(command)
+            outcomes = await self._fleet.call(self._fleet.sync.outcomes, command)
         finally:
             if self._stops.get(who) is command:
                 del self._stops[who]
