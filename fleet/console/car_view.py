@@ -321,6 +321,10 @@ class FleetView:
         """Return what a page shows of each car, by name."""
         return [self._cars[name].as_dict(now) for name in self.names]
 
+    def leads_of(self, cars: Iterable[str]) -> frozenset[str]:
+        """Return the persons whom the gateways of all these cars know as leads."""
+        return frozenset.intersection(*(frozenset(self.look_up(car).rules.leads) for car in cars))
+
     @property
     def rules(self) -> dict[str, CarRules]:
         """The rights of each person, by car."""

@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -57,6 +57,8 @@ _MAX_MERGES: Final = 256
 """Number of remembered merges of stops, by person and cars."""
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
+
+_BUS_LOST: Final = "The console has lost the bus. Press again when it is back."
 
 log = logging.getLogger("fleet")
 
@@ -164,6 +166,9 @@ class Console:
         while True:
             now = time.monotonic()
             self._end_presses_of_sleep()
+            if not self._fleet.sync.bus.connected:  # else a press that is still held would drive when it is back
+                for press in self._presses.on_bus_lost():
+                    self._end(press, _BUS_LOST)
             for press in self._presses.expire(now):
                 self._end(press, "The page did not answer for 0.3 s.")
             tick = f'{{"t":"tick","n":{self._presses.tick(now)}}}'
@@ -441,12 +446,26 @@ class Console:
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()
-        before = self._presses.current(page.number)
+        before, person = self._presses.current(page.number), page.person.name
         try:
-            press = self._presses.begin(page.number, press_id, cars, motion, message.number("n"), now)
+            if not self._fleet.sync.bus.connected:
+                raise PressRefused(_BUS_LOST)
+            press, taken = self._presses.begin(
+                page.number,
+                press_id,
+                cars,
+                motion,
+                message.number("n"),
+                now,
+                person=person,
+                leads=self._view.leads_of(cars),
+            )
         except PressRefused as error:
             page.answer(t="over", press=press_id, words=str(error))
             return
+        for other in taken:  # its stop would be refused for the cars that the lead drives from now on
+            words = f"{person} drives {' and '.join(car for car in other.cars if car in cars)} now."
+            self._end(other, words, [car for car in other.cars if car not in cars])
         if before is not None:  # another direction: a stop in between only for cars that are no longer driven
             page.operator.end_press(before, [car for car in before.cars if car not in cars])
         page.operator.begin_press(
@@ -461,9 +480,10 @@ class Console:
         for press in self._presses.drop_cars(cars):
             self._end(press, words)
 
-    def _end(self, press: HeldPress, words: str) -> None:
+    def _end(self, press: HeldPress, words: str, cars: Sequence[str] | None = None) -> None:
+        """End a press: stop its cars (None: all), and tell its page why."""
         page = self._pages[press.client]
-        page.operator.end_press(press)
+        page.operator.end_press(press, cars)
         page.answer(t="over", press=press.id, words=words)
 
     async def close(self) -> None:
