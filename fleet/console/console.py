@@ -35,6 +35,7 @@ from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessag
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
+from fleet.policy.authority import Authority
 from fleet.policy.requests import PlanRequest
 from schemas import keys
 from schemas.bus import Handover, Latest, Sample
@@ -242,6 +243,8 @@ class Console:
             "cars": self._view.as_list(now),
             "stop": None if report is None else report.as_dict(),
             "unrecorded": self._unrecorded,
+            "at_ms": time.time_ns() // 1_000_000,
+            "zone_s": time.localtime().tm_gmtoff,
         }
         return json.dumps(state, separators=(",", ":"))
 
@@ -273,6 +276,11 @@ class Console:
         """Return the name under which a request acts, also of a person without an open page."""
         sender = self.operator_of(person).sender
         return sender if person is None or person_of(sender) == person.name else default_sender(person.name)
+
+    @property
+    def authority(self) -> Authority | None:
+        """The people of the fleet. None if no gateway has named them yet."""
+        return self._view.authority
 
     def management_refusal(self, person: PagePerson | None) -> str:
         """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
@@ -375,7 +383,7 @@ class Console:
     def _stop_all(self, operator: ConsoleOperator, request: CommandRequest) -> None:
         now = time.monotonic()
         for press in self._presses.on_stop(now):
-            self._end(press, "All cars were stopped.")
+            self._end(press, "All cars were paused." if request.verb == "pause" else "All cars were stopped.")
         self._stops += 1
         present = {*self._fleet.sync.cars(), *self._view.names}
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
@@ -447,9 +455,10 @@ class Console:
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()
         before, person = self._presses.current(page.number), page.person.name
+        if not self._fleet.sync.bus.connected:
+            page.answer(t="over", press=press_id, words=_BUS_LOST)
+            return
         try:
-            if not self._fleet.sync.bus.connected:
-                raise PressRefused(_BUS_LOST)
             press, taken = self._presses.begin(
                 page.number,
                 press_id,

@@ -45,7 +45,10 @@ HELLO: Final = "fleet console"
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Room for what a message contains beside the text of a plan, bytes."""
+NORMAL: Final = 1000
 TRY_AGAIN_LATER: Final = 1013
+NOT_PAIRED: Final = 4001
+"""Close code of a page whose device was revoked or whose pairing has expired. The page says so at once."""
 SENT_TOO_MUCH: Final = 4008
 """Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
 _CLOSE_TIMEOUT_S: Final = 2.0
@@ -139,7 +142,7 @@ async def serve(
         config.load()
         config.ssl = lan.context
         servers.append((ConsoleServer(config), lan.listener))
-        running.append(asyncio.ensure_future(lan.run()))
+        running.append(asyncio.ensure_future(lan.run(lambda: console.authority)))
 
     def end(_: object) -> None:
         for server, _listener in servers:
@@ -250,9 +253,9 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
     page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON), socket_.scope.get(DEVICE, ""))
     sending = asyncio.ensure_future(page.run())
 
-    def end() -> None:
+    def end(code: int = NORMAL) -> None:
         console.remove_page(page)
-        console.operator.spawn(_close(socket_))
+        console.operator.spawn(_close(socket_, code))
 
     def on_sent(task: "asyncio.Task[None]") -> None:
         if not task.cancelled() and task.exception() is not None:  # the page does not read, or has gone
@@ -262,18 +265,18 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
         if from_network is None or from_network.is_current(socket_.scope):
             console.on_text(page, text)
         else:
-            end()
+            end(NOT_PAIRED)
 
     sending.add_done_callback(on_sent)
     from_network = lan if PERSON in socket_.scope else None
     try:
-        with nullcontext() if from_network is None else from_network.connected(socket_.scope, end):
+        with nullcontext() if from_network is None else from_network.connected(socket_.scope, partial(end, NOT_PAIRED)):
             yield on_text
     finally:
         console.remove_page(page)
         sending.cancel()
 
 
-async def _close(socket_: WebSocket) -> None:
+async def _close(socket_: WebSocket, code: int = NORMAL) -> None:
     with suppress(RuntimeError, WebSocketDisconnect):
-        await socket_.close()
+        await socket_.close(code)
