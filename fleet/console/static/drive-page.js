@@ -24,12 +24,11 @@ function onKeyDown(event) {
   const motion = KEYS[key];
   if (motion === undefined || event.ctrlKey || event.altKey || event.metaKey || event.target.closest(TYPES_INTO)) return;
   event.preventDefault();
-  if (!event.repeat) press(motion, names(), `key ${key}`);
+  if (!event.repeat) press(motion, names(), `key ${event.code}`);
 }
 
-function onKeyUp(event) {
-  release(`key ${event.key.length === 1 ? event.key.toLowerCase() : event.key}`);
-}
+// By its place: with another key held down, the same key may have another letter.
+const onKeyUp = (event) => release(`key ${event.code}`);
 
 function stickMotion() {
   for (const stick of navigator.getGamepads()) {
