@@ -111,9 +111,9 @@ def test_no_press_outlives_the_hub(stage: ConsoleStage, how: str) -> None:
         stage.fleet.ready(car)
     expect(page.locator(".banner")).to_have_count(0)
     stage.stands(since_ns=lost_ns)
-    back_ns = time.time_ns()
     page.wait_for_timeout(2000)  # longer than any stream needs to begin again
-    assert stage.judges["red"].on_after(back_ns) == []
+    assert stage.judges["red"].on_after(lost_ns) == []
+    expect(page.locator(".pad.held")).to_have_count(0)
     page.keyboard.up("w")
     hold_key(stage, page, "w")
     page.keyboard.up("w")
@@ -170,6 +170,33 @@ def test_two_fingers_are_an_arc_and_the_one_that_stays_drives_on(stage: ConsoleS
     wait_motion(stage, Motion.FORWARD, touch("touchEnd", second))
     assert stage.judges["red"].on_after(began_ns) == []
     touch("touchEnd", first)
+    stage.stands()
+
+
+def test_a_stick_that_was_stopped_drives_again_only_from_its_middle(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red")
+    page.evaluate("window.stick = [0, 0]; navigator.getGamepads = () => [null, { axes: window.stick }]")
+
+    def drives(stick: str) -> bool:
+        page.evaluate(f"window.stick = {stick}")
+        with contextlib.suppress(AssertionError):
+            wait_for(lambda: stage.judges["red"].driving, "it drives", 3.0)
+        if not stage.judges["red"].driving:
+            page.evaluate("window.stick = [0, 0]")
+            page.wait_for_timeout(700)
+        return stage.judges["red"].driving
+
+    wait_for(lambda: drives("[0, -0.9]"), "it drives")
+    stopped_ns = time.time_ns()
+    page.keyboard.press("Escape")
+    stage.stands(since_ns=stopped_ns)
+    page.evaluate("window.stick = [0.9, 0]")  # past the middle, in no moment in it
+    page.wait_for_timeout(1500)
+    assert stage.judges["red"].on_after(stopped_ns) == []
+    page.evaluate("window.stick = [0, 0]")
+    page.wait_for_timeout(700)
+    wait_for(lambda: drives("[0.9, 0]"), "it drives again")
+    page.evaluate("window.stick = [0, 0]")
     stage.stands()
 
 

@@ -171,6 +171,8 @@ function letGo() {
   store.press = null;
 }
 
+export const isHeld = (source) => holds.some((each) => each.source === source);
+
 export function press(motion, cars, source) {
   holds = [...holds.filter((each) => each.source !== source), { source, motion }];
   drive(cars);
@@ -191,7 +193,7 @@ function drive(cars) {
 // Release this source (left out: all). What is still held drives on.
 export function release(source) {
   if (source !== undefined) {
-    if (!holds.some((each) => each.source === source)) return;
+    if (!isHeld(source)) return;
     holds = holds.filter((each) => each.source !== source);
     if (holds.length > 0 && store.press !== null) {
       drive(store.press.cars);

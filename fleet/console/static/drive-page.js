@@ -1,6 +1,6 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
-import { changed, command, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
+import { changed, command, isHeld, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
 import { html, Refused, Results, useEffect, useState } from "./ui.js";
 
@@ -46,6 +46,8 @@ let stickBefore = null;
 function onStick() {
   const motion = stickMotion();
   if (motion === stickBefore) return;
+  // Its drive has ended: only a stick that was let go begins another one.
+  if (motion !== null && stickBefore !== null && !isHeld("stick")) return;
   stickBefore = motion;
   if (motion === null) release("stick");
   else press(motion, names(), "stick");
