@@ -10,6 +10,7 @@ import socket
 import sys
 import time
 import webbrowser
+from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,13 +20,21 @@ import click
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
-from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, starter_option
+from fleet.commands.group import (
+    DefaultCommandGroup,
+    chosen_person,
+    connect_option,
+    fleet_option,
+    say,
+    starter_option,
+)
 from fleet.commands.options import bus_options, cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
-from fleet.console.pairing import RANKS, PagePerson
+from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
+from fleet.fleetfile.fleet_file import read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.bus import resolve_endpoint
@@ -148,7 +157,8 @@ def serve_console(
     address = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
 
     with listener:
-        lan = _open_lan(lan_port, PeopleFile(people_path(resolve_endpoint(connect), fleet))) if on_lan else None
+        file = PeopleFile(people_path(resolve_endpoint(connect), fleet))
+        lan = _open_lan(lan_port, file, read_people(fleet_file)) if on_lan else None
 
         def on_ready() -> None:
             if parent is None:
@@ -191,14 +201,19 @@ examples:
 @connect_option()
 @fleet_option()
 def pair(name: str | None, rank: str, connect: str | None, fleet: str) -> None:
-    """Make a code that pairs one device with the console as the person NAME (default: you)."""
+    """Make a code that pairs one device with the console as the person NAME (default: you).
+
+    NAME is one of the people of the fleet file, if it lists any. A console must serve the network: fleet console --lan.
+    """
     person = PagePerson(name or _own_name(), rank)
     with cli_errors():
         people = PeopleFile(people_path(resolve_endpoint(connect), fleet))
-        address = people.read().address
-        if not address:
-            raise click.ClickException("No console has served the network yet. Type: fleet console --lan")
-        _show_code(people, address, person)
+        if not people.is_served:  # a code would lead to a page that nobody serves
+            raise click.UsageError("No console serves the network now. `fleet console --lan` starts one.")
+        try:
+            _show_code(people, people.read().address, person)
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
 
 
 @console.command(
@@ -252,7 +267,7 @@ def _network() -> Any:
     return lan
 
 
-def _open_lan(port: int, people: PeopleFile) -> "Lan":
+def _open_lan(port: int, people: PeopleFile, names: Iterable[str] | None) -> "Lan":
     network = _network()
     try:
         listener = network.LimitedListener.on_port(port)
@@ -261,7 +276,7 @@ def _open_lan(port: int, people: PeopleFile) -> "Lan":
             f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` takes a free one."
         ) from None
     try:
-        lan: Lan = network.Lan(listener, people)
+        lan: Lan = network.Lan(listener, people, names)
     except OSError as error:
         listener.close()
         raise click.ClickException(
@@ -273,7 +288,10 @@ def _open_lan(port: int, people: PeopleFile) -> "Lan":
 def _describe_lan(lan: "Lan") -> None:
     click.echo(f"On the network: {lan.address}")
     click.echo(f"Certificate SHA-256: {lan.certificate.fingerprint}")
-    _show_code(lan.people, lan.address, PagePerson(_own_name()))
+    try:
+        _show_code(lan.people, lan.address, PagePerson(_own_name()))
+    except UnknownPerson as error:
+        say(f"To pair a device, type: fleet console pair NAME. {error}")
 
 
 def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:

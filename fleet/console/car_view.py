@@ -11,6 +11,7 @@ from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
 from fleet.console.permissions import CarRules
+from fleet.policy.authority import Authority, merge_authority
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import messages, topics
 
@@ -23,6 +24,8 @@ TREND_STEADY_V: Final = 0.03
 """Maximum change of a steady battery. The readings have steps of 0.01 V."""
 MAX_LEDGER_ENTRIES: Final = 60
 """Maximum commands and log records of a car that a page can show."""
+SILENT_AFTER_S: Final = topics.TOPICS["state/safety"].stale_after_s or 0.0
+"""Time without any message of a car, after which its card says how old it is: its gateway repeats this state."""
 _LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
 _SIDES: Final = ("left", "right")
 
@@ -64,18 +67,23 @@ class CarView:
         """Commands and log records, the newest last."""
         self.rules = CarRules(name)
         """The rights of each person."""
+        self.names_people = False
+        """True if a gateway of this car has said who may drive it."""
         self.commands = CommandLedger()
         self._events: deque[tuple[float, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Time and event of the newest commands."""
         self._newest: dict[str, tuple[Any, float]] = {}
         self._trend = BatteryTrend()
         self._present = False
+        self._heard_at: float | None = None
+        """When the newest message came."""
         self._starts = GatewayStarts()
         self._changed_at: float | None = None
         """When the gateway joined or left the bus."""
 
     def on_message(self, topic: str, value: Any, now: float) -> None:
         """Handle a message of this car. topic: such as `sensor/range`."""
+        self._heard_at = now
         match topic:
             case "event/command":
                 self._on_command(value)
@@ -92,7 +100,7 @@ class CarView:
                 if topic == "sensor/battery":
                     self._trend.add(value.voltage_v, now)
                 elif topic == "state/safety":
-                    self.rules = CarRules.of(self.name, value)
+                    self.rules, self.names_people = CarRules.of(self.name, value), True
 
     def on_presence(self, now: float, *, present: bool) -> None:
         """Handle that the car's gateway is on the bus, or not."""
@@ -153,6 +161,8 @@ class CarView:
         shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
         if self._gone_at is not None:
             shown["gone_s"] = int(now - self._gone_at)
+        if self._heard_at is not None and now - self._heard_at > SILENT_AFTER_S:
+            shown["silent_s"] = int(now - self._heard_at)
         for part in (self._link, self._mode, self._motion, self._safety, self._health, self._sensors):
             shown |= part(now)
         if self.ledger:
@@ -177,6 +187,8 @@ class CarView:
             return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
         link, at = found
         claim = self.claims(now).link
+        if claim.is_stale:
+            return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
         if claim.past is not None:
             return {"link": {"state": claim.what, "reason": "", "since_s": 0}}
         shown = {"state": claim.what, "reason": claim.why, "since_s": int(link.since_s + now - at)}
@@ -213,10 +225,10 @@ class CarView:
 
     def _safety(self, now: float) -> dict[str, Any]:
         safety, claim = self._get("state/safety"), self.claims(now).motors
-        motors = {"state": claim.what, "basis": claim.basis}
+        motors: dict[str, Any] = {"state": claim.what, "basis": claim.basis}
         past = claim if claim.is_stale else claim.past
-        if past is not None:  # a card has no room for an age, so it claims nothing that is old
-            motors = {"state": UNKNOWN, "basis": "", "past": past.basic}
+        if past is not None:  # what is old is told as past, with its age
+            motors = {"state": UNKNOWN, "basis": "", "past": past.basic, "past_s": int(past.age_s or 0)}
         shown: dict[str, Any] = {"motors": motors, "hold": None, "lease": None, "estops": []}
         if safety is None:
             return shown
@@ -320,6 +332,16 @@ class FleetView:
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""
         return [self._cars[name].as_dict(now) for name in self.names]
+
+    @property
+    def authority(self) -> Authority | None:
+        """The people of the fleet. None if no gateway has named them yet."""
+        found = [car.rules.authority for car in self._cars.values() if car.names_people]
+        return merge_authority(found) if found else None
+
+    def leads_of(self, cars: Iterable[str]) -> frozenset[str]:
+        """Return the persons whom the gateways of all these cars know as leads."""
+        return frozenset.intersection(*(frozenset(self.look_up(car).rules.leads) for car in cars))
 
     @property
     def rules(self) -> dict[str, CarRules]:

@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -36,6 +36,7 @@ from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessag
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
+from fleet.policy.authority import Authority
 from fleet.policy.requests import PlanRequest
 from schemas import keys
 from schemas.bus import Handover, Latest, Sample
@@ -60,6 +61,7 @@ _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
 
 OnOutcomes = Callable[[list[dict[str, Any]]], object]
+_BUS_LOST: Final = "The console has lost the bus. Press again when it is back."
 
 log = logging.getLogger("fleet")
 
@@ -170,6 +172,9 @@ class Console:
         while True:
             now = time.monotonic()
             self._end_presses_of_sleep()
+            if not self._fleet.sync.bus.connected:  # else a press that is still held would drive when it is back
+                for press in self._presses.on_bus_lost():
+                    self._end(press, _BUS_LOST)
             for press in self._presses.expire(now):
                 self._end(press, "The page did not answer for 0.3 s.")
             tick = f'{{"t":"tick","n":{self._presses.tick(now)}}}'
@@ -243,6 +248,8 @@ class Console:
             "cars": self._view.as_list(now),
             "stop": None if report is None else report.as_dict(),
             "unrecorded": self._unrecorded,
+            "at_ms": time.time_ns() // 1_000_000,
+            "zone_s": time.localtime().tm_gmtoff,
         }
         return json.dumps(state, separators=(",", ":"))
 
@@ -274,6 +281,11 @@ class Console:
         """Return the name under which a request acts, also of a person without an open page."""
         sender = self.operator_of(person).sender
         return sender if person is None or person_of(sender) == person.name else default_sender(person.name)
+
+    @property
+    def authority(self) -> Authority | None:
+        """The people of the fleet. None if no gateway has named them yet."""
+        return self._view.authority
 
     def management_refusal(self, person: PagePerson | None) -> str:
         """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
@@ -377,7 +389,7 @@ class Console:
     def _stop_all(self, operator: ConsoleOperator, request: CommandRequest) -> None:
         now = time.monotonic()
         for press in self._presses.on_stop(now):
-            self._end(press, "All cars were stopped.")
+            self._end(press, "All cars were paused." if request.verb == "pause" else "All cars were stopped.")
         self._stops += 1
         present = {*self._fleet.sync.cars(), *self._view.names}
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
@@ -460,12 +472,27 @@ class Console:
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()
-        before = self._presses.current(page.number)
+        before, person = self._presses.current(page.number), page.person.name
+        if not self._fleet.sync.bus.connected:
+            page.answer(t="over", press=press_id, words=_BUS_LOST)
+            return
         try:
-            press = self._presses.begin(page.number, press_id, cars, motion, message.number("n"), now)
+            press, taken = self._presses.begin(
+                page.number,
+                press_id,
+                cars,
+                motion,
+                message.number("n"),
+                now,
+                person=person,
+                leads=self._view.leads_of(cars),
+            )
         except PressRefused as error:
             page.answer(t="over", press=press_id, words=str(error))
             return
+        for other in taken:  # its stop would be refused for the cars that the lead drives from now on
+            words = f"{person} drives {' and '.join(car for car in other.cars if car in cars)} now."
+            self._end(other, words, [car for car in other.cars if car not in cars])
         if before is not None:  # another direction: a stop in between only for cars that are no longer driven
             page.operator.end_press(before, [car for car in before.cars if car not in cars])
         page.operator.begin_press(
@@ -480,9 +507,10 @@ class Console:
         for press in self._presses.drop_cars(cars):
             self._end(press, words)
 
-    def _end(self, press: HeldPress, words: str) -> None:
+    def _end(self, press: HeldPress, words: str, cars: Sequence[str] | None = None) -> None:
+        """End a press: stop its cars (None: all), and tell its page why."""
         page = self._pages[press.client]
-        page.operator.end_press(press)
+        page.operator.end_press(press, cars)
         page.answer(t="over", press=press.id, words=words)
 
     async def close(self) -> None:

@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from fleet.client.diagnosis import describe_reports
 from schemas import messages
+from schemas.printable import printable_lines
 
 MAX_FRAMES: Final = 60
 """Number of frames that a page shows."""
@@ -22,9 +23,8 @@ class FrameLog:
 
     def on_frame(self, topic: str, frame: Any) -> None:
         """Handle a frame. topic: `frame/rx` or `frame/tx`."""
-        text = (
-            frame.data[:MAX_FRAME_BYTES].decode("ascii", "backslashreplace").replace("\r", "\\r").replace("\n", "\\n")
-        )
+        data = frame.data[:MAX_FRAME_BYTES].decode("ascii", "backslashreplace")
+        text = printable_lines(data.replace("\r", "\\r").replace("\n", "\\n"))
         at_ms = messages.stamp_ms(frame.stamp)
         if topic == "frame/rx":
             became = ", ".join(key.partition("/")[2] for key in frame.published)

@@ -146,7 +146,8 @@ class NetworkGuard(Guard):
         device, state = self._device_of(cookie_value(headers, self._cookie) or "")
         stops = scope["type"] == "http" and scope["path"] == STOP_PATH and method == "POST"
         if device is None or (state != "valid" and not stops):
-            return "this device is not paired (open /pair)"
+            expired = "'s pairing has expired; only STOP works (open /pair)"  # the page looks for "expired"
+            return f"this device{' is not paired (open /pair)' if device is None else expired}"
         scope[PERSON], scope[DEVICE] = device.person, device.id
         self._on_device(tuple(scope["client"]), device)
         return ""

@@ -8,8 +8,9 @@ import socket
 import ssl
 import time
 from asyncio import sslproto
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Final
 
 import segno
@@ -30,6 +31,7 @@ from fleet.console.pairing import (
     new_code,
 )
 from fleet.console.people_file import PeopleFile
+from fleet.policy.authority import Authority
 
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
@@ -111,7 +113,8 @@ class Lan:
 
     # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
 
-    def __init__(self, listener: LimitedListener, people: PeopleFile) -> None:
+    def __init__(self, listener: LimitedListener, people: PeopleFile, names: Iterable[str] | None = None) -> None:
+        """Begin. names: the people of the fleet until its gateways say who they are. None: everybody."""
         self.listener = listener
         self.people = people
         self.port: int = listener.getsockname()[1]
@@ -126,11 +129,13 @@ class Lan:
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
         self.certificate.load_into(self.context)
         self._refusals = LogLimit()
+        self._failures = LogLimit()
         self._shared_cookies = LogLimit()
         self._connected: dict[int, tuple[str, str, Callable[[], object]]] = {}
         """Device, address and the function that closes it, by number of the socket."""
         self._last_socket = 0
-        self._write_address()
+        self.people.serve()
+        self._write(_sorted(names))
 
     @property
     def address(self) -> str:
@@ -236,13 +241,21 @@ class Lan:
         self.close_revoked()
         return gone
 
-    async def run(self) -> None:
-        """Close pages of revoked devices and renew the certificate until the task is cancelled."""
+    async def run(self, authority: Callable[[], Authority | None]) -> None:
+        """Close pages of revoked devices and renew the certificate until the task is cancelled.
+
+        authority: returns the people of the fleet, None if no gateway has named them yet.
+        """
         next_look = time.monotonic() + ADDRESS_INTERVAL_S
         while True:
             await asyncio.sleep(REVOCATION_INTERVAL_S)
             self.listener.expire()
             self.close_revoked()
+            try:
+                await asyncio.to_thread(self._update_people, authority())
+            except OSError as error:
+                if (words := self._failures.words(str(error), time.monotonic())) is not None:
+                    log.error("the list of people cannot be written: %s", words)
             if time.monotonic() >= next_look:
                 next_look = time.monotonic() + ADDRESS_INTERVAL_S
                 try:
@@ -255,15 +268,20 @@ class Lan:
         renewed = ensure_certificate((*addresses, *own_names()))
         self.addresses = addresses
         if self.address != before:
-            self._write_address()
+            self._write(self.people.read().people)
         if renewed.fingerprint != self.certificate.fingerprint:
             renewed.load_into(self.context)
             self.certificate = renewed
             log.warning("the network is now %s, with a new certificate: SHA-256 %s", self.address, renewed.fingerprint)
 
-    def _write_address(self) -> None:
-        """Write the address to the people file, where `fleet console pair` reads it."""
-        self.people.change(lambda book: (PeopleBook(book.codes, book.devices, self.address), None))
+    def _update_people(self, authority: Authority | None) -> None:
+        self.people.serve()
+        if authority is not None and self.people.read().people != (names := _sorted(authority.names)):
+            self._write(names)
+
+    def _write(self, names: tuple[str, ...] | None) -> None:
+        """Write address and people to the people file, where `fleet console pair` reads them."""
+        self.people.change(lambda book: (replace(book, address=self.address, people=names), None))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what the page of the paired devices shows, as JSON values."""
@@ -282,10 +300,15 @@ class Lan:
         ]
         return {
             "address": self.address,
+            "people": self.people.read().people or (),
             "fingerprint": self.certificate.fingerprint,
             "wrong_codes": self.guesses.wrong,
             "devices": devices,
         }
+
+
+def _sorted(names: Iterable[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(sorted(names))
 
 
 def issue_code(people: PeopleFile, person: PagePerson) -> str:

@@ -35,8 +35,8 @@ class ConsoleOperator:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._tasks: set[asyncio.Task[None]] = set()
-        self._streams: dict[tuple[int, int], tuple[float, int]] = {}
-        """Time of the last drive and number of drives, by press."""
+        self._streams: dict[tuple[int, int], tuple[float, int, tuple[str, ...]]] = {}
+        """Time of the last drive, number of drives, and cars, by press."""
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
         self._commands = 0
@@ -61,16 +61,16 @@ class ConsoleOperator:
 
     def renew_press(self, press: HeldPress, now: float) -> None:
         """Send the next drive of a press, unless the last one is recent."""
-        sent_at, count = self._streams.get((press.client, press.id), (float("-inf"), 0))
+        sent_at, count, _ = self._streams.get((press.client, press.id), (float("-inf"), 0, ()))
         if now - sent_at < STREAM_INTERVAL_S:
             return
-        self._streams[(press.client, press.id)] = now, count + 1
+        self._streams[(press.client, press.id)] = now, count + 1, press.cars
         self._stream(press.cars, drive_request(press.motion, DRIVE_TTL_S), STREAM_MAX_AGE_S, count + 1)
 
     def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
         """Stop the cars of a press, or some of them: at once in the stream, and by a query whose outcome is known."""
         stopped = tuple(press.cars if cars is None else cars)
-        _, count = self._streams.pop((press.client, press.id), (0.0, 0))
+        _, count, _ = self._streams.pop((press.client, press.id), (0.0, 0, ()))
         if stopped:
             self._stream(stopped, drive_request("stop"), None, count + 1)
             self.spawn(self._ask_to_end(stopped))
@@ -95,10 +95,12 @@ class ConsoleOperator:
             if not outcome.ok and outcome.reason != "superseded":
                 on_refusal(outcome)
         if (press.client, press.id) not in self._streams:  # this query may have overtaken the end of the press
-            await self._ask_to_end(press.cars)
+            driven = {car for _, _, cars in self._streams.values() for car in cars}  # by a press that has replaced it
+            await self._ask_to_end([car for car in press.cars if car not in driven])
 
     async def _ask_to_end(self, cars: Sequence[str]) -> None:
-        await self._fleet.ask(drive_request("stop"), cars)
+        if cars:
+            await self._fleet.ask(drive_request("stop"), cars)
 
     # ------------------------------------------------------------------ STOP
 

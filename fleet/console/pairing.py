@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, Self
 
 from schemas import keys
 from schemas.process.stdio import printable
+from schemas.suggestion import did_you_mean
 
 CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """Letters and digits that nobody confuses."""
@@ -36,6 +37,10 @@ MAX_DEVICE_NAME_LENGTH: Final = 60
 RANKS: Final = ("person", "lead")
 
 CookieState = Literal["unknown", "expired", "valid"]
+
+
+class UnknownPerson(ValueError):
+    """The fleet lists its people, and this is none of them. The text says who they are."""
 
 
 class BadBook(ValueError):
@@ -95,10 +100,16 @@ class PeopleBook:
     devices: tuple[PairedDevice, ...] = ()
     address: str = ""
     """Where the console last served the network."""
+    people: tuple[str, ...] | None = None
+    """The people of the fleet, as the console knows them. None: the fleet lists nobody, so everybody may come."""
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
-        """Add a code for a person. Raises ValueError."""
+        """Add a code for a person. Raises UnknownPerson, and ValueError for what is no name or no rank."""
         keys.check_name(person.name, "a person's name")
+        if self.people is not None and person.name not in self.people:
+            hint = did_you_mean(person.name, self.people) or f"There are: {', '.join(self.people)}."
+            words = f"`people:` in the fleet file lists no {person.name}, who could only watch and stop."
+            raise UnknownPerson(f"{words} {hint}")
         if person.rank not in RANKS:
             raise ValueError(f"There is no rank {person.rank!r}.")
         open_codes = [each for each in self.codes if each.is_open(now)]
@@ -154,7 +165,8 @@ class PeopleBook:
             hashes = [each.digest for each in codes] + [each.digest for each in devices]
             if not all(isinstance(each, str) for each in hashes):
                 raise BadBook("a hash is not a text")
-            return cls(codes, devices, str(fields["address"]))
+            people = fields.get("people")  # a console of an earlier version wrote none
+            return cls(codes, devices, str(fields["address"]), None if people is None else tuple(map(str, people)))
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise BadBook(str(error)) from None
 

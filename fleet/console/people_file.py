@@ -8,6 +8,7 @@ from typing import Final, TypeVar
 
 from fleet.console.pairing import BadBook, PeopleBook
 from schemas.atomic_file import write_atomically
+from schemas.process.file_lock import FileLock
 from schemas.state_dir import directory_of
 
 T = TypeVar("T")
@@ -28,6 +29,7 @@ class PeopleFile:
         self.path = path
         self._book = PeopleBook()
         self._version: tuple[int, int, int] | None = None
+        self._served = FileLock(path.with_suffix(".served"))
 
     def read(self) -> PeopleBook:
         """Return the book as it is now. A damaged or missing one is empty: everybody pairs again."""
@@ -44,6 +46,22 @@ class PeopleFile:
             book, value = function(self._load())
             write_atomically(self.path, book.as_text().encode(), sync=True, private=True)
         return value
+
+    def serve(self) -> None:
+        """Let others see that a console serves the network with this file, until this process ends. Raises OSError.
+
+        Of two consoles of one fleet, the second one takes the place of the first one: call it again and again.
+        """
+        self._served.try_take()
+
+    @property
+    def is_served(self) -> bool:
+        """True if a console serves the network with this file now. Raises OSError."""
+        if self._served.is_held:
+            return True
+        is_free = self._served.try_take()
+        self._served.release()
+        return not is_free
 
     def _stat(self) -> tuple[int, int, int]:
         try:

@@ -3,7 +3,7 @@
 The server numbers its ticks. While the finger is down, the page echoes each tick with the id of its press.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -35,6 +35,7 @@ class HeldPress:
     cars: tuple[str, ...]
     motion: str
     last_echo_at: float
+    person: str = ""
 
 
 class PressBook:
@@ -59,10 +60,24 @@ class PressBook:
         self._ticks.pop(self._number - _MAX_TICKS, None)
         return self._number
 
-    def begin(self, client: int, press_id: int, cars: tuple[str, ...], motion: str, tick: int, now: float) -> HeldPress:
+    def begin(
+        self,
+        client: int,
+        press_id: int,
+        cars: tuple[str, ...],
+        motion: str,
+        tick: int,
+        now: float,
+        *,
+        person: str = "",
+        leads: Collection[str] = (),
+    ) -> tuple[HeldPress, list[HeldPress]]:
         """Begin a press. It replaces the page's earlier press. Raises PressRefused.
 
+        Return it with the presses of other pages that it ends: a lead takes cars from persons who are none.
         An id counts once: a press that is over, or a late message of it, never begins again.
+
+        person: of the page. leads: the persons who are leads, for all of these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -71,11 +86,15 @@ class PressBook:
             raise PressRefused("The connection to the console is slow. Press again.")
         if now - self._stopped_at < AFTER_STOP_S:
             raise PressRefused("The cars were stopped just now. Press again.")
-        for other in self._presses.values():
-            if other.client != client and (shared := set(cars) & set(other.cars)):
-                raise PressRefused(f"Another page drives {' and '.join(sorted(shared))}.")
-        press = self._presses[client] = HeldPress(client, press_id, cars, motion, now)
-        return press
+        taken = [other for other in self._presses.values() if other.client != client and set(cars) & set(other.cars)]
+        for other in taken:
+            if person not in leads or other.person in leads:
+                shared = " and ".join(sorted(set(cars) & set(other.cars)))
+                raise PressRefused(f"{_driver(other, person)} drives {shared}.")
+        for other in taken:
+            del self._presses[other.client]
+        press = self._presses[client] = HeldPress(client, press_id, cars, motion, now, person)
+        return press, taken
 
     def echo(self, client: int, press_id: int, tick: int, now: float) -> HeldPress | None:
         """Handle the echo of a tick. Return the press, None if the press is over or the tick is old."""
@@ -114,6 +133,10 @@ class PressBook:
         self._ticks.clear()
         return self._end(lambda _: True)
 
+    def on_bus_lost(self) -> list[HeldPress]:
+        """End every press: no command reaches a car."""
+        return self._end(lambda _: True)
+
     def drop_cars(self, cars: set[str]) -> list[HeldPress]:
         """End every press of these cars: they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))
@@ -130,3 +153,7 @@ class PressBook:
         for press in over:
             del self._presses[press.client]
         return over
+
+
+def _driver(press: HeldPress, person: str) -> str:
+    return "Another page" if press.person == person else press.person

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -51,7 +52,10 @@ _LAST_READ_MESSAGES: Final = 10_000
 """Messages of a page over its budget that may still stop cars: one read, 256 KiB, has 8,000 of the smallest."""
 _LAST_READ_S: Final = 2.0
 """Timeout of these messages. Alone they take 0.4 s, beside other pages that flood some times that."""
+NORMAL: Final = 1000
 TRY_AGAIN_LATER: Final = 1013
+NOT_PAIRED: Final = 4001
+"""Close code of a page whose device was revoked or whose pairing has expired. The page says so at once."""
 SENT_TOO_MUCH: Final = 4008
 """Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
 _CLOSE_TIMEOUT_S: Final = 2.0
@@ -145,7 +149,7 @@ async def serve(
         config.load()
         config.ssl = lan.context
         servers.append((ConsoleServer(config), lan.listener))
-        running.append(asyncio.ensure_future(lan.run()))
+        running.append(asyncio.ensure_future(lan.run(lambda: console.authority)))
 
     def end(_: object) -> None:
         for server, _listener in servers:
@@ -272,9 +276,9 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
     page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON), socket_.scope.get(DEVICE, ""))
     sending = asyncio.ensure_future(page.run())
 
-    def end() -> None:
+    def end(code: int = NORMAL) -> None:
         console.remove_page(page)
-        console.operator.spawn(_close(socket_))
+        console.operator.spawn(_close(socket_, code))
 
     def on_sent(task: "asyncio.Task[None]") -> None:
         if not task.cancelled() and task.exception() is not None:  # the page does not read, or has gone
@@ -284,12 +288,12 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
         if from_network is None or from_network.is_current(socket_.scope):
             console.on_text(page, text)
         else:
-            end()
+            end(NOT_PAIRED)
 
     sending.add_done_callback(on_sent)
     from_network = lan if PERSON in socket_.scope else None
     try:
-        with nullcontext() if from_network is None else from_network.connected(socket_.scope, end):
+        with nullcontext() if from_network is None else from_network.connected(socket_.scope, partial(end, NOT_PAIRED)):
             yield on_text
     finally:
         console.remove_page(page)
@@ -307,6 +311,6 @@ async def _carry_out_stops(socket_: WebSocket, text: str, on_text: Callable[[str
                 text = await socket_.receive_text()
 
 
-async def _close(socket_: WebSocket) -> None:
+async def _close(socket_: WebSocket, code: int = NORMAL) -> None:
     with suppress(RuntimeError, WebSocketDisconnect):
-        await socket_.close()
+        await socket_.close(code)

@@ -1,11 +1,18 @@
-"""The course of a STOP, car by car: stopping, shown, sent, or not reached. Pure: time is an argument (s, monotonic)."""
+"""The course of a STOP, car by car: stopping, shown, sent, not reached, or moved again. Pure: time is an argument.
+
+`now` is monotonic, s. `at_ms` is the clock of the console, ms since the epoch: pages show it.
+"""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
-from fleet.client.claims import SENT
+from fleet.client.claims import SENT, SHOWN
 from fleet.client.outcome import NO_ANSWER, Outcome
+from schemas import messages
 from schemas.commands import STOPS
+
+MOVED: Final = "moved"
+"""State of a car that stood, and moves again."""
 
 
 class StopReport:
@@ -17,6 +24,8 @@ class StopReport:
         self._verb = verb
         self._asked_at = now
         self._at_ms = at_ms
+        self._result_ns: dict[str, int] = {}
+        """Stamp of the event or state that the result of a car rests on, by its gateway's clock, ns."""
         self._cars: dict[str, dict[str, Any]] = {name: _entry("asked") for name in cars}
 
     @property
@@ -26,7 +35,11 @@ class StopReport:
 
     def on_event(self, car: str, event: Any, now: float) -> None:
         """Handle a command event of the sender of this STOP."""
-        if event.verb not in (*STOPS, "pause") or self._is_over(car):
+        if event.verb not in (*STOPS, "pause"):
+            return
+        if event.phase in ("complete", "sent"):
+            self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
+        if self._is_over(car):
             return
         match event.phase:
             case "complete":
@@ -39,14 +52,19 @@ class StopReport:
                 self._cars[car] = _entry("stopping")
 
     def on_safety(self, car: str, safety: Any, now: float) -> None:
-        """Handle a new state/safety: a car that was not reached may be stopped by its own gateway later."""
-        if (
-            car in self._cars
-            and self._cars[car]["state"] == "failed"
-            and safety.motors == "off"
-            and safety.motors_basis
-        ):
+        """Handle a new state/safety.
+
+        A car that was not reached may be stopped by its own gateway later, and one that stood may move again.
+        """
+        state = self._cars[car]["state"] if car in self._cars else ""
+        stamp_ns = messages.stamp_ns(safety.stamp)
+        if state == "failed" and safety.motors == "off" and safety.motors_basis:
             self._set(car, safety.motors_basis, now)
+            self._result_ns[car] = stamp_ns
+        elif state in (SHOWN, SENT) and safety.motors == "on" and stamp_ns > self._result_ns.get(car, 0):
+            self._cars[car]["state"] = MOVED
+        if state in ("asked", "stopping"):  # a state that is older than the result must not contradict it later
+            self._result_ns[car] = max(stamp_ns, self._result_ns.get(car, 0))
 
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float) -> None:
         """Handle the final outcomes. A car without an outcome was not reached."""
@@ -71,8 +89,9 @@ class StopReport:
         return car in self._cars and self._cars[car]["state"] not in ("asked", "stopping")
 
     def _set(self, car: str, state: str, now: float, words: str = "") -> None:
-        self._cars[car] = _entry(state, round(now - self._asked_at, 2), words)
+        took_s = now - self._asked_at
+        self._cars[car] = _entry(state, round(took_s, 2), words, self._at_ms + round(took_s * 1000))
 
 
-def _entry(state: str, took_s: float | None = None, words: str = "") -> dict[str, Any]:
-    return {"state": state, "took_s": took_s, "words": words}
+def _entry(state: str, took_s: float | None = None, words: str = "", at_ms: int | None = None) -> dict[str, Any]:
+    return {"state": state, "took_s": took_s, "words": words, "at_ms": at_ms}

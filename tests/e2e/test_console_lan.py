@@ -1,5 +1,6 @@
 """The console on the network in a real browser: a phone pairs, drives, and is revoked in the page People."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,9 @@ from click.testing import CliRunner
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from fleet.cli import cli
+from fleet.client.client import Fleet as Client
+from gateway.protocol.enums import Motion
+from gateway.protocol.frames import General, encode
 from tests.support.console import DESKTOP, ConsoleProcess, find_chromium, hold_until_driving
 from tests.support.judge import Judge
 from tests.support.network_client import network_port
@@ -85,7 +89,16 @@ def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_p
         assert serious(teacher) == []
         teacher.get_by_role("button", name="Yes, revoke it").click()
         wait_for(lambda: not judge.driving, "red stands")
-        expect(phone.get_by_text("This device is not paired any more.")).to_be_visible()
+        expect(phone.locator(".banner")).to_contain_text(["This device is not paired any more. It stops no car"])
+        expect(phone.locator("#stop")).to_have_text("⬣ STOP does not work on this device")
+        # What the page says is so.
+        with Client(fleet.endpoint, sender="teacher", kind="person") as lead:
+            lead.car("red").drive("forward", 10.0, wait=False).check()
+            wait_for(lambda: judge.driving, "red drives")
+            phone.keyboard.press("Escape")
+            expect(phone.get_by_text("STOP has not reached the console.")).to_be_visible()
+            assert judge.driving
+            lead.stop(["red"])
         assert serious(phone) == []
         expect(teacher.locator("[data-device]")).to_have_count(0)
         phone.mouse.up()
@@ -172,6 +185,56 @@ def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Pat
         ours.mouse.up()
         wait_for(lambda: not judges["red"].driving, "red stands")
         assert not judges["blue"].motors or not any(on for _, on in judges["blue"].motors), "nobody drove it"
+        assert console.process.end() == 0
+    finally:
+        fleet.close()
+
+
+def test_a_lead_takes_a_car_that_a_pupil_holds_and_no_pupil_takes_one_of_a_lead(
+    browser: Browser, tmp_path: Path
+) -> None:
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    try:
+        _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
+        fleet.gateway(link, *(word for name in ("teacher:lead", "group_a") for word in ("--person", name)))
+        judge = Judge.follow(fleet.bus, "red")
+        console = ConsoleProcess(fleet, "--lan", "--lan-port", "0")
+        fleet.ready("red")
+        port = network_port(console)
+        ours = paired_page(browser, fleet, port, "group_a")
+        teacher = paired_page(browser, fleet, port, "teacher", "--rank", "lead")
+        back = encode(General(Motion.BACK))
+        for page in (ours, teacher):
+            page.locator("input[name=select-red]").check()
+
+        def goes_back_after(moment_ns: int) -> bool:
+            return back in [data for _, data in judge.written_after(moment_ns)]
+
+        hold_until_driving(ours, judge)
+        taken_ns = time.time_ns()
+        teacher.locator("[data-motion=back]").hover()
+        teacher.mouse.down()
+        wait_for(lambda: goes_back_after(taken_ns), "the lead drives it")
+        expect(ours.locator(".results")).to_contain_text("teacher drives red now.")
+        expect(ours.locator("[data-control=drive] .refused")).to_contain_text("teacher drives red.")
+        expect(ours.locator(".pad.held")).to_have_count(0)
+        expect(teacher.locator("[data-motion=back].held")).to_have_count(1)
+        assert judge.driving
+
+        # The pupil lets go and presses again: the car of a lead stays with the lead.
+        ours.mouse.up()
+        pressed_ns = time.time_ns()
+        ours.mouse.down()
+        ours.wait_for_timeout(1000)
+        ours.mouse.up()
+        assert encode(General(Motion.FORWARD)) not in [data for _, data in judge.written_after(pressed_ns)]
+        assert judge.driving
+        teacher.mouse.up()
+        judge.wait_off(time.time_ns(), watched_s=1.0)
+        expect(ours.locator("[data-control=drive] .refused")).to_have_count(0)
+        hold_until_driving(ours, judge)
+        ours.mouse.up()
+        judge.wait_off(time.time_ns(), watched_s=0.6)
         assert console.process.end() == 0
     finally:
         fleet.close()

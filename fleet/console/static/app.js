@@ -1,6 +1,6 @@
 // The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
 
-import { estopAll, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
+import { clock, estopAll, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
@@ -54,11 +54,11 @@ function Report({ report }) {
   const failed = report.cars.some((car) => car.state === "failed");
   if (report.over && !failed && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
   return html`<div class="report" data-report=${report.number}>
-    <p role="status"><strong>${report.verb === "estop" ? t.estopped : "STOP"}</strong>: ${t.stopSummary(report.cars)}</p>
+    <p role="status"><strong>${t.stopVerbs[report.verb]}</strong>: ${t.stopSummary(report.cars)}</p>
     <ul class="plain chips">
       ${report.cars.map(
         (car) => html`<li key=${car.name} class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
-          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${t.took(car.took_s)} />
+          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s)} />
           ${car.state === "failed" ? ` ${car.words}` : ""}
         </li>`,
       )}
@@ -91,7 +91,7 @@ function StopBar({ report }) {
     </div>`}
     <div class="stop-row">
       <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
-        <span aria-hidden="true">⬣</span> ${t.stop} <small>${t.stopKeys}</small>
+        <span aria-hidden="true">⬣</span> ${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}
       </button>
       <button id="pause" aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>${t.pause}</button>
       <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}>${t.estop}</button>
@@ -137,9 +137,9 @@ class App extends Component {
         <span class="person">${store.hello ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
-      ${state !== null && (store.lost || !store.connected) && html`<${Banner} words=${t.consoleLost} />`}
+      ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
       ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
-      ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired} <a href="/pair">${t.pairAgain}</a></p>`}
+      ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
       ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
       ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
       <${Paused} cars=${state?.cars ?? []} />

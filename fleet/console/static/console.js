@@ -1,6 +1,10 @@
 // The page's side of the one WebSocket: the newest state, presses, STOP, commands and their outcomes.
 
+import { parse, seen } from "./foreign.js";
+import { motionOf } from "./holds.js";
+
 const RECONNECT_MS = 500;
+const NOT_PAIRED = 4001; // the close code of a page whose device was revoked, or whose pairing has expired
 const SENT_TOO_MUCH = 4008; // the close code of a page that has sent far more than a person can
 const COOLDOWN_MS = 15_000;
 const UNPAIRED_MS = 5000;
@@ -20,9 +24,10 @@ export const store = {
   hello: null,
   connected: false,
   lost: false,
+  silent_s: 0, // whole seconds since the console said anything, while it is lost
   stopUnsent: false, // the last STOP has not reached the console
-  unpaired: false, // revoked, or expired: only STOP by fetch may still work
-  press: null, // the motion that is held: {id, motion, cars, source}
+  unpaired: "", // "revoked": not even STOP works. "expired": STOP by fetch works
+  press: null, // the motion that is driven: {id, motion, cars}
   results: [],
   selected: new Set(),
 };
@@ -32,6 +37,7 @@ let tick = 0;
 let pressNumber = 0;
 let requestNumber = 0;
 let lastMessageAt = performance.now();
+let stateAt = 0;
 let drawing = false;
 const verbs = new Map();
 
@@ -81,6 +87,15 @@ function note(words, bad) {
   changed();
 }
 
+// ---------------------------------------------------------------- time
+
+// The clock of this device may be wrong, and its zone another one: all times are those of the console.
+export const consoleNow = () => (store.state?.at_ms ?? 0) + performance.now() - stateAt;
+
+// The time of day at the console: HH:MM:SS, or fewer or more letters of HH:MM:SS.mmm.
+export const clock = (at_ms, letters = 8) =>
+  new Date(at_ms + 1000 * (store.state?.zone_s ?? 0)).toISOString().slice(11, 11 + letters);
+
 // ---------------------------------------------------------------- STOP
 
 const newId = () => Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
@@ -90,7 +105,7 @@ export function stopAll() {
   const id = newId();
   send({ t: "stop", id });
   postStop(id, performance.now() + STOP_RETRY_MS);
-  store.press = null;
+  letGo();
   changed();
 }
 
@@ -114,13 +129,13 @@ async function postStop(id, until) {
 export function estopAll(why) {
   if (!store.connected || store.lost) stopAll(); // by fetch, again and again; an e-stop has only the socket
   send({ t: "estop", id: newId(), why });
-  store.press = null;
+  letGo();
   changed();
 }
 
 // ---------------------------------------------------------------- who may do what
 
-const personOf = (sender) => sender.split("@")[0];
+const personOf = (sender) => seen(sender.split("@")[0]);
 // Another program of the same person has its whole name.
 export function who(sender) {
   const own = store.hello?.sender ?? "";
@@ -136,7 +151,7 @@ export const isRefused = (action, cars) => cars.length > 0 && cars.every((car) =
 
 export function pauseAll(why) {
   send({ t: "pause", id: newId(), why });
-  store.press = null;
+  letGo();
   changed();
 }
 
@@ -147,18 +162,46 @@ export function unpause() {
 
 // ---------------------------------------------------------------- hold to drive
 
+// Keys, buttons and fingers that are down, the oldest first: {source, motion}. When a drive ends for any other reason
+// than their release, none of them counts any more: whoever wants to drive on presses again.
+let holds = [];
+
+function letGo() {
+  holds = [];
+  store.press = null;
+}
+
+export const isHeld = (source) => holds.some((each) => each.source === source);
+
 export function press(motion, cars, source) {
-  if (cars.length === 0 || isRefused("move", cars) || !store.connected || document.visibilityState !== "visible") return;
-  store.press = { id: ++pressNumber, motion, cars, source };
+  holds = [...holds.filter((each) => each.source !== source), { source, motion }];
+  drive(cars);
+}
+
+function drive(cars) {
+  const motion = motionOf(holds.map((each) => each.motion));
+  if (store.press?.motion === motion) return;
+  if (cars.length === 0 || isRefused("move", cars) || !store.connected || document.visibilityState !== "visible") {
+    release();
+    return;
+  }
+  store.press = { id: ++pressNumber, motion, cars };
   send({ t: "press", press: pressNumber, cars, motion, n: tick });
   changed();
 }
 
-// End the press of this source (left out: whatever its source).
+// Release this source (left out: all). What is still held drives on.
 export function release(source) {
-  if (store.press === null || (source !== undefined && store.press.source !== source)) return;
-  send({ t: "release", press: store.press.id });
-  store.press = null;
+  if (source !== undefined) {
+    if (!isHeld(source)) return;
+    holds = holds.filter((each) => each.source !== source);
+    if (holds.length > 0 && store.press !== null) {
+      drive(store.press.cars);
+      return;
+    }
+  }
+  if (store.press !== null) send({ t: "release", press: store.press.id });
+  letGo();
   changed();
 }
 
@@ -206,19 +249,22 @@ export function plan(verb) {
 // Check the text of a plan, or put it in force.
 export async function sendPlan(what, text) {
   try {
-    const response = await fetch(`/plan/${what}`, { method: "POST", body: text });
-    store.planAnswer = { what, ...(await response.json()) };
+    store.planAnswer = { what, ...(await request(`/plan/${what}`, text)) };
   } catch {
     store.planAnswer = { what, ok: false, words: describe.unreachable };
   }
   changed();
 }
 
+async function request(path, body) {
+  const response = await fetch(path, body === undefined ? {} : { method: "POST", body });
+  return parse(await response.text());
+}
+
 // Ask the console by HTTP for what is not about driving. Always answers with an object.
 export async function ask(path, body) {
   try {
-    const response = await fetch(path, body === undefined ? {} : { method: "POST", body });
-    return await response.json();
+    return await request(path, body);
   } catch {
     return { ok: false, words: describe.unreachable };
   }
@@ -233,7 +279,7 @@ export function setTexts(texts) {
 
 function onMessage(text) {
   lastMessageAt = performance.now();
-  const message = JSON.parse(text);
+  const message = parse(text);
   switch (message.t) {
     case "tick":
       tick = message.n;
@@ -242,6 +288,7 @@ function onMessage(text) {
       return;
     case "state":
       store.state = message;
+      stateAt = lastMessageAt;
       stateChanged();
       return;
     case "rights":
@@ -264,7 +311,7 @@ function onMessage(text) {
       break;
     case "over":
       if (store.press !== null && store.press.id === message.press) {
-        store.press = null;
+        letGo();
         note(message.words, true);
       }
       break;
@@ -296,7 +343,7 @@ async function connect() {
   // A console that was started again has another cookie.
   try {
     const hello = await fetch("/hello");
-    store.unpaired = hello.status === 403;
+    store.unpaired = hello.status !== 403 ? "" : (await hello.text()).includes("expired") ? "expired" : "revoked";
   } catch {
     setTimeout(connect, RECONNECT_MS);
     return;
@@ -317,18 +364,23 @@ async function connect() {
   socket.onmessage = (event) => onMessage(event.data);
   socket.onclose = (event) => {
     store.connected = false;
-    store.press = null;
+    letGo();
     if (event.code === SENT_TOO_MUCH) note(event.reason, true);
+    if (event.code === NOT_PAIRED) store.unpaired = "revoked"; // `/hello` knows better in a moment
     changed();
-    setTimeout(connect, event.code === SENT_TOO_MUCH ? COOLDOWN_MS : RECONNECT_MS);
+    const wait = { [SENT_TOO_MUCH]: COOLDOWN_MS, [NOT_PAIRED]: 0 };
+    setTimeout(connect, wait[event.code] ?? RECONNECT_MS);
   };
 }
 
 setInterval(() => {
-  const lost = performance.now() - lastMessageAt > LOST_MS;
-  if (lost !== store.lost) {
+  const silent_ms = performance.now() - lastMessageAt;
+  const lost = silent_ms > LOST_MS;
+  const silent_s = lost ? Math.floor(silent_ms / 1000) : 0;
+  if (lost !== store.lost || silent_s !== store.silent_s) {
     store.lost = lost;
-    if (lost) store.press = null;
+    store.silent_s = silent_s;
+    if (lost) letGo();
     changed();
   }
 }, 250);

@@ -1,6 +1,6 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
-import { changed, command, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
+import { changed, command, isHeld, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
 import { html, Refused, Results, useEffect, useState } from "./ui.js";
 
@@ -24,12 +24,11 @@ function onKeyDown(event) {
   const motion = KEYS[key];
   if (motion === undefined || event.ctrlKey || event.altKey || event.metaKey || event.target.closest(TYPES_INTO)) return;
   event.preventDefault();
-  if (!event.repeat) press(motion, names(), `key ${key}`);
+  if (!event.repeat) press(motion, names(), `key ${event.code}`);
 }
 
-function onKeyUp(event) {
-  release(`key ${event.key.length === 1 ? event.key.toLowerCase() : event.key}`);
-}
+// By its place: with another key held down, the same key may have another letter.
+const onKeyUp = (event) => release(`key ${event.code}`);
 
 function stickMotion() {
   for (const stick of navigator.getGamepads()) {
@@ -47,6 +46,8 @@ let stickBefore = null;
 function onStick() {
   const motion = stickMotion();
   if (motion === stickBefore) return;
+  // Its drive has ended: only a stick that was let go begins another one.
+  if (motion !== null && stickBefore !== null && !isHeld("stick")) return;
   stickBefore = motion;
   if (motion === null) release("stick");
   else press(motion, names(), "stick");

@@ -1,6 +1,6 @@
 // The fleet page: a card for each car.
 
-import { command, isRefused, refusals, store, who } from "./console.js";
+import { clock, command, isRefused, refusals, store, who } from "./console.js";
 import { links, modes, motions, motors, t, trends, verdicts } from "./texts.js";
 import { html, Memo, Refused, Results, useState, Verdict } from "./ui.js";
 
@@ -63,17 +63,21 @@ const Loan = ({ car }) =>
   car.loan === undefined
     ? null
     : html`<div class="note">
-        <p>${t.lentTo(car.loan.to, who(car.loan.by), new Date(car.loan.until_s * 1000).toLocaleTimeString([], { timeStyle: "short" }))}</p>
+        <p>${t.lentTo(car.loan.to, who(car.loan.by), clock(car.loan.until_s * 1000, 5))}</p>
         <button disabled=${isRefused("end_loan", [car.name])} onClick=${() => command("end_loan", [car.name])}
           aria-label=${`${t.endLoan} ${car.name}`}>${t.endLoan}</button>
       </div>`;
+
+// How long nothing new has come of a car, s. 0 while news come.
+const silence = (car) => (car.silent_s ?? 0) + store.silent_s;
 
 function Card({ car }) {
   const select = () => {
     store.selected = new Set([car.name]);
   };
   const { battery, mode, event } = car;
-  const reports = car.gateway && (car.link.state === "online" || car.link.state === "quiet");
+  const silent_s = silence(car);
+  const reports = car.gateway && silent_s === 0 && (car.link.state === "online" || car.link.state === "quiet");
   const missing = reports ? t.notMeasured : t.notKnown;
   return html`<article class="card" style=${{ "--car": car.color }} aria-labelledby=${`car-${car.name}`} data-car=${car.name}>
     <header>
@@ -81,6 +85,7 @@ function Card({ car }) {
       <span class="platform">${car.platform}</span>
     </header>
     <${Trouble} car=${car} />
+    ${silent_s > 0 && html`<p class="note" data-old>${t.old(t.ago(silent_s))}</p>`}
     <${Estops} car=${car} />
     <${Hold} car=${car} />
     <${Loan} car=${car} />
@@ -91,7 +96,7 @@ function Card({ car }) {
         <${Verdict} table=${verdicts} name=${mode.verdict}
           detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
       <//>
-      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.past(car.motors.past)}` : ""}<//>
+      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.past(car.motors.past, t.ago(car.motors.past_s + store.silent_s))}` : ""}<//>
       ${car.shows && car.shows !== "yes" && html`<${Row} name=${t.showsStops}>${t.shows[car.shows] ?? ""} ${car.shows_words}<//>`}
       <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${who(car.motion.owner)})` : ""}<//>
       <${Row} name=${t.battery}>
@@ -116,7 +121,7 @@ function Card({ car }) {
       <${Row} name=${t.control}>${car.lease ? t.leaseOf(who(car.lease.holder), car.lease.kind) : t.nobody}<//>
       <${Row} name=${t.event}>
         ${event
-          ? html`<time>${new Date(event.at_ms).toLocaleTimeString()}</time>${" "}
+          ? html`<time>${clock(event.at_ms)}</time>${" "}
               ${event.level === "info" ? "" : "⚠ "}${event.words}`
           : "–"}
       <//>
@@ -135,6 +140,6 @@ export const FleetPage = ({ cars }) => html`
   <${Results} />
   ${cars.length === 0 && html`<p>${t.noCars}</p>`}
   <div class="cards">
-    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify([car, store.rights.cars[car.name]])} draw=${() => html`<${Card} car=${car} />`} />`)}
+    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify([car, store.rights.cars[car.name], store.silent_s])} draw=${() => html`<${Card} car=${car} />`} />`)}
   </div>
 `;

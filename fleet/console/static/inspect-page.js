@@ -1,10 +1,10 @@
 // The inspect page: raw frames beside what they became, the ledger of commands, and what the gateway knows.
 
-import { inspect, store } from "./console.js";
+import { clock, inspect, store } from "./console.js";
 import { t } from "./texts.js";
 import { html, useEffect, useState } from "./ui.js";
 
-const time = (at_ms) => new Date(at_ms).toISOString().slice(11, 23);
+const time = (at_ms) => clock(at_ms, 12);
 
 const Frames = ({ frames }) => html`<section>
   <h2 id="frames">${t.frames}</h2>

@@ -1,40 +1,36 @@
 // The people page: pairs devices on the network, lists them and revokes them.
 
+import { ask } from "./console.js";
 import { t } from "./texts.js";
 import { html, useEffect, useState } from "./ui.js";
 
 const READ_MS = 2000;
 const RANKS = ["person", "lead"];
 
-async function post(message) {
-  try {
-    return await (await fetch("/people", { method: "POST", body: JSON.stringify(message) })).json();
-  } catch {
-    return { ok: false, words: t.unreachable };
-  }
-}
+const post = (message) => ask("/people", JSON.stringify(message));
 
-function NewCode({ address }) {
+function NewCode({ address, people }) {
   const [name, setName] = useState("");
   const [rank, setRank] = useState(RANKS[0]);
   const [answer, setAnswer] = useState(null);
   const [endsAt, setEndsAt] = useState(0);
-  const [now, setNow] = useState(Date.now());
+  const [now, setNow] = useState(performance.now());
   useEffect(() => {
-    const timer = setInterval(() => setNow(Date.now()), 1000);
+    const timer = setInterval(() => setNow(performance.now()), 1000);
     return () => clearInterval(timer);
   }, []);
   const ask = async (event) => {
     event.preventDefault();
     const found = await post({ t: "pair", name, rank });
     setAnswer(found);
-    setEndsAt(Date.now() + 1000 * (found.lifetime_s ?? 0));
+    setEndsAt(performance.now() + 1000 * (found.lifetime_s ?? 0));
   };
   const left_s = Math.ceil((endsAt - now) / 1000);
   return html`<section>
     <h2>${t.pairTitle}</h2>
     <form class="controls" onSubmit=${ask}>
-      <label>${t.pairName} <input name="person" maxlength="32" required value=${name} onInput=${(event) => setName(event.target.value)} /></label>
+      <label>${t.pairName} <input name="person" list="people" maxlength="32" required value=${name} onInput=${(event) => setName(event.target.value)} /></label>
+      <datalist id="people">${people.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
       <label>${t.pairRank} <select name="rank" value=${rank} onChange=${(event) => setRank(event.target.value)}>
         ${RANKS.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
       </select></label>
@@ -66,11 +62,8 @@ function Device({ device, onRevoke }) {
 export function PeoplePage() {
   const [found, setFound] = useState(null);
   const read = async () => {
-    try {
-      setFound(await (await fetch("/people")).json());
-    } catch {
-      setFound(null);
-    }
+    const answer = await ask("/people");
+    setFound("may_pair" in answer ? answer : null);
   };
   useEffect(() => {
     read();
@@ -81,10 +74,10 @@ export function PeoplePage() {
   if (!found.may_pair || found.lan === null) {
     return html`<h1>${t.people}</h1><p>${found.may_pair ? t.notOnNetwork : t.mayNotPair}</p>`;
   }
-  const { address, fingerprint, wrong_codes, devices } = found.lan;
+  const { address, people, fingerprint, wrong_codes, devices } = found.lan;
   return html`
     <h1>${t.people}</h1>
-    <${NewCode} address=${address} />
+    <${NewCode} address=${address} people=${people} />
     <section>
       <h2>${t.devices}</h2>
       ${devices.length === 0 && html`<p>${t.noDevices}</p>`}

@@ -1,10 +1,11 @@
 // The plan page: the plan in force, who has which role and why, and another plan.
 
-import { plan, sendPlan, store } from "./console.js";
+import { clock, plan, sendPlan, store } from "./console.js";
+import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, Refused, useRef, useState } from "./ui.js";
 
-const FAULT = /^plan:(\d+):(\d+): error: (.*)$/;
+const FAULT = /^\u2068?plan:(\d+):(\d+): error: (.*)$/;
 
 function Status({ shown }) {
   if (shown.plan === null) return html`<p>${t.noPlan}</p>`;
@@ -30,7 +31,7 @@ const Roles = ({ roles }) => html`<section>
   <h2>${t.roles}</h2>
   <dl>
     ${roles.map(
-      (role) => html`<div class="row" key=${role.name} data-role=${role.name}><dt>${role.name}</dt><dd>${role.cars.join(", ") || t.noCar}</dd></div>`,
+      (role) => html`<div class="row" key=${role.name} data-role=${role.name}><dt>${seen(role.name)}</dt><dd>${role.cars.join(", ") || t.noCar}</dd></div>`,
     )}
   </dl>
 </section>`;
@@ -39,7 +40,7 @@ const Decisions = ({ decisions }) => html`<section>
   <h2>${t.why}</h2>
   ${decisions.map(
     (each) => html`<details key=${each.subject} data-why=${each.subject}>
-      <summary><strong>${each.subject}</strong>: ${each.decided} <time>${new Date(each.since * 1000).toLocaleTimeString()}</time></summary>
+      <summary><strong>${each.subject}</strong>: ${each.decided} <time>${clock(each.since * 1000)}</time></summary>
       <p>${t.because(each.why)}</p>
       <ul>
         ${each.readings.map((words) => html`<li key=${words}>${t.reading(words)}</li>`)}
@@ -57,7 +58,7 @@ function Answer({ answer, onFault }) {
       const fault = FAULT.exec(line);
       return html`<li key=${index} class=${answer.ok ? "" : "bad"}>
         ${fault
-          ? html`<button onClick=${() => onFault(Number(fault[1]))}>${t.fault(fault[1], fault[3])}</button>`
+          ? html`<button onClick=${() => onFault(Number(fault[1]))}>${t.fault(fault[1], seen(fault[3]))}</button>`
           : `${answer.ok ? "✓" : "⚠"} ${line}`}
       </li>`;
     })}
@@ -108,7 +109,7 @@ export function PlanPage() {
         html`<section>
           <h2>${t.coordinator}</h2>
           <ul class="plain">
-            ${shown.log.map((each, index) => html`<li key=${index}><time>${new Date(each.at_ms).toLocaleTimeString()}</time> ${each.bad ? "⚠ " : ""}${each.words}</li>`)}
+            ${shown.log.map((each, index) => html`<li key=${index}><time>${clock(each.at_ms)}</time> ${each.bad ? "⚠ " : ""}${each.words}</li>`)}
           </ul>
         </section>`}
       </div>

@@ -1,6 +1,6 @@
 // The plots page: up to four readings, each of several cars, over thirty seconds to ten minutes.
 
-import { onSamples, plot, store } from "./console.js";
+import { consoleNow, onSamples, plot, store } from "./console.js";
 import { t } from "./texts.js";
 import { html, useEffect, useRef, useState } from "./ui.js";
 import uPlot from "./vendor/uplot.js";
@@ -26,13 +26,20 @@ class Grid {
     return slots.length === 0 ? "–" : this.rows[row].get(Math.max(...slots));
   }
   data() {
-    const last = Math.floor(Date.now() / this.slot_ms);
+    const last = Math.floor(consoleNow() / this.slot_ms);
     const slots = Array.from({ length: SLOTS }, (_, index) => last - SLOTS + 1 + index);
     for (const row of this.rows) {
       for (const slot of row.keys()) if (slot <= last - SLOTS) row.delete(slot);
     }
     return [slots.map((slot) => (slot * this.slot_ms) / 1000), ...this.rows.map((row) => slots.map((slot) => row.get(slot) ?? null))];
   }
+}
+
+// A date whose local time is that of the console: uPlot writes local times.
+function consoleDate(at_s) {
+  const there = new Date(1000 * (at_s + (store.state?.zone_s ?? 0)));
+  const day = [there.getUTCFullYear(), there.getUTCMonth(), there.getUTCDate()];
+  return new Date(...day, there.getUTCHours(), there.getUTCMinutes(), there.getUTCSeconds(), there.getUTCMilliseconds());
 }
 
 function Plot({ title, cars, grid }) {
@@ -46,6 +53,7 @@ function Plot({ title, cars, grid }) {
       width: area.current.clientWidth,
       height: area.current.clientHeight - 40,
       pxAlign: 0,
+      tzDate: consoleDate,
       axes: [axis, axis],
       series: [{}, ...cars.map((car) => ({ label: car.name, stroke: car.color, width: 2, spanGaps: true, points: { show: false } }))],
       cursor: { show: false },

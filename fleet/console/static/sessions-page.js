@@ -1,6 +1,7 @@
 // The sessions page: the recorder, and the list of recordings with what can be done with each.
 
 import { ask, store } from "./console.js";
+import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, Refused, useEffect, useState } from "./ui.js";
 
@@ -61,16 +62,16 @@ function Row({ session }) {
     setAnswer({ words: t.working });
     setAnswer(await ask(`${path}/${what}`, ""));
   };
-  const button = (what, words) => html`<button key=${what} data-session-do=${what} aria-label=${`${words}: ${session.name}`} onClick=${() => act(what)}>${words}</button>`;
+  const button = (what, words) => html`<button key=${what} data-session-do=${what} aria-label=${`${words}: ${seen(session.name)}`} onClick=${() => act(what)}>${words}</button>`;
   const cells = [length(session.length_s), t.size(session.bytes), session.lost, session.marks.length || "", session.cars.join(", ")];
   return html`<tr data-session=${session.name}>
-    <th scope="row">${session.name}</th>
+    <th scope="row">${seen(session.name)}</th>
     <td>${t.sessionStates[session.state] ?? session.state}${session.words && html`<br /><small>${session.words}</small>`}</td>
     ${cells.map((cell, index) => html`<td key=${index}>${cell}</td>`)}
     <td>
       <div class="controls">
         ${button("verify", t.verify)}
-        <a class="button" href=${`${path}/download`} download aria-label=${`${t.download}: ${session.name}`}>${t.download}</a>
+        <a class="button" href=${`${path}/download`} download aria-label=${`${t.download}: ${seen(session.name)}`}>${t.download}</a>
         ${Object.entries(t.exportAs).map(([kind, words]) => button(`export/${kind}`, words))}
         ${isHere() ? button("view", t.rerun) : html`<small>${t.rerunElsewhere}</small>`}
       </div>

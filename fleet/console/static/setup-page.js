@@ -1,6 +1,7 @@
 // The set-up page: find the cars, let each blink, give it a name, write the fleet file.
 
 import { ask } from "./console.js";
+import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, useEffect, useState } from "./ui.js";
 
@@ -14,7 +15,7 @@ function Found({ found, name, onName, busy, onBusy }) {
     setSaid(answer.ok ? t.setupBlinked : answer.words);
   };
   return html`<li class="card" data-link=${found.url}>
-    <p><strong>${found.url}</strong><br /><span class="hint">${found.words}</span> ${found.car && t.setupKnown(found.car)}</p>
+    <p><strong>${seen(found.url)}</strong><br /><span class="hint">${found.words}</span> ${found.car && t.setupKnown(found.car)}</p>
     <div class="controls">
       <button disabled=${busy} data-setup="blink" aria-label=${`${t.setupBlink}: ${found.url}`} onClick=${blink}>${t.setupBlink}</button>
       <label>${t.setupName} <input name="car" maxlength="32" autocapitalize="none" aria-label=${t.setupNameOf(found.url)} value=${name} onInput=${(event) => onName(event.target.value)} /></label>

@@ -50,8 +50,9 @@ export const trends = { falling: "↓ falling", steady: "→ steady", rising: "�
 export const stopStates = {
   asked: ["…", "asked"],
   stopping: ["…", "stopping"],
-  shown: ["✓", "stands, shown"],
+  shown: ["✓", "stood"],
   sent: ["□", "stop sent; nothing shows it"],
+  moved: ["▶", "moves again"],
   failed: ["✕", "NOT CONFIRMED"],
 };
 
@@ -70,7 +71,8 @@ export const t = {
   drive: "Drive",
   noCars: "No car is on the bus yet. `fleet up` connects the cars of your fleet file; `fleet up --sim 3` simulates three.",
   connecting: "Connecting to the console…",
-  past: (claim) => `(was ${claim})`,
+  past: (claim, ago) => `(was ${claim}, ${ago} ago)`,
+  old: (ago) => `Nothing new for ${ago}: what this card shows is at least that old.`,
   showsStops: "Shows stops",
   shows: { no: "no:", not_known_yet: "not known yet:", doubt: "in doubt, no plan uses it:" },
   consoleLost: "The console does not answer. A car that you drove stops by itself. STOP is still sent; look at the cars.",
@@ -85,6 +87,8 @@ export const t = {
   estopWhy: "What happened? (for the record)",
   cancel: "Cancel",
   estopped: "E-stopped",
+  stopVerbs: { stop: "STOP", estop: "E-stopped", pause: "Paused" },
+  stopDead: "STOP does not work on this device",
   endEstop: "End the e-stop…",
   endEstopSure: "Yes, end it: the cars may move again",
   resume: "Resume",
@@ -133,7 +137,7 @@ export const t = {
   select: "Cars to drive",
   selectHint: "Select at least one car.",
   padLabel: "Hold to drive",
-  padHint: "Hold a button, an arrow key, or W A S D. Release it and the cars stop.",
+  padHint: "Hold a button, an arrow key, or W A S D; forward and a turn are an arc. Release all and the cars stop.",
   driving: (motion, cars) => `${motion}: ${cars.join(", ")}`,
   lease: "Who drives",
   leaseOf: (holder, kind) => `${holder} (${kind})`,
@@ -167,12 +171,18 @@ export const t = {
     const of = (state) => cars.filter((car) => state.includes(car.state)).length;
     const waiting = of(["asked", "stopping"]);
     const parts = [`${of(["shown"])} of ${cars.length} shown`];
+    if (of(["moved"])) parts.push(`${of(["moved"])} moving again`);
     if (of(["sent"])) parts.push(`${of(["sent"])} sent`);
     if (waiting) parts.push(`${waiting} stopping`);
     if (of(["failed"])) parts.push(`${of(["failed"])} NOT stopped`);
     return parts.join(", ");
   },
-  took: (s) => (s === null ? "" : `after ${s.toFixed(1)} s`),
+  stopDetail: (state, at, took_s) =>
+    ({
+      shown: `at ${at}, shown after ${took_s.toFixed(1)} s`,
+      sent: `at ${at}`,
+      moved: `(stopped at ${at})`,
+    })[state] ?? `at ${at}`,
   plots: "Plots",
   plotCars: "Cars to plot",
   plotSpan: "Time shown",
@@ -240,7 +250,10 @@ export const t = {
   security: "Security",
   fingerprint: "Certificate, SHA-256:",
   wrongCodes: (count) => `Wrong codes since the console started: ${count}.`,
-  unpaired: "This device is not paired any more.",
+  unpaired: {
+    revoked: "This device is not paired any more. It stops no car: go to the cars, or type `fleet stop` in a terminal.",
+    expired: "The pairing of this device has expired. Only STOP still works.",
+  },
   pairAgain: "Pair it again",
   setup: "Set up",
   setupFile: (file, exists) => (exists ? `Links are written into ${file}. Everything else in it stays as it is.` : `${file} does not exist yet. The page creates it.`),

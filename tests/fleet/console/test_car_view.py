@@ -1,6 +1,8 @@
 """The view of a car on a page, by the car's messages."""
 
-from fleet.console.car_view import BatteryTrend, FleetView
+import pytest
+
+from fleet.console.car_view import SILENT_AFTER_S, BatteryTrend, FleetView
 from gateway.protocol.platforms import parse_platform
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -60,7 +62,9 @@ def test_a_gateway_that_has_gone_says_for_how_long() -> None:
     view.on_presence([], 25.0)
     (car,) = view.as_list(32.0)
     assert (car["gateway"], car["gone_s"]) == (False, 12)
-    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)"}, "it showed that before"
+    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)", "past_s": 22}, (
+        "it showed that before"
+    )
     assert (car["mode"]["asked"], car["mode"]["verdict"]) == ("unknown", "assumed")
 
 
@@ -108,7 +112,21 @@ def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
     view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
     assert view.as_list(10.0)[0]["motors"]["basis"] == "shown"
     (car,) = view.as_list(60.0)
-    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)"}
+    assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)", "past_s": 50}
+
+
+@pytest.mark.parametrize(("after_s", "silent_s"), [(SILENT_AFTER_S, None), (SILENT_AFTER_S + 0.1, 3), (90.0, 90)])
+def test_a_card_without_news_says_its_age_and_claims_no_link(after_s: float, silent_s: int | None) -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    view.car("red").on_message("state/link", pb.Link(state="online"), 9.0)
+    view.car("red").on_message("sensor/range", pb.Range(range_m=0.5), 10.0)
+    (car,) = view.as_list(10.0 + after_s)
+    assert car.get("silent_s") == silent_s
+    assert car["link"]["state"] == "unknown"
+    view.car("red").on_message("state/link", pb.Link(state="online"), 10.0 + after_s)
+    (car,) = view.as_list(10.0 + after_s)
+    assert ("silent_s" in car, car["link"]["state"]) == (False, "online")
 
 
 def test_a_car_that_cannot_show_its_stops_says_so() -> None:

@@ -7,11 +7,11 @@ from schemas.gen import fleet_v1_pb2 as pb
 def test_frames_are_bounded_and_readable() -> None:
     log = FrameLog()
     for number in range(2 * MAX_FRAMES):
-        log.on_frame("frame/rx", pb.RxFrame(data=b"$4WD\r\xff" + b"x" * 500, verdict=str(number)))
+        log.on_frame("frame/rx", pb.RxFrame(data=b"$4WD\r\xff\x07" + b"x" * 500, verdict=str(number)))
     frames = log.as_list()
     assert len(frames) == MAX_FRAMES
     assert frames[0]["verdict"] == str(2 * MAX_FRAMES - 1)
-    assert frames[0]["text"].startswith("$4WD\\r\\xff")
+    assert frames[0]["text"].startswith("$4WD\\r\\xff\\x07")
     assert len(frames[0]["text"]) < 2 * MAX_FRAME_BYTES
 
 

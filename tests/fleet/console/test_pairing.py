@@ -1,5 +1,7 @@
 """Pairing codes, cookies and the slow-down, on virtual time."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +19,7 @@ from fleet.console.connection_limit import (
     ConnectionLimit,
     LogLimit,
 )
-from fleet.console.pairing import BadBook, GuessLimit, PagePerson, PeopleBook, code_words, new_code
+from fleet.console.pairing import BadBook, GuessLimit, PagePerson, PeopleBook, UnknownPerson, code_words, new_code
 
 MIA = PagePerson("mia")
 CODES = st.text(pairing.CODE_ALPHABET, min_size=pairing.CODE_LENGTH, max_size=pairing.CODE_LENGTH)
@@ -55,6 +57,17 @@ def test_a_new_code_does_not_end_another_and_old_ones_are_forgotten() -> None:
 def test_a_code_is_for_a_name_and_a_rank(person: PagePerson) -> None:
     with pytest.raises(ValueError):
         PeopleBook().issue("K7QF3MXP", person, NOW)
+
+
+def test_a_code_is_for_the_people_of_the_fleet() -> None:
+    book = replace(PeopleBook(), people=("mia", "teacher"))
+    assert len(book.issue("K7QF3MXP", MIA, NOW).codes) == 1
+    with pytest.raises(UnknownPerson, match="teacher"):
+        book.issue("K7QF3MXP", PagePerson("teachr"), NOW)
+    assert PeopleBook.of_text(book.as_text()) == book
+    assert PeopleBook.of_text('{"codes": [], "devices": [], "address": ""}').people is None
+    with pytest.raises(UnknownPerson):
+        replace(book, people=()).issue("K7QF3MXP", MIA, NOW)
 
 
 def test_a_cookie_opens_for_a_month_then_only_stops_then_is_forgotten() -> None:

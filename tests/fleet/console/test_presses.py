@@ -34,7 +34,7 @@ def test_a_press_without_an_echo_ends_after_the_gap_and_stays_over() -> None:
     assert book.echo(1, 1, tick, 10.4) is None
     with pytest.raises(PressRefused, match="over"):
         book.begin(1, 1, RED, "forward", tick, 10.4)
-    assert book.begin(1, 2, RED, "forward", tick, 10.4).id == 2
+    assert book.begin(1, 2, RED, "forward", tick, 10.4)[0].id == 2
 
 
 def test_an_echo_after_the_gap_does_not_count_even_if_nothing_has_expired_it() -> None:
@@ -133,4 +133,29 @@ def test_a_sleep_of_the_computer_ends_every_press_and_no_tick_from_before_counts
     assert book.echo(1, 1, tick, 10.05) is None
     with pytest.raises(PressRefused):
         book.begin(1, 2, RED, "forward", tick, 10.05)
-    assert book.begin(1, 3, RED, "forward", book.tick(10.1), 10.1).id == 3
+    assert book.begin(1, 3, RED, "forward", book.tick(10.1), 10.1)[0].id == 3
+
+
+@pytest.mark.parametrize(
+    ("person", "holder", "takes"),
+    [("teacher", "pupil", True), ("pupil", "teacher", False), ("teacher", "head", False), ("pupil", "other", False)],
+)
+def test_a_lead_takes_a_car_from_a_person_and_nobody_else_takes_one(person: str, holder: str, *, takes: bool) -> None:
+    book, leads = PressBook(), ("head", "teacher")
+    tick = book.tick(10.0)
+    book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, leads=leads)
+    if not takes:
+        with pytest.raises(PressRefused, match=f"{holder} drives red"):
+            book.begin(2, 1, RED, "back", tick, 10.0, person=person, leads=leads)
+        assert [press.client for press in book.alive] == [1]
+        return
+    press, (taken,) = book.begin(2, 1, RED, "back", tick, 10.0, person=person, leads=leads)
+    assert (press.motion, taken.client) == ("back", 1)
+    assert [each.client for each in book.alive] == [2]
+    assert book.echo(1, 1, tick, 10.1) is None, "what was taken does not drive on"
+
+
+def test_no_press_outlives_the_bus() -> None:
+    book, tick = book_with_press()
+    assert [press.client for press in book.on_bus_lost()] == [1]
+    assert book.echo(1, 1, tick, 10.1) is None

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -41,6 +42,12 @@ from tests.support.processes import FleetProcesses, wait_for
 
 PEOPLE = ("teacher:lead", "mia", "thief")
 """The people who may drive red."""
+GUESTS = (
+    *("boss", "calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
+    *("hasty", "bomber", "merger", "nervous", "greedy"),
+    *(f"pupil{number}" for number in range(30)),
+)
+"""The people who drive other cars."""
 FLOOD = 40_000
 """Messages of a page that floods."""
 STOPS_AT_ONCE = 40
@@ -60,7 +67,8 @@ class ServerStage:
         self.fleet = fleet
         cars = ("red", *more)
         _, links = fleet.simulate(*(f"{car}:arduino:tcp" for car in cars), truth=True)
-        people = [word for name in PEOPLE for word in ("--person", name)]
+        listed = (*PEOPLE, *(f"{name}:other" for name in GUESTS))
+        people = [word for name in listed for word in ("--person", name)]
         for car, link in zip(cars, links, strict=True):
             fleet.gateway(link, *people, car=car, platform="arduino")
         self.judge = Judge.follow(fleet.bus, "red")
@@ -164,7 +172,7 @@ def test_a_stranger_on_the_network_gets_nothing(stage: ServerStage) -> None:
 
 def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> None:
     device = NetworkDevice(stage.lan_port)
-    assert device.pair(stage.code())["ok"]
+    assert device.pair(stage.code("mia"))["ok"]
     for flag in ("; HttpOnly", "; Secure", "; SameSite=Strict", "; Path=/"):
         assert flag in device.cookie_flags
     assert device.ask("GET", "/")[0] == 200
@@ -186,7 +194,31 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
     offered = json.loads(teacher.ask("POST", "/people", '{"t": "pair", "name": "eva", "rank": "person"}')[1])
     assert NetworkDevice(stage.lan_port).pair(offered["code"])["name"] == "eva"
     assert offered["qr"].startswith("data:image/svg+xml")
-    assert teacher.ask("POST", "/people", '{"t": "pair", "name": "Eva E", "rank": "person"}')[0] == 400
+    for name in ("Eva E", "nobody"):  # no name, and no person of this fleet
+        assert teacher.ask("POST", "/people", json.dumps({"t": "pair", "name": name, "rank": "person"}))[0] == 400
+
+
+def test_a_code_is_for_a_person_of_the_fleet_and_for_a_console_that_runs(stage: ServerStage, tmp_path: Path) -> None:
+    def pair(name: str, fleet: FleetProcesses = stage.fleet) -> tuple[int, str]:
+        done = CliRunner().invoke(cli, ["console", "pair", name], env=fleet.environment)
+        return done.exit_code, done.output
+
+    wait_for(lambda: pair("eva")[0] == 0, "the gateways have named their people")
+    codes = len(book_file(stage).read().codes)
+    code, words = pair("evaa")
+    assert (code, "eva" in words, " type " in words) == (2, True, False)
+    assert len(book_file(stage).read().codes) == codes
+    # Another fleet's console has ended, however that went. Its address is still in its file.
+    hub = FleetProcesses(free_endpoint(), tmp_path)
+    try:
+        ended = ConsoleProcess(hub, "--lan", "--lan-port", "0")
+        assert pair("eva", hub)[0] == 0, "that fleet lists nobody"
+        ended.process.kill()
+        ended.process.wait()
+        code, words = pair("eva", hub)
+        assert (code, "`fleet console --lan`" in words) == (2, True)
+    finally:
+        hub.close()
 
 
 def book_file(stage: ServerStage) -> PeopleFile:

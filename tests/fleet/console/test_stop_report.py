@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import pytest
+
 from fleet.client.outcome import Outcome
 from fleet.console.stop_report import StopReport
 from schemas.gen import fleet_v1_pb2 as pb
@@ -65,3 +67,36 @@ def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
     assert states(report)["red"][0] == "failed"
     report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 14.0)
     assert states(report)["red"][0] == "shown"
+
+
+def safety(motors: str, at_s: int, basis: str = "") -> Any:
+    found = pb.Safety(motors=motors, motors_basis=basis)
+    found.stamp.seconds = at_s
+    return found
+
+
+@pytest.mark.parametrize("basis", ["shown", "sent"])
+def test_a_car_that_moves_again_stands_no_more_and_keeps_its_time(basis: str) -> None:
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 1_000_000)
+    done = event("complete", basis=basis)
+    done.stamp.seconds = 50
+    report.on_event("red", done, 11.5)
+    report.on_safety("red", safety("on", 49), 11.6)
+    assert states(report)["red"][0] == basis, "this state is older than the stop"
+    report.on_safety("red", safety("off", 51, basis), 11.7)
+    report.on_safety("red", safety("unknown", 52), 11.8)
+    assert states(report)["red"][0] == basis
+    report.on_safety("red", safety("on", 53), 30.0)
+    (car,) = report.as_dict()["cars"]
+    assert (car["state"], car["at_ms"], car["took_s"]) == ("moved", 1_001_500, 1.5)
+    assert report.over
+
+
+def test_an_outcome_without_an_event_is_as_new_as_the_last_state() -> None:
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
+    report.on_safety("red", safety("stopping", 60), 10.1)
+    report.on_outcomes([Outcome("red", ok=True, phase="complete", basis="shown")], 11.0)
+    report.on_safety("red", safety("on", 60), 11.1)
+    assert states(report)["red"][0] == "shown"
+    report.on_safety("red", safety("on", 61), 11.2)
+    assert states(report)["red"][0] == "moved"
