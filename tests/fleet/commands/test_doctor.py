@@ -167,7 +167,7 @@ def test_why_did_red_not_stop_at_that_time(session: Path, tmp_path: Path) -> Non
     [
         (("why", "red", "--at", "13:01"), 2),
         (("why", "--session", "latest", "--at", "13:01"), 2),
-        (("why", "red", "--session", "latest", "--at", "9:00"), 1),
+        (("why", "red", "--session", "latest", "--at", "9:00"), 2),
         (("why", "red", "--session", "latest", "--at", "soon"), 2),
         (("why", "rde", "--session", "latest", "--at", "13:01"), 1),
         (("doctor", "red", "blue"), 2),

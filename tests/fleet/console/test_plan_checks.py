@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -25,9 +26,13 @@ async def checks() -> AsyncIterator[PlanChecks]:
 
 
 def workers() -> list[psutil.Process]:
-    """Return the processes that check plans, of this test."""
-    children = psutil.Process().children()
-    return [each for each in children if each.is_running() and "fleet.console.plan_checks" in each.cmdline()]
+    """Return the processes that check plans, of this test. Others of the test's process may have ended unnoticed."""
+    found = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # also of a zombie
+            if "fleet.console.plan_checks" in child.cmdline():
+                found.append(child)
+    return found
 
 
 async def test_a_plan_is_checked_as_the_parser_does(checks: PlanChecks) -> None:
