@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from gateway.control.senders import STREAM_PAUSE_S
 from gateway.protocol.enums import Light, Motion, ServoAction
 from gateway.protocol.frames import General, encode
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
@@ -384,7 +385,12 @@ def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
     try:
         for _ in range(40):
             page.keyboard.press("Escape")
-        wait_for(lambda: stage.person.car("blue").drive("forward", 10.0, wait=False).ok, "the last stop is over")
+
+        def drives() -> bool:
+            time.sleep(1.2 * STREAM_PAUSE_S)  # drives without this pause are refused after a stop, for ever
+            return stage.person.car("blue").drive("forward", 10.0, wait=False).ok
+
+        wait_for(drives, "the last stop is over")
         wait_for(lambda: stage.judges["blue"].driving, "blue drives")
         pressed_ns = time.time_ns()
         page.keyboard.press("Escape")
