@@ -80,13 +80,15 @@ class CarMonitor:
             model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
         if not isinstance(event, Sensors):
             return
-        before = model.mode.verdict
+        before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at)
         model.mode.on_reading(event, counts=settled)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
         # Somebody may have commanded it in the silence.
         if self._silent_since is not None or model.trust.state is CarTrust.UNHEARD:
             self._silent_since = None
+            # If a `MODE00` delays the report for longer than expected, the silence leads to the next one, for ever.
+            model.mode.allow_silence(silent_s)
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
         if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:

@@ -271,7 +271,7 @@ class Executor:
         model = self.model
         shown = model.trust.shown
         model.believed.on_written(frame, now)
-        block_s = model.profile.block_s(frame)
+        block_s = model.pacing.longest_block_s(frame)
         match frame:
             case ModeOpen(mode):
                 self.mode_sent = None

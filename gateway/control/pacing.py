@@ -52,10 +52,10 @@ class Pacing:
         self._written_at = now
         if not isinstance(frame, Reset):
             self._framed_at = now
-        self._block_s = self._longest_block_s(frame)
+        self._block_s = self.longest_block_s(frame)
         self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
 
-    def _longest_block_s(self, frame: Frame) -> float:
+    def longest_block_s(self, frame: Frame) -> float:
         """Return the maximum block of a frame, as expected and as this car has shown."""
         expected_s, kind = self.profile.block_s(frame), blocking_kind(frame)
         return expected_s if kind is None else max(expected_s, self.learned.block_s(kind, expected_s))

@@ -69,6 +69,11 @@ FOUND = (
         ),
         traits=CarTraits(spread_s=0.06858682185966497, silent_modes=frozenset({Mode.TRACKING}), text=True),
     ),
+    # `MODE00` delayed each report until the car counted as silent. So each report led to the next `MODE00`, for ever.
+    EpisodePlan(
+        91817, "arduino", "stm32", "no-echo", "drive", 0.8960729485160077, Ending.ESTOP, (),
+        traits=CarTraits(interval_s=1.3770950250146663, last_frame_wins=True), kept=True,
+    ),
 )  # fmt: skip
 
 

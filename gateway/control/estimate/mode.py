@@ -68,6 +68,8 @@ class ModeEstimator:
     """When the last reading arrived that fits the commanded mode, and the last that does not."""
     _excused_at: float = field(default=float("-inf"))
     """When silence was last expected. Unexpected silence is measured from here."""
+    _ended_silence_s: float = 0.0
+    """The longest silence on this link that was normal for this car after all (`allow_silence`)."""
     _matches: int = 0
     _mismatches: int = 0
     """Number of consecutive readings that fit the commanded mode, and that do not."""
@@ -110,6 +112,7 @@ class ModeEstimator:
         self.inferred = None
         self.candidates = ()
         self._matches = self._mismatches = 0
+        self._ended_silence_s = 0.0
         self._blocks.clear()
         self.verdict = Verdict.ASSUMED
         self.evidence = "the link was lost"
@@ -169,6 +172,14 @@ class ModeEstimator:
             words = f"no reading as in mode {self.asked} for {own_s:.1f} s, the last one is as in mode {shape}"
             self._conclude(Verdict.CONTRADICTED, words, now)
 
+    def allow_silence(self, silent_s: float) -> None:
+        """Take a silence that a report has ended for one that this car has at times, on this link.
+
+        A silence of over `FIRST_SILENCE_S` is none: the car was off or out of range.
+        """
+        if silent_s <= FIRST_SILENCE_S:
+            self._ended_silence_s = max(self._ended_silence_s, silent_s)
+
     def excuse_silence(self, now: float) -> None:
         """Count no silence from before now: nobody could hear the car."""
         self._excused_at = max(self._excused_at, now)
@@ -223,7 +234,7 @@ class ModeEstimator:
         if not learned.echo.is_known and not learned.no_echo.is_known:
             return FIRST_SILENCE_S
         longest_s = max(learned.no_echo.median_s, learned.echo.median_s + self.profile.ranging_s)
-        return max(MANUAL_SILENCE_S, longest_s + SILENCE_MARGIN_S)
+        return max(MANUAL_SILENCE_S, max(longest_s, self._ended_silence_s) + SILENCE_MARGIN_S)
 
     @property
     def _silent_modes(self) -> tuple[Mode, ...]:
