@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -436,7 +436,9 @@ class Console:
             case "take":
                 page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
             case "give_back":
-                self._stop_presses(set(message.cars()), "The car was given back.")
+                self._end_all(
+                    self._presses.drop_cars_of(set(message.cars()), page.person.name), "The car was given back."
+                )
                 page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
             case "inspect":
                 self._inspections.begin(page.number, message.cars()[0])
@@ -453,8 +455,13 @@ class Console:
                     page.operator.spawn(self._ask_coordinator(page, request_id, verb))
             case "do":
                 request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
-                if request.verb in (*STOPS, "mode"):
-                    self._stop_presses(set(cars), "The car was stopped.")
+                if request.verb in STOPS:
+                    self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
+                elif request.verb == "mode":
+                    leads = self._view.leads_of(cars)
+                    self._end_all(
+                        self._presses.drop_cars_of(set(cars), page.person.name, leads), "The car is in a mode."
+                    )
                 if request.verb in STOPS:
                     who = (page.operator.sender, request.verb)
                     self._waiting_stops.setdefault(who, []).append((cars, answer))
@@ -503,8 +510,8 @@ class Console:
         request_id = message.number("id")
         return lambda outcomes: page.answer(t="done", id=request_id, outcomes=outcomes)
 
-    def _stop_presses(self, cars: set[str], words: str) -> None:
-        for press in self._presses.drop_cars(cars):
+    def _end_all(self, presses: Iterable[HeldPress], words: str) -> None:
+        for press in presses:
             self._end(press, words)
 
     def _end(self, press: HeldPress, words: str, cars: Sequence[str] | None = None) -> None:

@@ -141,6 +141,17 @@ class PressBook:
         """End every press of these cars: they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))
 
+    def drop_cars_of(self, cars: set[str], person: str, leads: Collection[str] = ()) -> list[HeldPress]:
+        """End the presses of these cars that a person may end by anything but a stop.
+
+        Those are the person's own, and for a lead of the cars those of persons who are none.
+        """
+
+        def is_theirs(press: HeldPress) -> bool:
+            return press.person == person or (person in leads and press.person not in leads)
+
+        return self._end(lambda press: bool(cars & set(press.cars)) and is_theirs(press))
+
     def current(self, client: int) -> HeldPress | None:
         """Return the press of a page."""
         return self._presses.get(client)

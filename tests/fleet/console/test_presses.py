@@ -155,6 +155,26 @@ def test_a_lead_takes_a_car_from_a_person_and_nobody_else_takes_one(person: str,
     assert book.echo(1, 1, tick, 10.1) is None, "what was taken does not drive on"
 
 
+@pytest.mark.parametrize(
+    ("person", "holder", "ends"),
+    [
+        ("teacher", "pupil", True),
+        ("pupil", "teacher", False),
+        ("teacher", "head", False),
+        ("pupil", "other", False),
+        ("pupil", "pupil", True),
+    ],
+)
+def test_a_mode_or_a_car_given_back_ends_no_press_of_somebody_who_need_not_yield(
+    person: str, holder: str, *, ends: bool
+) -> None:
+    book, leads = PressBook(), ("head", "teacher")
+    book.begin(1, 1, RED, "forward", book.tick(10.0), 10.0, person=holder, leads=leads)
+    assert not book.drop_cars_of({"blue"}, person, leads)
+    assert bool(book.drop_cars_of({"red"}, person, leads)) is ends
+    assert bool(book.alive) is not ends
+
+
 def test_no_press_outlives_the_bus() -> None:
     book, tick = book_with_press()
     assert [press.client for press in book.on_bus_lost()] == [1]

@@ -252,6 +252,20 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     assert driver.ask("GET", "/sessions")[0] == 200
 
 
+def test_what_a_pupil_may_not_do_ends_no_press_of_a_lead(stage: ServerStage) -> None:
+    teacher, pupil = stage.device("teacher", "--rank", "lead"), stage.device("eva")
+    with teacher.socket() as page, pupil.socket() as other:
+        driving = hold(stage, page)
+        began_ns = time.time_ns()
+        for number, wish in enumerate(({"t": "give_back"}, {"t": "do", "verb": "mode", "mode": "tracking"})):
+            other.send(json.dumps({"id": number, "cars": ["red"], **wish}))
+            assert next_message(other, "done")["id"] == number
+        assert stage.judge.driving
+        assert all(on for at, on in stage.judge.motors if at > began_ns), "it drove on without a pause"
+    driving.join()
+    wait_for(lambda: not stage.judge.driving, "red stands")
+
+
 def test_a_plan_is_set_under_the_persons_name_also_without_an_open_page(stage: ServerStage) -> None:
     teacher = stage.device("teacher", "--rank", "lead")
     by: list[str] = []
