@@ -108,7 +108,7 @@ class CarMonitor:
         model.learned.on_fields(event, model.profile.rejects(event))
         if event.at > model.left_at + FLIGHT_S:
             model.left_until = float("-inf")
-            if model.trust.state is not CarTrust.IN_MODE:
+            if model.trust.state is not CarTrust.IN_MODE or model.mode.is_left:
                 model.learned.opened_as = ""
         if event.range_cm is not None:
             model.pacing.on_report(event.at)
@@ -152,14 +152,18 @@ class CarMonitor:
         model = self.model
         if model.platform.profile is model.profile or not model.link_open:
             return
-        may_replace = model.platform.open_mode and model.stop_style is StopStyle.BOTH
+        # Named frames with another head reach nobody, and readings with it are not read.
+        has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
+        may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):
             return
         model.treat_as(model.platform.profile)
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
         if model.platform.auto:  # a named one was corrected, and its contradiction says so
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
+        if has_other_head:
+            self._stops.recover(now, words)
+        elif model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
             # It can show its stop, and half a named frame may lie in its buffer.
             if model.known:
                 self._stops.begin(self._stops.full(now), FrameOrigin.RECOVERY, now)

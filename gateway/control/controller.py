@@ -646,7 +646,7 @@ class Controller:
             link_open=self.model.link_open,
             link_reason=self.model.link_reason,
             closing=self.stops.shutting_down,
-            asked=self.asked,
+            asked=Mode.MANUAL if self.model.mode.is_left and self._queue.mode_change is None else self.asked,
             hold=self.safety.hold,
             estops=self.safety.estops,
             ended=self.safety.ended,

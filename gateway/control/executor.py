@@ -294,7 +294,7 @@ class Executor:
                     model.evidence.sent_other()
                 if shown and frame != model.believed.with_fan(STOP_FRAME) and model.trust.shown:
                     self._doubt_rest(now)
-        if model.stop_style is StopStyle.GENERAL and model.mode.asked is None:
+        if model.stop_style is StopStyle.GENERAL and (model.mode.asked is None or model.mode.is_left):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:

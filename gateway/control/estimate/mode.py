@@ -81,6 +81,11 @@ class ModeEstimator:
         """Return the commanded mode if it is confirmed."""
         return self.asked if self.verdict is Verdict.CONFIRMED else None
 
+    @property
+    def is_left(self) -> bool:
+        """Return True if readings show mode 0 where another mode was commanded: the car has left it."""
+        return self.asked is not Mode.MANUAL and self.verdict is Verdict.CONTRADICTED and self.inferred is Mode.MANUAL
+
     def on_mode_sent(self, mode: Mode, *, now: float, block_s: float) -> None:
         """Record a written frame that brings the car into `mode` and blocks it for `block_s`."""
         # The car obeys after the block of the previous frame and one turn of the previous mode. If that mode is

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from gateway.control.commands import Drive, Stop
+from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import REACTED, Learned, Shows
-from gateway.protocol.enums import Motion
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platform_name import parse_option
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
@@ -196,3 +197,45 @@ def test_readings_end_the_option_that_there_are_none(platform: str, told: str, c
     assert model.shows_stops[0] is (Shows.NO if platform == "raspberry_pi" else Shows.YES)
     if platform == "raspberry_pi":
         assert not any(b"MODE" in data for _, data in pair.sent), "it would end some programs"
+
+
+def swapped(told: str, mode: Mode) -> Pair:
+    """Let the car's program change to a Raspberry Pi's on the link while a silent mode is open."""
+    name, auto = parse_option(told)
+    pair = Pair("arduino", told="arduino", start_s=2.0)
+    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.connect()
+    pair.until(lambda: pair.control.model.profile.kind == "arduino" and pair.control.is_free(pair.now), 30.0)
+    pair.ask(SetMode(mode), identity="mode")
+    pair.until(lambda: pair.control.model.mode.asked is mode, 15.0)
+    pair.run(6.0)
+    other = Pair("raspberry_pi", start_s=2.0)
+    pair.car = other.car
+    pair.car.advance(pair.now)
+    return pair
+
+
+@pytest.mark.parametrize("told", ["auto", "arduino"])
+def test_a_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
+    pair = swapped(told, Mode.COLOR_LED)
+    pair.until(lambda: pair.control.model.mode.is_left, 15.0)
+    answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
+    assert answer.status != "rejected", answer
+    pair.run(15.0)
+    last = pair.last_of("drive")
+    assert last is not None
+    assert last.phase in ("sent", "complete"), last
+    assert pair.control.model.learned.opened_as == "", "readings have shown mode 0"
+
+
+def test_another_head_is_used_as_soon_as_it_is_known() -> None:
+    pair = Pair(told="arduino+head=TANK", start_s=2.0)
+    pair.car.feed(b"$4WD,MODE21#", pair.now)
+    pair.run(4.0, linked=False)
+    pair.decoder.use_head("TANK")
+    pair.control.link_up(pair.now)
+    began = pair.now
+    pair.decoder = Decoder(head="TANK")
+    pair.until(lambda: pair.control.model.profile.dialect.head == "4WD", 3.0)
+    pair.until(lambda: pair.car.truth.mode is Mode.MANUAL, began + 6.0 - pair.now)
+    assert not pair.car.truth.driving
