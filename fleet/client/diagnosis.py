@@ -154,8 +154,10 @@ def _doubted(e: CarEvidence) -> str:
     doubted = health is not None and health.doubted
     if not doubted and (safety is None or safety.trust != "unproven"):
         return ""
-    before = "It has shown its stops before, and did" if doubted else "It could have shown its last stop, and did"
-    return f"{before} not show the last one. Plans leave it alone. {describe_end_of_doubt(e.car)}"
+    if not doubted:
+        return "Its reports do not show its last stop yet. Look at the car: it may be moving."
+    words = "It has shown its stops before, and did not show the last one. Plans leave it alone."
+    return f"{words} {describe_end_of_doubt(e.car)}"
 
 
 def _out_of_range(e: CarEvidence) -> str:
@@ -410,7 +412,10 @@ def describe_reports(health: Any) -> str:
             f", {each.replace('_', ' ')} +{health.blocks_s[each]:.2f} s" for each in sorted(health.blocks_s)
         )
         rhythm = f"every {health.interval_s:.2f} s (spread {health.interval_spread_s:.2f} s{blocks}); "
-    return f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
+    words = f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
+    # The reports of most arduino programs react, if the frames arrive.
+    is_odd = health.shows_stops == "no" and health.platform.partition("+")[0] == "arduino"
+    return f"{words}. If it obeys nothing: look at the wire to its RX pin" if is_odd else words
 
 
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:

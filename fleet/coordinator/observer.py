@@ -162,7 +162,7 @@ class FleetObserver:
             verdict=str(mode["verdict"]),
             evidence=str(mode["evidence"]),
             motors=str(safety["motors"]),
-            doubted=safety["trust"] == "unproven" or (health is not None and bool(health.fields["doubted"])),
+            doubted=health is not None and bool(health.fields["doubted"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
             estopped_by=estops[0].by if estops else None,
             paused_by=pauses[-1].by if pauses else None,

@@ -143,15 +143,13 @@ def test_a_doubted_car_is_a_finding_and_one_that_cannot_show_is_none() -> None:
     lost = pb.Link(state="online", rx_frames=500, rejects={"not_obeyed": 4})
     cannot_show = with_states(health=cannot, safety=sent, link=lost)
     assert diagnose(cannot_show) == []
-    assert dict(describe(cannot_show))["reports"].endswith("red's reports do not react to frames")
-    for doubted in (
-        with_states(health=pb.Health(platform="arduino", shows_stops="yes", doubted=True)),
-        ODD["not_shown"],
-    ):
-        (found,) = diagnose(doubted)
+    assert dict(describe(cannot_show))["reports"].startswith("red's reports do not react to frames")
+    is_doubted = with_states(health=pb.Health(platform="arduino", shows_stops="yes", doubted=True))
+    for evidence, ends in ((is_doubted, True), (ODD["not_shown"], False)):
+        (found,) = diagnose(evidence)
         assert found.code == "not_shown"
         assert found.todo == "fleet stop red"
-        assert "`fleet resume red`" in found.cause
+        assert ("`fleet resume red`" in found.cause) is ends, "only a doubt is ended by a person"
         assert "RX" not in found.cause
 
 
