@@ -16,10 +16,14 @@ WITHOUT_BUS: Final = frozenset(
 _PROPOSED: Final = re.compile(r"`(fleet [a-z][^`]*)`")
 
 
-def fleet_options(connect: str | None, fleet: str) -> str:
-    """Return the options that select a fleet. connect: its bus; None: the one that is taken without an option."""
+def fleet_options(connect: str | None, fleet: str, *, is_one_of_several: bool = False) -> str:
+    """Return the options that select a fleet. connect: its bus; None: the one that is taken without an option.
+
+    is_one_of_several: True to name the fleet also if it is the default.
+    """
     bus = f"--connect {connect}" if connect else ""
-    return " ".join(filter(None, (bus, "" if fleet == DEFAULT_FLEET else f"--fleet {fleet}")))
+    name = f"--fleet {fleet}" if is_one_of_several or fleet != DEFAULT_FLEET else ""
+    return " ".join(filter(None, (bus, name)))
 
 
 def complete_hints(words: str, options: str) -> str:

@@ -6,24 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import click
-from click.core import ParameterSource
 
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.supervision import fleets_on
-from fleet.commands.group import choose_fleet, chosen_person
+from fleet.commands.group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
 from fleet.commands.params import ALL_CARS
 from schemas.bus import Bus
-
-
-def is_named() -> bool:
-    """Return True if the user has named the fleet of the running command."""
-    at: click.Context | None = click.get_current_context()
-    while at is not None:
-        if at.get_parameter_source("fleet") not in (None, ParameterSource.DEFAULT):
-            return True
-        at = at.parent
-    return False
 
 
 def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
@@ -31,6 +20,8 @@ def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
     found = fleets_on(bus)
     if len(found) < 2:
         return [fleet]
+    if click.get_current_context(silent=True) is not None:  # not in the thread of a stop
+        name_fleet_in_hints()
     wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
     return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
 
@@ -117,6 +108,8 @@ def in_all_fleets(
         further = pool.submit(elsewhere)
         own = list(act(client))
         found = further.result()
+    if found:
+        name_fleet_in_hints()
     both = [*own, *found]
     # A car that is in one fleet only is missing in the others.
     answered = {each.car.rpartition("/")[2] for each in both if each.phase != NO_ANSWER}

@@ -14,6 +14,7 @@ from schemas.suggestion import did_you_mean
 PERSON: Final = "fleet.person"
 """Key of the value of --as in the context."""
 _BUS: Final = "fleet.bus"
+_NAMED: Final = "fleet.named"
 """Key of the chosen bus and fleet in the context."""
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -79,13 +80,31 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
 def choose_fleet(connect: str | None, fleet: str) -> None:
     """Remember by which options the user reaches the fleet, for the commands that messages propose."""
     click.get_current_context().meta[_BUS] = connect, fleet
+    if is_named():
+        name_fleet_in_hints()
+
+
+def name_fleet_in_hints() -> None:
+    """Name also the default fleet in the commands that messages propose: there are several, or the user named it."""
+    click.get_current_context().meta[_NAMED] = True
+
+
+def is_named() -> bool:
+    """Return True if the user has named the fleet of the running command."""
+    at: click.Context | None = click.get_current_context()
+    while at is not None:
+        if at.get_parameter_source("fleet") not in (None, ParameterSource.DEFAULT):
+            return True
+        at = at.parent
+    return False
 
 
 def hint_options(fleet: str = "") -> str:
     """Return the options that a proposed command needs. fleet: another one than that of the running command."""
     context = click.get_current_context(silent=True)
-    connect, chosen = (context.meta if context is not None else {}).get(_BUS, (None, DEFAULT_FLEET))
-    return fleet_options(connect, fleet or chosen)
+    known = context.meta if context is not None else {}
+    connect, chosen = known.get(_BUS, (None, DEFAULT_FLEET))
+    return fleet_options(connect, fleet or chosen, is_one_of_several=known.get(_NAMED, False))
 
 
 def say(words: str, *, err: bool = False, fleet: str = "") -> None:
