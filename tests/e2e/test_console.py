@@ -84,7 +84,7 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, ho
     for car in CARS:
         stage.stands(car)
     for car, kind in CARS.items():
-        state = "shown" if kind == "arduino" else "sent"  # the reports of the others do not react to frames
+        state = "shown" if kind.startswith("arduino") else "sent"  # the reports of the others do not react to frames
         report.locator(f"[data-stop={car}].stop-{state}").wait_for()
         page.locator(f"[data-car={car}]").get_by_text("On hold: you stopped it").wait_for()
 
@@ -260,15 +260,15 @@ def test_a_console_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
 @pytest.mark.parametrize("size", ["desktop", "phone"])
 def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage, size: str) -> None:
     phone = size == "phone"
-    page = stage.driving_page("blue", **(stage.playwright.devices["Pixel 7"] if phone else {}))
+    page = stage.driving_page("red", **(stage.playwright.devices["Pixel 7"] if phone else {}))
 
     def truth(name: str) -> Any:
-        return stage.sim.say({"car": "blue", "ask": "truth"})[name]
+        return stage.sim.say({"car": "red", "ask": "truth"})[name]
 
     def use(selector: str) -> None:
         page.locator(selector).tap() if phone else page.locator(selector).click()
 
-    def reaches(frame: bytes, selector: str, car: str = "blue") -> None:
+    def reaches(frame: bytes, selector: str, car: str = "red") -> None:
         frames = stage.judges[car].frames
         before = len(frames)
         use(selector)
@@ -296,7 +296,7 @@ def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage, size: st
     for mode in (*modes[1:], "manual"):
         use(f"[data-mode={mode}]")
         wait_for(lambda mode=mode: truth("mode") == mode, f"it is in mode {mode}")
-    page.locator("input[name=select-blue]").uncheck()
+    page.locator("input[name=select-red]").uncheck()
     page.locator("input[name=select-green]").check()
     up = encode(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))
     reaches(up, "[data-control=servo_vertical] button >> nth=0", "green")

@@ -64,6 +64,7 @@ OTHER_RESULTS: Final = {
     "fleet resume red": "still emergency-stopped",
     "fleet resume red blue --id 5f0c2e": "has no e-stop 5f0c2e",
     "fleet sessions at 14:05": "No session ran at 14:05",
+    "fleet why red --session latest --at 14:05": "is not in the session",
     "fleet sessions redecode": "",
     "fleet sessions vector --car red --from 10s --to 20s --out tracking.jsonl": "",
     "fleet sessions verify": "went back",

@@ -21,7 +21,7 @@ from tests.support.ports import free_port
 from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
 
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
-CARS = {"red": "arduino", "blue": "stm32+arm", "green": "raspberry_pi"}
+CARS = {"red": "arduino+arm", "blue": "stm32", "green": "raspberry_pi"}
 DESKTOP: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
 
 
