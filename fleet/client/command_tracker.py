@@ -167,7 +167,8 @@ class PendingCommand:
         elif isinstance(item, SupervisedCars):
             self._open -= 1
             self._on_supervised(item, at)
-        else:
+        elif self._named is None or self.concerns(item.car):
+            # A gateway forwards the end of an e-stop of the fleet under the same id. Those cars were not asked.
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _on_presence(self, change: PresenceChange, at: float) -> None:

@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from gateway.bus.requests import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, PersistedSafety
@@ -90,6 +91,9 @@ class EstopSync:
             case _:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
+        if isinstance(command.what, Resume | Unpause):
+            # Under the same id it would be refused as a duplicate, or the sender's own command, if that comes later.
+            payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
         key = keys.command_key(self._fleet, "*", command.verb)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)
         task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, payload.SerializeToString(), encoding))

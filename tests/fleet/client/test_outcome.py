@@ -7,7 +7,7 @@ import pytest
 
 from fleet.client import command_tracker
 from fleet.client.command_tracker import PendingCommand, QueryEnded
-from fleet.client.commands import mode_request
+from fleet.client.commands import mode_request, resume_request
 from fleet.client.effects import EFFECTS, STOP_VERBS
 from fleet.client.outcome import COMMAND_QUEUE_TIMEOUT_S, STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
@@ -231,6 +231,16 @@ def test_a_person_is_told_once_what_a_command_waits_for(
     pending.inbox.put((time.monotonic(), QueryEnded("red", "")))
     pending.wait()
     assert [record.getMessage() for record in caplog.records] == ["red: opens later"]
+
+
+def test_a_car_that_was_not_asked_has_no_outcome() -> None:
+    """Its gateway got the command from that of the named car, which forwards the end of an e-stop of the fleet."""
+    pending = PendingCommand("it", resume_request(["x"]), ["red", "blue"], ["red"], tuple, lambda car: None)
+    for car, phase in (("blue", "rejected"), ("red", "sent")):
+        pending.inbox.put((time.monotonic(), pb.CommandEvent(car=car, phase=phase)))
+    pending.inbox.put((time.monotonic(), QueryEnded("red", "")))
+    pending.wait()
+    assert [(each.car, each.ok) for each in pending.outcomes()] == [("red", True)]
 
 
 def test_each_verb_has_a_text() -> None:
