@@ -27,6 +27,11 @@ MAX_OPEN_CHECKS: Final = 2
 """Maximum number of checks of one person that wait. Others wait for those of each person before them."""
 COOLDOWN_S: Final = 15.0
 """Time for which a person whose page was closed opens no other one."""
+# A person clicks some two times a second: 60 commands at once after 30 s of slow Wi-Fi. The rate is ten times that, and
+# the burst three times: each command costs every gateway that is asked.
+COMMAND_BURST: Final = 200.0
+COMMAND_RATE: Final = 20.0
+"""Commands of one person that ask gateways, at once and per second. A press is one, also if it changes direction."""
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum commands of one person without an outcome. One command may be for many cars."""
 MAX_PERSONS: Final = 256
@@ -71,6 +76,7 @@ class _PersonBudget:
     messages: Allowance
     requests: Allowance
     checks: Allowance
+    commands: Allowance
     closed_until: float = float("-inf")
 
 
@@ -100,6 +106,10 @@ class Budgets:
         """Count a check of a plan. Return False if there were too many."""
         return self._of(person, now).checks.take(now)
 
+    def may_command(self, person: Hashable, now: float) -> bool:
+        """Count a command that asks gateways. Return False if there were too many."""
+        return self._of(person, now).commands.take(now)
+
     def _of(self, person: Hashable, now: float) -> _PersonBudget:
         found = self._persons.pop(person, None)
         if found is None:
@@ -107,6 +117,7 @@ class Budgets:
                 Allowance(PERSON_BURST, PERSON_RATE, at=now),
                 Allowance(REQUEST_BURST, REQUEST_RATE, at=now),
                 Allowance(CHECK_BURST, CHECK_RATE, at=now),
+                Allowance(COMMAND_BURST, COMMAND_RATE, at=now),
             )
         self._persons[person] = found
         if len(self._persons) > MAX_PERSONS:

@@ -410,6 +410,10 @@ class Console:
     def _on_message(self, page: PageLink, message: PageMessage) -> None:
         now = time.monotonic()
         self._end_presses_of_sleep()
+        if message.is_command:
+            cars = () if message.kind == "unpause" else message.cars()
+            if words := self._command_refusal(page, cars, now):
+                raise BadPageMessage(words)
         match message.kind:
             case "echo":
                 press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)
@@ -466,12 +470,21 @@ class Console:
                     who = (page.operator.sender, request.verb)
                     self._waiting_stops.setdefault(who, []).append((cars, answer))
                     self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
-                elif page.operator.is_busy:
-                    raise BadPageMessage(f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them.")
                 else:
                     page.operator.command(request, cars, answer)
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
+
+    def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
+        """Count a command to these cars. Return why it is not sent, empty if it is."""
+        # A query for a car that nobody knows would wait for an answer in a thread.
+        if unknown := set(cars).difference(self._view.names, self._fleet.sync.cars()):
+            return f"There is no car {min(unknown)}."
+        if page.operator.is_busy:
+            return f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them."
+        if not self.budgets.may_command(page.person.name, now):
+            return "Too many commands. Wait a few seconds."
+        return ""
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
         ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
@@ -482,6 +495,9 @@ class Console:
         before, person = self._presses.current(page.number), page.person.name
         if not self._fleet.sync.bus.connected:
             page.answer(t="over", press=press_id, words=_BUS_LOST)
+            return
+        if words := self._command_refusal(page, cars, now):
+            page.answer(t="over", press=press_id, words=words)
             return
         try:
             press, taken = self._presses.begin(

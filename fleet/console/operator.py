@@ -40,7 +40,7 @@ class ConsoleOperator:
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
         self._commands = 0
-        """Number of commands without an outcome, apart from stops of all."""
+        """Number of commands and of begun presses without an outcome, apart from stops of all."""
         self._stops: dict[tuple[str, str], PendingCommand] = {}
         """The newest stop of all cars without an outcome, by sender and verb."""
         self._renewals: set[str] = set()
@@ -57,6 +57,7 @@ class ConsoleOperator:
         """Start the cars of a press. A refusal of a car is reported; the other cars drive."""
         self._streams.pop((press.client, press.id), None)
         self.renew_press(press, time.monotonic())
+        self._commands += 1
         self.spawn(self._ask_first_drive(press, on_refusal))
 
     def renew_press(self, press: HeldPress, now: float) -> None:
@@ -90,7 +91,10 @@ class ConsoleOperator:
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
         # A stream is rejected without words from the second time on, a query never.
-        outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
+        try:
+            outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
+        finally:
+            self._commands -= 1
         for outcome in outcomes:
             if not outcome.ok and outcome.reason != "superseded":
                 on_refusal(outcome)

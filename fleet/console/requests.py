@@ -45,6 +45,12 @@ class PageMessage:
         return cls(fields)
 
     @property
+    def is_command(self) -> bool:
+        """True if the message asks gateways and has a budget. Stops have none; a press is answered in its own way."""
+        is_done = self.kind == "do" and self.fields.get("verb") not in STOPS
+        return is_done or self.kind in ("take", "give_back", "unpause")
+
+    @property
     def kind(self) -> str:
         """What the page wants."""
         return self.text("t", 16)

@@ -8,6 +8,7 @@ import math
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from websockets.typing import Origin
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
-from fleet.console.budgets import PAGE_BURST, PAGE_RATE
+from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.people_file import PeopleFile, people_path
@@ -45,6 +46,7 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 GUESTS = (
     *("boss", "calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
+    *("giver", "presser", "plotter", "pinger", "lister", "twotab"),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
@@ -555,6 +557,71 @@ def test_a_person_who_stops_again_and_again_takes_no_thread_for_each(stage: Serv
             elif message["t"] == "state" and message["stop"] is not None:
                 reports.append(message["stop"])
     assert threads_now < threads + STOPS_AT_ONCE / 2
+
+
+def allowed_commands(since: float) -> float:
+    """Return how many commands a person may have sent since this time (s, monotonic)."""
+    return COMMAND_BURST + COMMAND_RATE * (time.monotonic() - since)
+
+
+COMMANDS = 3 * int(COMMAND_BURST)
+"""Commands of a person that floods gateways."""
+
+
+@pytest.mark.parametrize("kind", ["take", "give_back", "unpause", "do"])
+def test_commands_in_a_flood_reach_gateways_at_a_persons_rate(stage: ServerStage, kind: str) -> None:
+    begun: list[str] = []
+
+    def note(sample: Sample) -> None:
+        event: Any = sample.message()
+        if event.phase == "asked":
+            begun.append(person_of(event.sender))
+
+    subscribed: Any = stage.fleet.bus.subscribe("fleet/red/event/command", note)
+    server, since = psutil.Process(stage.console.process.pid), time.monotonic()
+    with stage.device("giver").socket() as page:
+        text = json.dumps({"t": kind, "id": 1, "verb": "whistle", "cars": ["red"]})
+        for _ in range(COMMANDS):
+            page.send(text)
+        answers = answers_so_far(page)
+        threads = server.num_threads()
+    subscribed.undeclare()
+    assert answers["done"] <= allowed_commands(since)
+    assert begun.count("giver") <= allowed_commands(since)
+    assert threads < 150
+
+
+@pytest.mark.parametrize("kind", ["take", "give_back", "do"])
+def test_a_car_that_nobody_knows_is_refused_without_a_query(stage: ServerStage, kind: str) -> None:
+    with stage.device("giver").socket() as page:
+        for number in range(10):
+            page.send(json.dumps({"t": kind, "id": number, "verb": "whistle", "cars": ["red", f"ghost{number}"]}))
+        assert answers_so_far(page)["bad"] == 10
+
+
+def test_presses_begin_at_a_persons_rate(stage: ServerStage) -> None:
+    since, sent, over = time.monotonic(), 0, 0
+    with stage.device("presser").socket() as page:
+        while sent < COMMANDS:
+            message = json.loads(page.recv(30))
+            if message["t"] == "tick":
+                for _ in range(40):
+                    sent += 1
+                    motion = ("forward", "back")[sent % 2]
+                    press = {"t": "press", "press": sent, "cars": ["red"], "motion": motion, "n": message["n"]}
+                    page.send(json.dumps(press))
+            over += message["t"] == "over"
+        over += answers_so_far(page)["over"]
+    assert sent - over <= allowed_commands(since)
+
+
+def answers_so_far(page: ClientConnection) -> Counter[str]:
+    """Return how many messages of each kind come before the answer to a press that is refused."""
+    found = Counter[str]()
+    page.send(json.dumps({"t": "press", "press": 0, "cars": ["ghost"], "motion": "forward", "n": 0}))
+    while (message := json.loads(page.recv(30))).get("press") != 0:
+        found[message["t"]] += 1
+    return found
 
 
 def test_192_half_requests_of_one_cookie_lock_nobody_out(stage: ServerStage) -> None:
