@@ -1,5 +1,6 @@
 """Feeds the plots of the pages with every reading, at full rate, only while a page shows them."""
 
+import asyncio
 import json
 import logging
 from collections import deque
@@ -14,6 +15,9 @@ from schemas import keys, topics
 from schemas.bus import BusError, Sample
 
 _MAX_PLOT_SAMPLES: Final = 16_384
+# A gateway answers `busy` to whoever asks when some questions wait there. Pages must not take all these places.
+MAX_HISTORY_QUESTIONS: Final = 2
+"""Maximum number of questions for history at a time, of all pages. One page has one."""
 
 log = logging.getLogger("fleet")
 
@@ -24,6 +28,11 @@ class PlotFeed:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._buffers: dict[int, PlotBuffer] = {}
+        self._wanted: dict[int, tuple[PlotBuffer, float]] = {}
+        """The newest plot of each page whose history is not being read yet, and how far back it goes, s."""
+        self._reading: set[int] = set()
+        """The pages whose history is being read."""
+        self._questions = asyncio.Semaphore(MAX_HISTORY_QUESTIONS)
         self._plotted: frozenset[str] = frozenset()
         """The keys of the bus that pages plot."""
         # Twenty cars send 500 samples a second. To wake the loop for each would cost more than to decode it.
@@ -33,23 +42,38 @@ class PlotFeed:
         """Plot these series on a page instead of those before. Return what reads the gateways' history."""
         self._buffers[page] = PlotBuffer(series)
         self._note_plotted()
-        return self._read_history(page, self._buffers[page], since_s)
+        self._wanted[page] = self._buffers[page], since_s
+        return self._read_histories(page)
+
+    async def _read_histories(self, page: int) -> None:
+        """Read the history for the newest plot of a page, unless that is being done: then it follows."""
+        if page in self._reading:
+            return
+        self._reading.add(page)
+        try:
+            while (wanted := self._wanted.pop(page, None)) is not None:
+                await self._read_history(page, *wanted)
+        finally:
+            self._reading.discard(page)
 
     async def _read_history(self, page: int, buffer: PlotBuffer, since_s: float) -> None:
         for car, topic in buffer.keys:
-            if self._buffers.get(page) is not buffer:  # it has gone, or plots something else
-                return
-            if topics.TOPICS[topic].history_size > 1:
+            if topics.TOPICS[topic].history_size <= 1:
+                continue
+            async with self._questions:
+                if self._buffers.get(page) is not buffer:  # it has gone, or plots something else
+                    return
                 try:
                     past = await self._fleet.history(f"{car}/{topic}", since_s=since_s)
                 except (BusError, ValueError) as error:
                     log.warning("no history of %s/%s: %s", car, topic, error)
                     continue
-                for reading in past:
-                    buffer.add(car, topic, reading.value)
+            for reading in past:
+                buffer.add(car, topic, reading.value)
 
     def end(self, page: int) -> None:
         """Plot nothing on a page."""
+        self._wanted.pop(page, None)
         if self._buffers.pop(page, None) is not None:
             self._note_plotted()
 

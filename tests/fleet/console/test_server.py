@@ -624,6 +624,32 @@ def answers_so_far(page: ClientConnection) -> Counter[str]:
     return found
 
 
+def test_a_flood_of_plots_asks_one_question_at_a_time_and_the_newest_wins(stage: ServerStage) -> None:
+    held: list[zenoh.Query] = []
+    asked: list[str] = []
+
+    def hold(query: zenoh.Query) -> bool:
+        asked.append(str(query.key_expr).split("/")[1])
+        held.append(query)
+        return True
+
+    declared: Any = [stage.fleet.bus.queryable(f"fleet/{car}/sensor/range", hold) for car in ("first", "last")]
+    with stage.device("plotter").socket() as page:
+        for car in ("first",) * 50 + ("last",):
+            page.send(json.dumps({"t": "plot", "series": [[car, "sensor/range", "range_m"]], "since_s": 600}))
+        answers_so_far(page)
+        wait_for(lambda: held, "a gateway is asked")
+        held.pop().drop()  # the end of its answer
+        wait_for(lambda: held, "it is asked for the newest plot")
+        held.pop().drop()
+        page.send(json.dumps({"t": "plot", "series": [["last", "sensor/range", "range_m"]], "since_s": 600}))
+        wait_for(lambda: held, "it is asked for the next one")
+        held.pop().drop()
+    for each in declared:
+        each.undeclare()
+    assert asked == ["first", "last", "last"]
+
+
 def test_192_half_requests_of_one_cookie_lock_nobody_out(stage: ServerStage) -> None:
     greedy, calm = stage.device("greedy", source="127.0.0.20"), stage.device("calm")
     with greedy.socket() as page, contextlib.ExitStack() as kept:
