@@ -4,10 +4,13 @@ uvicorn parses all that one read has brought, up to 256 KiB: thousands of small 
 """
 
 import asyncio
-from typing import Final
+from typing import Final, cast
 
 from uvicorn._types import ASGIReceiveEvent
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
+
+from fleet.console.page_link import SEND_TIMEOUT_S
 
 PIECE_BYTES: Final = 1024
 """Bytes that are parsed at a time: some thirty of the smallest messages."""
@@ -15,6 +18,8 @@ CLOSED_INTERVAL_S: Final = 0.01
 """Interval of the pieces that come after the page was closed. Only its answer to the closing is of use."""
 CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout of that answer. A page that floods does not read it."""
+WRITE_BUFFER_BYTES: Final = 64 * 1024
+"""Bytes that wait for a page that does not read. The next message is not sent then. asyncio's own is 512 KiB for TLS."""
 
 
 class FairWebSocket(WebSocketsSansIOProtocol):
@@ -24,7 +29,9 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         """Begin with no bytes."""
         self._rest = bytearray()
         self._waits = False
+        self._full: asyncio.TimerHandle | None = None
         super().connection_made(transport)
+        transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
         self.close_timeout = CLOSE_TIMEOUT_S
 
     def data_received(self, data: bytes) -> None:
@@ -32,6 +39,51 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         self._rest += data
         if not self._waits:
             self._parse()
+
+    def pause_writing(self) -> None:
+        """Keep what is sent waiting. End the connection if the page does not read for too long."""
+        super().pause_writing()
+        # A message that closes it would wait behind the others.
+        self._full = self.loop.call_later(SEND_TIMEOUT_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Send on."""
+        super().resume_writing()
+        self._read_again()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End all waits."""
+        self._read_again()
+        super().connection_lost(exc)
+
+    def _read_again(self) -> None:
+        if self._full is not None:
+            self._full.cancel()
+            self._full = None
+
+    def handle_ping(self) -> None:
+        """Answer a ping, unless the page reads nothing: answers would pile up. Count it as a message."""
+        answer = b"".join(self.conn.data_to_send())
+        if self.writable.is_set():
+            self.transport.write(answer)
+        self._count()
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take the answer to our ping. Count any other one as a message."""
+        if bytes(event.data) != self.pending_ping_payload:
+            self._count()
+        super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        """Take a part of a message. Count it as a message, too: an empty one takes memory."""
+        super().handle_cont(event)
+        if not event.fin:
+            self._count()
+
+    def _count(self) -> None:
+        """Hand over an empty message, which the console only counts."""
+        if not self.close_sent:
+            self.queue.put_nowait(cast("ASGIReceiveEvent", {"type": "websocket.receive", "text": ""}))
 
     def _parse(self) -> None:
         self._waits = False

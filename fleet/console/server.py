@@ -209,7 +209,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
                         await _carry_out_stops(socket_, text, on_text)
                         await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
                         return
-                    on_text(text)
+                    if text:  # else it is a ping, which only counts
+                        on_text(text)
                     await asyncio.sleep(0)  # a page that floods must not keep the others waiting
         except TooManyPages as error:
             await socket_.close(TRY_AGAIN_LATER, str(error))

@@ -28,6 +28,7 @@ from fleet.client.commands import drive_request
 from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
+from fleet.console.page_link import SEND_TIMEOUT_S
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.request_body import BODY_TIMEOUT_S
 from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
@@ -57,6 +58,8 @@ INFLATED = 10_000_000
 """Size of a message that has some 10 kB when it is compressed: less than a page may send."""
 MAX_BOMB_MB = 5.0
 """Half of an inflated message."""
+MAX_UNREAD_MB = 5.0
+"""Growth by a page that reads nothing: its buffers, TLS, and what the allocator keeps."""
 WARM_UP = 2000
 """Connections until TLS and the allocator need no more memory. The first thousand take 17 MB, the next one about 1."""
 MAX_GROWTH_MB_PER_THOUSAND = 2.0
@@ -625,7 +628,7 @@ def answers_so_far(page: ClientConnection) -> Counter[str]:
 
 
 def test_a_flood_of_plots_asks_one_question_at_a_time_and_the_newest_wins(stage: ServerStage) -> None:
-    held: list[zenoh.Query] = []
+    held: list[Any] = []
     asked: list[str] = []
 
     def hold(query: zenoh.Query) -> bool:
@@ -648,6 +651,43 @@ def test_a_flood_of_plots_asks_one_question_at_a_time_and_the_newest_wins(stage:
     for each in declared:
         each.undeclare()
     assert asked == ["first", "last", "last"]
+
+
+def test_pings_count_as_messages(stage: ServerStage) -> None:
+    with stage.device("pinger").socket() as page:
+        with contextlib.suppress(OSError), page.protocol_mutex:
+            for _ in range(int(PAGE_BURST + 4 * PAGE_RATE)):
+                page.protocol.send_ping(b"x" * 125)
+            page.socket.sendall(b"".join(page.protocol.data_to_send()))
+        assert close_code(page) == SENT_TOO_MUCH
+
+
+def test_a_page_that_reads_nothing_is_closed_and_takes_no_memory(stage: ServerStage) -> None:
+    pinger, server = stage.device("pinger", source="127.0.0.61"), psutil.Process(stage.console.process.pid)
+    with socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        raw.bind(("127.0.0.61", 0))
+        raw.connect(("127.0.0.1", stage.lan_port))
+        with untrusting().wrap_socket(raw, server_hostname="127.0.0.1") as page:
+            lines = (
+                *("GET /ws HTTP/1.1", f"Host: 127.0.0.1:{stage.lan_port}", f"Origin: {pinger.origin}"),
+                *(f"Cookie: {pinger.cookie}", "Upgrade: websocket", "Connection: Upgrade"),
+                *("Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "", ""),
+            )
+            page.sendall("\r\n".join(lines).encode())
+            assert b" 101 " in page.recv(100)
+            address = page.getsockname()
+
+            def is_open() -> bool:
+                return any(each.raddr == address for each in server.net_connections("tcp"))
+
+            assert is_open()
+            before_mb = server.memory_info().rss / 1e6
+            ping = b"\x89\xfd\0\0\0\0" + b"x" * 125
+            for _ in range(40):  # fewer than it may send, and more than the buffers hold
+                page.sendall(ping * 100)
+            wait_for(lambda: not is_open(), "it is closed", 4 * SEND_TIMEOUT_S)
+            assert server.memory_info().rss / 1e6 < before_mb + MAX_UNREAD_MB
 
 
 def test_192_half_requests_of_one_cookie_lock_nobody_out(stage: ServerStage) -> None:
