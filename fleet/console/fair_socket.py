@@ -19,7 +19,7 @@ CLOSED_INTERVAL_S: Final = 0.01
 CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout of that answer. A page that floods does not read it."""
 WRITE_BUFFER_BYTES: Final = 64 * 1024
-"""Bytes that wait for a page that does not read. The next message is not sent then. asyncio's own is 512 KiB for TLS."""
+"""Bytes that wait for a page that does not read. The next message has to wait. asyncio's is 512 KiB for TLS."""
 
 
 class FairWebSocket(WebSocketsSansIOProtocol):

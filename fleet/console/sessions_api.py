@@ -5,13 +5,9 @@ The work runs in processes of its own with a low priority: a session of gigabyte
 
 import asyncio
 import json
-import os
 import shutil
-import sys
 import tempfile
-from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -26,18 +22,16 @@ from fleet.console.guard import PERSON
 from fleet.console.pairing import PagePerson
 from fleet.console.request_body import read_start
 from fleet.console.session_files import NotInFolder, files_of, read_file, session_path, zip_files
+from fleet.console.session_jobs import SessionJobs
 from fleet.replay.rerun.viewer import VIEWER_HOST, NoViewer, Viewer, free_port
 from schemas.bus import Failure
 from schemas.suggestion import how_to_install
 
-MAX_SESSION_JOBS: Final = 2
-"""Maximum number of processes at work. More requests wait."""
 MAX_EXPORTS: Final = 4
 """Maximum number of exports that wait for their download."""
 FORMATS: Final = ("csv", "parquet")
 _RECORDER_VERBS: Final = ("start", "stop", "mark", "status")
 _MAX_REQUEST_BYTES: Final = 8192
-_LOW_PRIORITY: Final = 5
 
 
 class SessionsApi:
@@ -51,8 +45,9 @@ class SessionsApi:
         self._fleet = fleet
         self._place = place
         self._refusal = refusal
-        self._slots = asyncio.Semaphore(MAX_SESSION_JOBS)
-        self._running: set[Process] = set()
+        self._jobs = SessionJobs()
+        self._listing: asyncio.Task[tuple[int, str, str]] | None = None
+        """The process that lists the sessions, for all who ask meanwhile."""
         self._scratch: Path | None = None
         self._exports: dict[str, Path] = {}
         self._number = 0
@@ -72,9 +67,7 @@ class SessionsApi:
 
     async def close(self) -> None:
         """End the processes, and remove what was exported."""
-        for process in list(self._running):
-            with suppress(ProcessLookupError):
-                process.kill()
+        self._jobs.kill()
         if self._viewer is not None:
             await asyncio.to_thread(self._viewer.close)
         if self._scratch is not None:
@@ -119,7 +112,10 @@ class SessionsApi:
     async def _list(self, _: Request) -> Response:
         if not self._place.is_dir():
             return JSONResponse({"place": str(self._place), "sessions": []})
-        code, out, err = await self._run("sessions", "list", str(self._place.absolute()), "--json")
+        if self._listing is None or self._listing.done():
+            work = self._jobs.run("sessions", "list", str(self._place.absolute()), "--json")
+            self._listing = asyncio.ensure_future(work)
+        code, out, err = await asyncio.shield(self._listing)
         if code:
             return refuse(err)
         listed = [json.loads(line) for line in out.splitlines()]
@@ -138,7 +134,7 @@ class SessionsApi:
         path, wrong = await self._find(request)
         if path is None:
             return wrong
-        code, out, err = await self._run("sessions", "verify", str(path))
+        code, out, err = await self._jobs.run_for(request, "sessions", "verify", str(path))
         return JSONResponse({"ok": code == 0, "words": out.strip() or err})
 
     async def _download(self, request: Request) -> Response:
@@ -157,7 +153,7 @@ class SessionsApi:
         if kind not in FORMATS:
             return refuse(f"there is no format {kind!r}", 404)
         out = self._new_path(f"{path.stem if path.is_file() else path.name}-{kind}")
-        code, said, err = await self._run("sessions", "export", str(path), f"--{kind}", str(out))
+        code, said, err = await self._jobs.run_for(request, "sessions", "export", str(path), f"--{kind}", str(out))
         if code:
             return refuse(err)
         self._exports[out.name] = out
@@ -179,7 +175,7 @@ class SessionsApi:
         if PERSON in request.scope:
             return refuse("Rerun opens on the computer of the console only.")
         rrd = self._new_path("session").with_suffix(".rrd")
-        code, _, err = await self._run("replay", str(path), "--save", str(rrd))
+        code, _, err = await self._jobs.run_for(request, "replay", str(path), "--save", str(rrd))
         if code:
             return refuse(err)
         try:
@@ -213,26 +209,6 @@ class SessionsApi:
             self._scratch = Path(tempfile.mkdtemp(prefix="fleet-console-"))
         self._number += 1
         return self._scratch / f"{name}-{self._number}"
-
-    async def _run(self, *arguments: str) -> tuple[int, str, str]:
-        """Run `fleet` in a process. Return its exit code, output, and the last line of its errors."""
-        async with self._slots:
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                *("-m", "fleet.cli", *arguments),
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=PIPE,
-                stderr=PIPE,
-            )
-            self._running.add(process)
-            with suppress(OSError, AttributeError):  # it has ended; there are no priorities (Windows)
-                os.setpriority(os.PRIO_PROCESS, process.pid, _LOW_PRIORITY)
-            try:
-                out, err = await process.communicate()
-            finally:
-                self._running.discard(process)
-        said = err.decode("utf-8", "replace").strip().splitlines()
-        return process.returncode or 0, out.decode("utf-8", "replace"), said[-1].removeprefix("fleet: ") if said else ""
 
 
 def _stream(data: Iterator[bytes], name: str) -> Response:

@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,4 +83,51 @@ def test_recordings_are_listed_verified_downloaded_and_exported_and_no_path_lead
         assert answer(console.port, "GET", f"/exports/{bad}")[0] == 404, bad
     assert ask(f"/sessions/{name}/verify", Origin="http://evil.example") == 403
     assert ask("/recording/stop", Cookie="") == 403
+    assert console.process.end() == 0
+
+
+REQUESTS = 40
+"""Requests that one person sends at once."""
+MAX_SLOWER = 6.0
+"""Ratio of times: a process beside those of others, at 2 at a time, and what a busy machine adds. All 40 need 20."""
+
+
+def send_request(port: int, verb: str, path: str, **headers: str) -> http.client.HTTPConnection:
+    """Send a request. Return its connection, whose answer nobody has read."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S * 2)
+    connection.request(verb, path, "", headers)
+    return connection
+
+
+@pytest.mark.parametrize(
+    ("verb", "kind", "kept"), [("GET", "", True), ("POST", "verify", True), ("POST", "verify", False)]
+)
+def test_many_requests_of_one_person_keep_no_other_request_waiting(
+    fleet: FleetProcesses, tmp_path: Path, verb: str, kind: str, kept: bool
+) -> None:
+    """Also if the clients of these requests have gone."""
+    path = tmp_path / "sessions" / "20260921T141320Z-fleet"
+    path.mkdir(parents=True)
+    written(path / "0001.mcap")
+    console = ConsoleProcess(fleet, "--sessions", str(path.parent))
+    own = {"Origin": console.address, "Cookie": cookie_of(console.port)}
+    flooded = f"/sessions/{path.name}/{kind}" if kind else "/sessions"
+
+    def list_time() -> float:
+        since = time.monotonic()
+        assert json.loads(answer(console.port, "GET", "/sessions")[1])["sessions"]
+        return time.monotonic() - since
+
+    alone_s = max(list_time(), list_time())
+    connections = [send_request(console.port, verb, flooded, **own) for _ in range(REQUESTS)]
+    if not kept:
+        for each in connections:
+            each.close()
+    assert list_time() < MAX_SLOWER * alone_s
+    if not kept:  # its own next request does not wait for them, either
+        since = time.monotonic()
+        assert answer(console.port, verb, flooded, "", **own)[0] == 200
+        assert time.monotonic() - since < MAX_SLOWER * alone_s
+    for each in connections:
+        each.close()
     assert console.process.end() == 0
