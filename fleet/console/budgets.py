@@ -1,4 +1,4 @@
-"""How much one page and one person may ask of the console. Pure: time is an argument (s, monotonic).
+"""How much one page, one device and one person may ask of the console. Pure: time is an argument (s, monotonic).
 
 The console stops the cars for everybody, on one loop. A page that sends without a pause must cost nobody but itself.
 So each has a budget, far above what our own page can send, and a page that exceeds it is closed. STOP is merged and
@@ -14,9 +14,9 @@ from typing import Final
 PAGE_BURST: Final = 5000.0
 PAGE_RATE: Final = 160.0
 """Messages of one page: at once, and per second."""
-PERSON_BURST: Final = 10_000.0
-PERSON_RATE: Final = 320.0
-"""The same for all pages of one person."""
+DEVICE_BURST: Final = 10_000.0
+DEVICE_RATE: Final = 320.0
+"""The same for all pages of one device."""
 REQUEST_BURST: Final = 1000.0
 REQUEST_RATE: Final = 50.0
 """HTTP requests of one person other than STOP: a page loads some 25 files."""
@@ -26,7 +26,7 @@ CHECK_RATE: Final = 1.0
 MAX_OPEN_CHECKS: Final = 2
 """Maximum number of checks of one person that wait. Others wait for those of each person before them."""
 COOLDOWN_S: Final = 15.0
-"""Time for which a person whose page was closed opens no other one."""
+"""Time for which a device whose page was closed opens no other one."""
 # A person clicks some two times a second: 60 commands at once after 30 s of slow Wi-Fi. The rate is ten times that, and
 # the burst three times: each command costs every gateway that is asked.
 COMMAND_BURST: Final = 200.0
@@ -35,7 +35,7 @@ COMMAND_RATE: Final = 20.0
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum commands of one person without an outcome. One command may be for many cars."""
 MAX_PERSONS: Final = 256
-"""Maximum number of remembered persons. The one that was idle the longest is forgotten."""
+"""Maximum number of remembered persons and devices. The one that was idle the longest is forgotten."""
 MERGE_S: Final = 0.1
 """Time for which further STOPs of one person are merged into one that follows."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
@@ -72,7 +72,7 @@ def page_budget(now: float) -> Allowance:
 
 
 @dataclass(slots=True)
-class _PersonBudget:
+class _Budget:
     messages: Allowance
     requests: Allowance
     checks: Allowance
@@ -82,21 +82,21 @@ class _PersonBudget:
 
 @dataclass(slots=True)
 class Budgets:
-    """The budgets of all persons, by name (None: of this computer)."""
+    """The budgets of all persons by name, and of their devices by id (None: of this computer)."""
 
-    _persons: dict[Hashable, _PersonBudget] = field(default_factory=dict)
+    _persons: dict[Hashable, _Budget] = field(default_factory=dict)
 
-    def may_send(self, person: Hashable, page: Allowance, now: float) -> bool:
-        """Count a message. Return False if the page has to be closed: it, or its person, has sent too many."""
-        one = self._of(person, now)
+    def may_send(self, device: Hashable, page: Allowance, now: float) -> bool:
+        """Count a message. Return False if the page has to be closed: it, or its device, has sent too many."""
+        one = self._of(device, now)
         if page.take(now) and one.messages.take(now):
             return True
         one.closed_until = now + COOLDOWN_S
         return False
 
-    def may_open(self, person: Hashable, now: float) -> bool:
-        """Return False if a page of this person was closed a moment ago."""
-        return now >= self._of(person, now).closed_until
+    def may_open(self, device: Hashable, now: float) -> bool:
+        """Return False if a page of this device was closed a moment ago."""
+        return now >= self._of(device, now).closed_until
 
     def may_ask(self, person: Hashable, now: float) -> bool:
         """Count an HTTP request. Return False if there were too many."""
@@ -110,11 +110,11 @@ class Budgets:
         """Count a command that asks gateways. Return False if there were too many."""
         return self._of(person, now).commands.take(now)
 
-    def _of(self, person: Hashable, now: float) -> _PersonBudget:
+    def _of(self, person: Hashable, now: float) -> _Budget:
         found = self._persons.pop(person, None)
         if found is None:
-            found = _PersonBudget(
-                Allowance(PERSON_BURST, PERSON_RATE, at=now),
+            found = _Budget(
+                Allowance(DEVICE_BURST, DEVICE_RATE, at=now),
                 Allowance(REQUEST_BURST, REQUEST_RATE, at=now),
                 Allowance(CHECK_BURST, CHECK_RATE, at=now),
                 Allowance(COMMAND_BURST, COMMAND_RATE, at=now),

@@ -196,15 +196,17 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
         person = socket_.scope.get(PERSON)
+        # By device: another tablet of the same person does not pay for this one.
         name, budget = person and person.name, page_budget(time.monotonic())
-        if not console.budgets.may_open(name, time.monotonic()):
+        device = socket_.scope.get(DEVICE)
+        if not console.budgets.may_open(device, time.monotonic()):
             await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
             return
         try:
             async with _joined(console, socket_, lan) as on_text:
                 while True:
                     text = await socket_.receive_text()
-                    if not console.budgets.may_send(name, budget, time.monotonic()):
+                    if not console.budgets.may_send(device, budget, time.monotonic()):
                         log.warning("a page of %s was closed: it sent too much", name or "this computer")
                         await _carry_out_stops(socket_, text, on_text)
                         await socket_.close(SENT_TOO_MUCH, TOO_MUCH)

@@ -45,7 +45,7 @@ def test_a_flood_closes_the_page_and_no_page_of_another_person() -> None:
     assert budgets.may_send("bob", page_budget(1.0), 1.0)
 
 
-def test_a_new_page_brings_its_person_no_new_budget() -> None:
+def test_a_new_page_brings_its_device_no_new_budget() -> None:
     budgets, taken = Budgets(), 0
     for _ in range(20):
         page = page_budget(0.0)

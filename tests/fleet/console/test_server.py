@@ -653,6 +653,22 @@ def test_a_flood_of_plots_asks_one_question_at_a_time_and_the_newest_wins(stage:
     assert asked == ["first", "last", "last"]
 
 
+def test_another_device_of_a_person_who_floods_stays_live(stage: ServerStage) -> None:
+    flooder, calm = stage.device("twotab"), stage.device("twotab")
+    text = '{"t":"echo","n":1,"press":1}'
+    with calm.socket() as page:
+        for _ in range(2):  # the second one finds its device locked, or what is left of its budget
+            with flooder.socket() as flooding:
+                with contextlib.suppress(ConnectionClosed):
+                    for _ in range(FLOOD):
+                        flooding.send(text)
+                assert close_code(flooding) == SENT_TOO_MUCH
+        page.send(text)
+        assert answers_so_far(page)["tick"]
+        with calm.socket() as again:
+            assert json.loads(again.recv(30))["t"] == "hello"
+
+
 def test_pings_count_as_messages(stage: ServerStage) -> None:
     with stage.device("pinger").socket() as page:
         with contextlib.suppress(OSError), page.protocol_mutex:
