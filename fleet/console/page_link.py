@@ -69,4 +69,6 @@ class PageLink:
                 # The tick first: its echo keeps a car driving.
                 kind = "tick" if "tick" in self._newest else next(iter(self._newest), "")
                 text = self._answers.popleft() if self._answers and kind != "tick" else self._newest.pop(kind)
-                await asyncio.wait_for(self._send(text), SEND_TIMEOUT_S)
+                # Python 3.11's wait_for forgets a cancellation that comes as the message is sent.
+                async with asyncio.timeout(SEND_TIMEOUT_S):
+                    await self._send(text)

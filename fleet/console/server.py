@@ -26,6 +26,7 @@ from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
 from fleet.console.fair_socket import FairWebSocket
 from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
+from fleet.console.log_rate import LogRate
 from fleet.console.pairing import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.plan_checks import TooManyChecks
@@ -60,6 +61,9 @@ SENT_TOO_MUCH: Final = 4008
 """Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
 _CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout for open connections when the console ends."""
+
+_LOGGERS: Final = ("fleet", "asyncio", "uvicorn.error")
+"""The loggers whose lines a flood causes: asyncio has one for each write to a TLS connection that has gone."""
 
 log = logging.getLogger("fleet")
 
@@ -141,6 +145,9 @@ async def serve(
 
     place: the sessions folder. file: the fleet file. lan: what serves the network, too.
     """
+    rate = LogRate()
+    for name in _LOGGERS:
+        logging.getLogger(name).addFilter(rate)
     console = Console(fleet, place, file)
     servers = [(ConsoleServer(_config(guarded_app(console, listener.getsockname()[1], lan))), listener)]
     running = [asyncio.ensure_future(console.run())]
@@ -301,6 +308,7 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
     finally:
         console.remove_page(page)
         sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
 
 
 async def _carry_out_stops(socket_: WebSocket, text: str, on_text: Callable[[str], None]) -> None:

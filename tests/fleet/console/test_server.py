@@ -28,8 +28,10 @@ from fleet.client.commands import drive_request
 from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
+from fleet.console.log_rate import LOG_BURST
 from fleet.console.page_link import SEND_TIMEOUT_S
 from fleet.console.people_file import PeopleFile, people_path
+from fleet.console.plot_buffer import MAX_SERIES
 from fleet.console.request_body import BODY_TIMEOUT_S
 from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
 from schemas.bus import Sample, reply_message
@@ -667,6 +669,25 @@ def test_another_device_of_a_person_who_floods_stays_live(stage: ServerStage) ->
         assert answers_so_far(page)["tick"]
         with calm.socket() as again:
             assert json.loads(again.recv(30))["t"] == "hello"
+
+
+def test_a_flood_fills_no_log(stage: ServerStage) -> None:
+    asked: list[str] = []
+
+    def refuse(query: zenoh.Query) -> bool:
+        asked.append(str(query.key_expr))
+        return False  # busy
+
+    declared: Any = stage.fleet.bus.queryable("fleet/slow$*/sensor/range", refuse)
+    series = [[f"slow{number}", "sensor/range", "range_m"] for number in range(MAX_SERIES)]
+    with stage.device("plotter").socket() as page:
+        for count in (1, 2):
+            page.send(json.dumps({"t": "plot", "series": series, "since_s": 600}))
+            wait_for(lambda count=count: len(asked) == count * len(series), "all gateways were asked")
+        page.send(json.dumps({"t": "plot", "series": series[:1], "since_s": 600}))
+        wait_for(lambda: len(asked) > 2 * len(series), "the answers before have come")
+    declared.undeclare()
+    assert 1 <= stage.log().count("not every gateway answered") <= LOG_BURST + 2
 
 
 def test_pings_count_as_messages(stage: ServerStage) -> None:

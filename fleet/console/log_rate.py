@@ -1,0 +1,30 @@
+"""Limits the lines of the log by their cause: whoever floods the console must not fill a disk. Pure."""
+
+import logging
+from typing import Final
+
+from fleet.console.budgets import Allowance
+
+LOG_BURST: Final = 50.0
+"""Lines of one cause at once: more than a person reads, and a class that joins is still seen whole."""
+LOG_RATE: Final = 0.1
+"""Lines of one cause per second after that: one in 10 s, as of the other limits of the log."""
+
+
+class LogRate(logging.Filter):
+    """Lets so many lines of each cause pass, and counts the others. The cause is the line of code that logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._allowances: dict[tuple[str, int], Allowance] = {}
+        self._left_out: dict[tuple[str, int], int] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True if the line is logged. It says how many lines were left out before."""
+        cause, now = (record.pathname, record.lineno), record.created
+        if not self._allowances.setdefault(cause, Allowance(LOG_BURST, LOG_RATE, at=now)).take(now):
+            self._left_out[cause] = self._left_out.get(cause, 0) + 1
+            return False
+        if left_out := self._left_out.pop(cause, 0):
+            record.msg, record.args = f"{record.getMessage()} ({left_out} more like this were left out)", ()
+        return True
