@@ -4,6 +4,7 @@ uvicorn parses all that one read has brought, up to 256 KiB: thousands of small 
 """
 
 import asyncio
+import socket
 from typing import Final, cast
 
 from uvicorn._types import ASGIReceiveEvent
@@ -32,6 +33,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         self._full: asyncio.TimerHandle | None = None
         super().connection_made(transport)
         transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
+        # The kernel's own grows to some megabytes: a page that reads nothing would be noticed after minutes.
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
         self.close_timeout = CLOSE_TIMEOUT_S
 
     def data_received(self, data: bytes) -> None:

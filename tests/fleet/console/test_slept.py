@@ -20,7 +20,7 @@ async def test_a_press_from_before_a_sleep_is_over_although_the_page_still_answe
     ticks: list[int] = []
     try:
         async with Fleet(hub.endpoint, person="teacher", kind="person") as fleet:
-            assert hub.bus.connected
+            hub.bus.token("fleet/red")
             sleep = SleepWatch((lambda: time.monotonic() + slept_s[0], time.monotonic))
             console = Console(fleet, tmp_path, tmp_path / "fleet.yaml", sleep)
 
