@@ -106,7 +106,7 @@ class ServerStage:
         """Drive red as another person."""
         wish = replace(drive_request("forward", LONG_S, wait=False), take=True)
         while not (outcome := self.person.ask(wish, ["red"])[0]).ok:
-            assert outcome.reason in ("held", "expired"), outcome  # the latter on a machine that stalls
+            assert outcome.reason in ("held", "expired", "leased"), outcome  # a test before, or a machine that stalls
             time.sleep(0.6)  # after a stop, the gateway rejects a stream that does not pause
         wait_for(lambda: self.judge.driving, "red drives")
 
@@ -437,7 +437,7 @@ def test_what_is_too_large_or_elsewhere_is_refused(stage: ServerStage, where: st
     with device.socket() if where == "network" else loopback_socket(stage) as page:
         page.send("x" * (MAX_MESSAGE_BYTES + 1))
         read_to_the_end(page)
-        assert page.close_code == 1009
+        assert page.close_code in (1009, 1006)  # what is still being sent may reset the connection first
 
 
 def loopback_cookie(stage: ServerStage) -> str:
@@ -518,7 +518,7 @@ def test_a_message_that_inflates_a_thousandfold_is_refused_by_its_size(stage: Se
         with contextlib.suppress(ConnectionClosed):
             page.send(text if parts == 1 else itertools.repeat(text, parts))
         read_to_the_end(page)
-        assert page.close_code == 1009
+        assert page.close_code in (1009, 1006)  # what is still being sent may reset the connection first
     assert server.memory_info().rss / 1e6 < before_mb + MAX_BOMB_MB
 
 
