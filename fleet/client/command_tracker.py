@@ -17,7 +17,7 @@ from schemas.commands import STOPS
 ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
 WAIT_SAID_S: Final = 1.0
-"""Time after which it is said that a command waits for a busy car."""
+"""Time until the message that a command waits for a busy car."""
 _MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 
@@ -83,7 +83,7 @@ class PendingCommand:
         self._late_at: float | None = self._asked_at + ANSWER_TIMEOUT_S
         """Time of the warning about missing answers. None after the warning."""
         self._waits_said: set[str] = set()
-        """Cars of which it was said that the command waits for them."""
+        """Busy cars that were named in a message."""
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
             self._of(car)

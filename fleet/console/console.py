@@ -461,16 +461,13 @@ class Console:
                 request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
                 if request.verb in STOPS:
                     self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
-                elif request.verb == "mode":
-                    leads = self._view.leads_of(cars)
-                    self._end_all(
-                        self._presses.drop_cars_of(set(cars), page.person.name, leads), "The car is in a mode."
-                    )
-                if request.verb in STOPS:
                     who = (page.operator.sender, request.verb)
                     self._waiting_stops.setdefault(who, []).append((cars, answer))
                     self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
                 else:
+                    if request.verb == "mode":
+                        theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
+                        self._end_all(theirs, "The car is in a mode.")
                     page.operator.command(request, cars, answer)
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")

@@ -88,7 +88,7 @@ class PressBook:
             raise PressRefused("The cars were stopped just now. Press again.")
         taken = [other for other in self._presses.values() if other.client != client and set(cars) & set(other.cars)]
         for other in taken:
-            if person not in leads or other.person in leads:
+            if not _outranks(person, other, leads):
                 shared = " and ".join(sorted(set(cars) & set(other.cars)))
                 raise PressRefused(f"{_driver(other, person)} drives {shared}.")
         for other in taken:
@@ -146,11 +146,9 @@ class PressBook:
 
         Those are the person's own, and for a lead of the cars those of persons who are none.
         """
-
-        def is_theirs(press: HeldPress) -> bool:
-            return press.person == person or (person in leads and press.person not in leads)
-
-        return self._end(lambda press: bool(cars & set(press.cars)) and is_theirs(press))
+        return self._end(
+            lambda press: bool(cars & set(press.cars)) and (press.person == person or _outranks(person, press, leads))
+        )
 
     def current(self, client: int) -> HeldPress | None:
         """Return the press of a page."""
@@ -164,6 +162,10 @@ class PressBook:
         for press in over:
             del self._presses[press.client]
         return over
+
+
+def _outranks(person: str, press: HeldPress, leads: Collection[str]) -> bool:
+    return person in leads and press.person not in leads
 
 
 def _driver(press: HeldPress, person: str) -> str:

@@ -9,7 +9,6 @@ import signal
 import socket
 import time
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,7 @@ from gateway.control.senders import STREAM_PAUSE_S
 from gateway.protocol.enums import Light, Motion, ServoAction
 from gateway.protocol.frames import General, encode
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
-from tests.support.ports import free_endpoint
-from tests.support.processes import FleetProcesses, wait_for
+from tests.support.processes import wait_for
 
 pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
 
@@ -35,19 +33,6 @@ TTL_S = 0.5
 BLOCK_S = 1.0
 """The longest block of a car in mode 0: a ranging without echo."""
 STOPPED_WITHIN_S = TTL_S + BLOCK_S + 0.5
-
-
-@pytest.fixture(scope="module")
-def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleStage]:
-    stage = ConsoleStage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("console")))
-    yield stage
-    stage.close()
-
-
-@pytest.fixture
-def stage(stages: ConsoleStage) -> Iterator[ConsoleStage]:
-    yield stages
-    stages.rest()
 
 
 def drive_all(stage: ConsoleStage) -> None:

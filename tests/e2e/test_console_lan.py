@@ -91,7 +91,7 @@ def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_p
         wait_for(lambda: not judge.driving, "red stands")
         expect(phone.locator(".banner")).to_contain_text(["This device is not paired any more. It stops no car"])
         expect(phone.locator("#stop")).to_have_text("⬣ STOP does not work on this device")
-        # What the page says is so.
+        # The texts of the page are true.
         with Client(fleet.endpoint, sender="teacher", kind="person") as lead:
             lead.car("red").drive("forward", 10.0, wait=False).check()
             wait_for(lambda: judge.driving, "red drives")

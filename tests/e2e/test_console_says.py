@@ -4,7 +4,6 @@ import contextlib
 import re
 import signal
 import time
-from collections.abc import Iterator
 
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -14,24 +13,14 @@ from gateway.protocol.enums import Motion
 from gateway.protocol.frames import General, encode
 from schemas.topics import TOPICS
 from tests.support.console import CARS, ConsoleStage
-from tests.support.ports import free_endpoint
-from tests.support.processes import PATIENCE_S, FleetProcesses, freeze, wait_for
+from tests.support.processes import PATIENCE_S, freeze, wait_for
 
 pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
 
 
-@pytest.fixture(scope="module")
-def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleStage]:
+@pytest.fixture(scope="module", autouse=True)
+def patient() -> None:
     expect.set_options(timeout=PATIENCE_S * 1000)
-    stage = ConsoleStage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("says")))
-    yield stage
-    stage.close()
-
-
-@pytest.fixture
-def stage(stages: ConsoleStage) -> Iterator[ConsoleStage]:
-    yield stages
-    stages.rest()
 
 
 def hold_key(stage: ConsoleStage, page: Page, key: str, car: str = "red") -> None:

@@ -30,12 +30,6 @@ def stages(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
     stage.close()
 
 
-@pytest.fixture
-def stage(stages: ConsoleStage) -> Iterator[ConsoleStage]:
-    yield stages
-    stages.rest()
-
-
 def sessions_page(stage: ConsoleStage) -> Page:
     page = stage.page("#/sessions")
     page.locator("[data-session]").first.wait_for()

@@ -7,9 +7,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import psutil
 import pytest
@@ -18,13 +16,11 @@ from websockets.sync.client import ClientConnection
 
 from tests.fleet.console.test_server import ServerStage
 from tests.support.network_client import NetworkDevice
-from tests.support.ports import free_endpoint
-from tests.support.processes import FleetProcesses, wait_for
+from tests.support.processes import wait_for
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
 
 CLASS_S = float(os.environ.get("CLASS_S", "600"))
-MORE_CARS = ("blue", "green", "black", "white", "pink")
 DEVICES = 30
 TABS = 40
 MAX_SHARE = 0.6
@@ -56,15 +52,6 @@ class Tab:
                     self.page.send(json.dumps({"t": "echo", "press": 1, "n": message["n"]}))
         except ConnectionClosed:
             self.closed = True
-
-
-@pytest.fixture
-def stage(tmp_path: Path) -> Iterator[ServerStage]:
-    fleet = FleetProcesses(free_endpoint(), tmp_path)
-    try:
-        yield ServerStage(fleet, *MORE_CARS)
-    finally:
-        fleet.close()
 
 
 def load_page(device: NetworkDevice) -> None:

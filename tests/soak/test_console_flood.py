@@ -21,8 +21,7 @@ from schemas.keys import person_of
 from tests.fleet.console.test_server import ServerStage, press_until_closed
 from tests.support.network_client import NetworkDevice
 from tests.support.page_flood import start_flood
-from tests.support.ports import free_endpoint
-from tests.support.processes import FleetProcesses, wait_for
+from tests.support.processes import wait_for
 from tests.support.recording import Recording
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
@@ -33,7 +32,6 @@ DRIVE_S = min(60.0, FLOOD_S)
 """Time for which a car is driven in a flood without stops: each STOP would end the drive, as it has to."""
 CALM_PRESSES = min(60, PRESSES)
 SETTLED_NS = 1_000_000_000
-MORE_CARS = ("blue", "green", "black", "white", "pink")
 PUPILS = 3
 MAX_STOP_S = 0.15
 """Maximum time from the press to the first byte on the wire, of 99 in 100."""
@@ -98,15 +96,6 @@ def flood(stage: ServerStage, pupils: list[NetworkDevice], *kinds: str) -> Itera
     for process in processes:
         assert process.end() == 0, process.stderr
         print(f"\na pupil in {time.monotonic() - began:.0f} s: {process.line()}", end="")
-
-
-@pytest.fixture
-def stage(tmp_path: Path) -> Iterator[ServerStage]:
-    fleet = FleetProcesses(free_endpoint(), tmp_path)
-    try:
-        yield ServerStage(fleet, *MORE_CARS)
-    finally:
-        fleet.close()
 
 
 def pauses_of_a_drive(stage: ServerStage, teacher: NetworkDevice) -> int:

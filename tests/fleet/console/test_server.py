@@ -645,10 +645,10 @@ def test_a_flood_of_plots_asks_one_question_at_a_time_and_the_newest_wins(stage:
         answers_so_far(page)
         wait_for(lambda: held, "a gateway is asked")
         held.pop().drop()  # the end of its answer
-        wait_for(lambda: held, "it is asked for the newest plot")
+        wait_for(lambda: held, "the gateway gets the question of the newest plot")
         held.pop().drop()
         page.send(json.dumps({"t": "plot", "series": [["last", "sensor/range", "range_m"]], "since_s": 600}))
-        wait_for(lambda: held, "it is asked for the next one")
+        wait_for(lambda: held, "the gateway gets the next question")
         held.pop().drop()
     for each in declared:
         each.undeclare()
