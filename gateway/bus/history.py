@@ -7,7 +7,7 @@ arrives whole: `;` separates the parameters of a query.
 import math
 import re
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
@@ -37,10 +37,27 @@ class BadRange(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One published value. `at`: s, monotonic."""
+    """One published value. `at`: s, monotonic. `stamp_ns`: its published stamp."""
 
     at: float
+    stamp_ns: int
     payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """One end of a time range: ns since the epoch, or ns from now where `from_now`."""
+
+    ns: int
+    from_now: bool = False
+
+    def before(self, value: Value, now: float) -> int:
+        """Return how long the bound is before a value, ns.
+
+        A date is compared with the stamp, which is what a reader has seen. An age is counted by the monotonic clock, so
+        that it holds also if the wall clock was set meanwhile.
+        """
+        return (round((value.at - now) * 1e9) if self.from_now else value.stamp_ns) - self.ns
 
 
 class HistoryBuffer:
@@ -49,27 +66,22 @@ class HistoryBuffer:
     def __init__(self, size: int) -> None:
         self._values: deque[Value] = deque(maxlen=size)
 
-    def add(self, at: float, payload: bytes) -> None:
-        """Append a value of a monotonic time, s. A full buffer drops the oldest one."""
-        self._values.append(Value(at, payload))
+    def add(self, value: Value) -> None:
+        """Append a value. A full buffer drops the oldest one."""
+        self._values.append(value)
 
     def age(self, slept_s: float) -> None:
         """Let the values be older by a sleep of the computer that the monotonic clock does not count, s."""
-        self._values = deque((Value(each.at - slept_s, each.payload) for each in self._values), self._values.maxlen)
+        self._values = deque((replace(each, at=each.at - slept_s) for each in self._values), self._values.maxlen)
 
-    def select(self, *, time_range: str | None, last: str | None, now: float, now_ns: int) -> list[Value]:
-        """Return the latest value, or those in a time range, or the last ones. Raises BadRange.
-
-        now: s, monotonic. now_ns: the wall clock then. A value is as old as the monotonic clock says, also if the wall
-        clock was set meanwhile.
-        """
+    def select(self, *, time_range: str | None, last: str | None, now: float) -> list[Value]:
+        """Return the latest value, or those in a time range, or the last ones. Raises BadRange. now: s, monotonic."""
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)
         if time_range is not None:
-            begin, end = parse_range(time_range, now_ns)
-            since_ns = now_ns - round(now * 1e9)
-            values = [value for value in values if begin <= since_ns + round(value.at * 1e9) < end]
+            begin, end = parse_range(time_range)
+            values = [value for value in values if begin.before(value, now) >= 0 > end.before(value, now)]
         if last is not None:
             match = _COUNT.fullmatch(last)
             if match is None:
@@ -79,28 +91,28 @@ class HistoryBuffer:
         return values
 
 
-def parse_range(text: str, now_ns: int) -> tuple[int, int]:
-    """Return a Zenoh time range as half-open range [begin, end), ns since the epoch. Raises BadRange."""
+def parse_range(text: str) -> tuple[Bound, Bound]:
+    """Return a Zenoh time range as half-open range [begin, end). Raises BadRange."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise _bad(text)
     opening, first, second, closing = match.groups()
-    begin = _instant(first, now_ns, text) if first else 0
-    end = _instant(second, now_ns, text) if second else _FOREVER_NS
-    return begin + (opening == "]"), end + (closing == "]")
+    begin = _bound(first, text) if first else Bound(0)
+    end = _bound(second, text) if second else Bound(_FOREVER_NS)
+    return replace(begin, ns=begin.ns + (opening == "]")), replace(end, ns=end.ns + (closing == "]"))
 
 
-def _instant(text: str, now_ns: int, whole: str) -> int:
+def _bound(text: str, whole: str) -> Bound:
     match = _NOW.fullmatch(text)
     if match is not None:
-        return now_ns + (_duration_ns(match[1], whole) if match[1] else 0)
+        return Bound(_duration_ns(match[1], whole) if match[1] else 0, from_now=True)
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         raise _bad(whole) from None
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
-    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+    return Bound((moment - _EPOCH) // timedelta(microseconds=1) * 1000)
 
 
 def _duration_ns(text: str, whole: str) -> int:

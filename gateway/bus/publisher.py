@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.bus.history import BadRange, HistoryBuffer
+from gateway.bus.history import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
 from gateway.control.car_model import CarModel
@@ -118,7 +118,8 @@ class CarPublisher:
         return True
 
     def _put_kept(self, name: str, message: Any, at: float, stamp_ns: int) -> None:
-        self._histories[name].add(at, self._publishers[name].put(message, stamp_ns))
+        payload = self._publishers[name].put(message, stamp_ns)
+        self._histories[name].add(Value(at, stamp_ns, payload))
 
     # ------------------------------------------------------------------ frames out, records
 
@@ -271,12 +272,12 @@ class CarPublisher:
                 and query.key_expr.intersects(self._publishers[name].key)
             ]
             time_range, last = parameters.get("_time"), parameters.get("last")
-            now, now_ns = time.monotonic(), time.time_ns()
+            now = time.monotonic()
             try:
                 values = [
                     (publisher, value)
                     for publisher, ring in matching
-                    for value in ring.select(time_range=time_range, last=last, now=now, now_ns=now_ns)
+                    for value in ring.select(time_range=time_range, last=last, now=now)
                 ]
             except BadRange as error:
                 query.reply_err(str(error), encoding="text/plain")
