@@ -162,6 +162,8 @@ class CarGateway:
         self._stopped = asyncio.Event()
         self._began_at = self._alive_at = now
         self._learned_due_at = now
+        self._worst_lag_s = 0.0
+        self._published_findings: tuple[object, ...] = ()
 
     async def run(self) -> bool:
         """Serve the car until `stop`, then until the car has stopped. Return False if it could not be stopped.
@@ -169,8 +171,7 @@ class CarGateway:
         Raises AlreadyServed (see bus/service.py), and LinkError if the link cannot be opened at the start.
         """
         now = self._loop.time()
-        self._publish_health(now, 0.0)
-        self._publisher.publish_states(self._control, self._health, now)
+        self._publish_states(now)
         if self._state_damage:
             self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
         if self._not_taken:
@@ -218,7 +219,7 @@ class CarGateway:
             self._save_learned(self._loop.time(), at_once=True)
             self._flush()
             self._publisher.on_bus_connected(self._loop.time(), at_once=True)
-            self._publisher.publish_states(self._control, self._health, self._loop.time(), force=True)
+            self._publish_states(self._loop.time(), force=True)
         return not self._control.stops.not_stopped
 
     def stop(self) -> None:
@@ -400,7 +401,13 @@ class CarGateway:
     def _shown_state(self) -> tuple[object, ...]:
         """Return the part of the published states that readings or silence may change."""
         model = self._control.model
-        return model.mode.verdict, model.mode.inferred, model.motors, model.basis
+        return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *self._findings
+
+    @property
+    def _findings(self) -> tuple[object, ...]:
+        """Return what was found out about the car itself."""
+        model = self._control.model
+        return model.profile.name, model.learned.shows, model.learned.doubted
 
     def _wake_if_due(self, now: float) -> None:
         """Wake the writer only if it has work. Waking it for every reading costs a third more CPU."""
@@ -469,7 +476,7 @@ class CarGateway:
     def _flush(self) -> None:
         """Publish records and states, save the safety state, answer the pending queries."""
         self._commands.flush()
-        self._publisher.publish_states(self._control, self._health, self._loop.time())
+        self._publish_states(self._loop.time())
 
     def _on_sender_tokens(self, changed: Mapping[str, bool]) -> None:
         """Pass changes of liveliness tokens to control."""
@@ -489,12 +496,11 @@ class CarGateway:
     async def _tick(self) -> None:
         """Check for silence and changed states, and publish the health of the process once a second."""
         next_health = self._loop.time()
-        worst = 0.0
         while True:
             due = self._loop.time() + CHECK_INTERVAL_S
             await asyncio.sleep(CHECK_INTERVAL_S)
             now = self._loop.time()
-            worst = max(worst, now - due)
+            self._worst_lag_s = max(self._worst_lag_s, now - due)
             self._on_gap(now)
             self._alive_at = now
             if self._attempts.check_proven(now, has_reading=False):
@@ -524,12 +530,12 @@ class CarGateway:
                 is_heard=self._control.model.is_heard,
             )
             if changed or self._shown_state != before or now >= next_health:
-                self._publisher.publish_states(self._control, self._health, now)
+                self._publish_states(now)
             if now >= next_health:
                 self._save_learned(now)
                 next_health = now + HEALTH_INTERVAL_S
-                self._publish_health(now, worst)
-                worst = 0.0
+                self._publish_health(now)
+                self._worst_lag_s = 0.0
 
     def _on_gap(self, now: float) -> None:
         """Handle a gap of the loop, or a sleep: the process may have lost the bus, and stops a driven car."""
@@ -554,9 +560,16 @@ class CarGateway:
         except OSError as error:
             log.debug("what was learned of %s is not kept: %s", self._settings.car, error)
 
-    def _publish_health(self, now: float, lag_s: float) -> None:
+    def _publish_states(self, now: float, *, force: bool = False) -> None:
+        """Publish changed states. A finding about the car goes before the claims that rest on it."""
+        if self._findings != self._published_findings:
+            self._publish_health(now)
+        self._publisher.publish_states(self._control, self._health, now, force=force)
+
+    def _publish_health(self, now: float) -> None:
+        self._published_findings = self._findings
         drops = self._service.dropped + self._publisher.dropped
-        self._publisher.publish_health(now, loop_lag_s=lag_s, bus_drops=drops, model=self._control.model)
+        self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops, model=self._control.model)
 
     async def _keep_hub(self) -> None:
         """Restart a lost hub. Jitter keeps a hundred gateways from trying at once."""

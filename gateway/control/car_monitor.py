@@ -9,7 +9,7 @@ from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
 from gateway.control.estimate.learned import Blocking, Shows
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.platform import PlatformDetector
-from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
+from gateway.control.estimate.trust import STOP_GOES_ON, CarTrust, TrustEvent
 from gateway.control.events import FrameOrigin, Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
@@ -17,6 +17,7 @@ from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
 from gateway.protocol.enums import Cause, Mode
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.modes import only_candidate
+from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
 
@@ -72,10 +73,8 @@ class CarMonitor:
             self._stops.leave_open_mode(now)
         for words in contradictions:
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
-            # The last stop may have been of the wrong kind, unless the car has shown it.
-            is_stopped = model.trust.state in STOP_GOES_ON or model.trust.basis is Basis.SENT
-            if model.platform.doubted and is_stopped and model.link_open:
-                self._stops.recover(now, words)
+            if model.platform.doubted:  # the last stop may have been of the wrong kind
+                self._on_other_program(now, words)
         if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
             model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
         if not isinstance(event, Sensors):
@@ -95,12 +94,12 @@ class CarMonitor:
             words = f"its reports pause after MODE00, which those of {model.profile.name} cars do not"
             if model.platform.note(words):
                 self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
-        if model.evidence.found_out:
-            self._log_found_out(now)
         if only_candidate(event) is Mode.MANUAL:
             self._on_report(event, now)
         self._log_delivery(finding, now)
         self._stops.on_finding(finding, event.at, now)
+        if model.evidence.found_out:
+            self._on_found_out(now)
 
     def _on_report(self, event: Sensors, now: float) -> None:
         """Update the model with a report of mode 0."""
@@ -133,8 +132,8 @@ class CarMonitor:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
-    def _log_found_out(self, now: float) -> None:
-        """Log what the readings have shown about the car itself."""
+    def _on_found_out(self, now: float) -> None:
+        """Handle what the readings have shown about the car itself."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = EVIDENCE[StopCase.NO_REACTION].words.format(car=name)
@@ -142,6 +141,14 @@ class CarMonitor:
         else:
             words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
             self._log.log(Level.WARNING, "rhythm_changed", f"{words} What it showed before is forgotten.", now)
+            self._on_other_program(now, words)
+
+    def _on_other_program(self, now: float, words: str) -> None:
+        """Keep no claim that the program before has shown. A car that drives or is in a mode goes on."""
+        model = self.model
+        model.learned.forget_reactions()
+        if model.link_open and (model.trust.state in STOP_GOES_ON or model.trust.basis is not None):
+            self._stops.recover(now, words)
 
     def _apply_platform(self, now: float) -> None:
         """Use the profile of the detected platform.
@@ -157,12 +164,15 @@ class CarMonitor:
         may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):
             return
+        before = model.profile.kind
         model.treat_as(model.platform.profile)
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
         if model.platform.auto:  # a named one was corrected, and its contradiction says so
             self._log.log(Level.INFO, "platform_settled", words, now)
         if has_other_head:
             self._stops.recover(now, words)
+        elif before not in (Platform.UNKNOWN, model.profile.kind):
+            self._on_other_program(now, words)
         elif model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
             # It can show its stop, and half a named frame may lie in its buffer.
             if model.known:

@@ -9,6 +9,7 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import REACTED, Learned, Shows
+from gateway.control.estimate.trust import Basis
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platform_name import parse_option
@@ -197,6 +198,25 @@ def test_readings_end_the_option_that_there_are_none(platform: str, told: str, c
     assert model.shows_stops[0] is (Shows.NO if platform == "raspberry_pi" else Shows.YES)
     if platform == "raspberry_pi":
         assert not any(b"MODE" in data for _, data in pair.sent), "it would end some programs"
+
+
+@pytest.mark.parametrize("told", ["auto", "arduino"])
+@pytest.mark.parametrize("other", ["raspberry_pi", "stm32"])
+def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, other: str) -> None:
+    name, auto = parse_option(told)
+    pair = Pair("arduino", told="arduino", start_s=2.0)
+    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.connect()
+    model = pair.control.model
+    pair.until(lambda: model.at_rest and model.trust.shown and model.learned.echo.is_firm, 60.0)
+    pair.car = Pair(other, start_s=2.0).car
+    pair.car.advance(pair.now)
+    pair.until(lambda: model.trust.basis is None, 6 * 1.254)
+    assert model.learned.shows is Shows.UNKNOWN
+    pair.until(lambda: model.trust.basis is Basis.SENT, 20.0)
+    assert model.shows_stops[0] is not Shows.YES
+    answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
+    assert answer.status != "rejected", answer
 
 
 def swapped(told: str, mode: Mode) -> Pair:
