@@ -146,7 +146,7 @@ def _contradicted(e: CarEvidence) -> str:
     health = e.of("state/health")
     if health is None or not health.platform_contradictions:
         return ""
-    return f"It may be no {health.platform} car: {'; '.join(health.platform_contradictions)}."
+    return f"Its platform may be named wrongly: {'; '.join(health.platform_contradictions)}."
 
 
 def _doubted(e: CarEvidence) -> str:
