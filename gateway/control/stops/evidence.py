@@ -507,6 +507,8 @@ class StopEvidence:
 
     def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
         """Learn the rhythm of a car that reports faster than it did."""
+        if self._pending is not None and event.at > self._pending + self._left_s + ROUND_TRIP_S:
+            self._pending = None  # its block is over, and no report in the rhythm of before came to show it
         clean = self._fast_before and self._pending is None and not self._blocking
         self._fast_before = bool(event.range_cm)
         if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:

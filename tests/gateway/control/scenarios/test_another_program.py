@@ -43,6 +43,7 @@ def met(kept_s: float, traits: CarTraits) -> Pair:
         (1.254, CarTraits(interval_s=3.0)),
         (1.254, CarTraits(interval_s=2.2)),
         (1.254, CarTraits(interval_s=0.71)),
+        (1.254, CarTraits(interval_s=0.3)),  # with its block, 1.3 s: as if it were the rhythm of before
         (3.0, CarTraits()),
         (0.5, CarTraits(interval_s=2.2)),
         (1.254, CarTraits(interval_s=1.0, timer=True, close_s=0.0)),
