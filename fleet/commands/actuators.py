@@ -21,9 +21,9 @@ from fleet.client.commands import (
 )
 from fleet.commands.options import carry_out, json_option, take_option, with_client
 from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, missing_words
-from gateway.protocol.enums import Light, SpeedStep
 from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled
+from schemas.words import Light, SpeedStep
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings with which -1 is a wrong value and not an unknown option."""

@@ -28,8 +28,8 @@ from fleet.commands.options import (
     with_client,
 )
 from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
-from gateway.protocol.enums import Mode, Motion
 from schemas.process import signals, startup
+from schemas.words import Mode, Motion
 
 _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 

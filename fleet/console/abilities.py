@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.protocol.platforms import Profile, parse_platform
+from schemas.words import Light, Mode, Motion, ServoAction
 
 _EXAMPLES: Final[dict[str, Frame]] = {
     "mode": ModeOpen(Mode.TRACKING),

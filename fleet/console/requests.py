@@ -10,9 +10,9 @@ from typing import Any, Final, Self
 
 from fleet.client import commands
 from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
-from gateway.protocol.enums import Light, Mode, Motion
 from schemas import keys
 from schemas.commands import STOPS
+from schemas.words import Light, Mode, Motion
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""

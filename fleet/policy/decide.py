@@ -31,9 +31,9 @@ from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import CONTRADICTED, LOST, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HUB_RETURN_GRACE_S, BlinkState, HeldRole, LedRequest, ModeAttempts, PolicyState
-from gateway.protocol.enums import Mode
 from schemas.colors import COLORS, Rgb
 from schemas.keys import name_of
+from schemas.words import Mode
 
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 
 LEFT_ALONE: Final = "left alone"
 

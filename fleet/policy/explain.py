@@ -15,8 +15,8 @@ from fleet.policy.plan.reachability import describe_unmeasured
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
-from gateway.protocol.enums import Mode
 from schemas.keys import name_of
+from schemas.words import Mode
 
 _GOES_ON: Final = "a person runs `fleet plan restart` or `fleet plan set`"
 _MAX_REASONS: Final = 4

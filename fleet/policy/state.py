@@ -9,8 +9,8 @@ from fleet.policy.decision import Decision
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
-from gateway.protocol.enums import Mode
 from schemas.colors import Rgb
+from schemas.words import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""

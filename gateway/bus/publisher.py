@@ -22,11 +22,11 @@ from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import CommandRecord, Level, LogRecord, OutgoingFrame
 from gateway.control.people import PersonRole
 from gateway.control.rate_limit import TokenBucket
-from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Mode
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0

@@ -29,13 +29,13 @@ from gateway.control.commands import (
     Stop,
 )
 from gateway.control.people import Sender, SenderKind
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
 from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 
 W = TypeVar("W", bound=str)
 

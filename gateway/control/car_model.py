@@ -17,11 +17,11 @@ from gateway.control.events import Level
 from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase, StopEvidence
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
+from schemas.words import Mode, Motion
 
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""

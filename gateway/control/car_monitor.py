@@ -14,12 +14,12 @@ from gateway.control.events import FrameOrigin, Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
-from gateway.protocol.enums import Cause, Mode
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.modes import only_candidate
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
+from schemas.words import Cause, Mode
 
 STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one it stops the car

@@ -7,8 +7,8 @@ from enum import StrEnum
 from typing import Final
 
 from gateway.control.people import Sender
-from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import ArmSet, Frame, General, Ptz
+from schemas.words import Mode, Motion, SpeedStep
 
 
 class Reason(StrEnum):

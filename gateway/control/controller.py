@@ -43,10 +43,10 @@ from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
+from schemas.words import Mode, Motion
 
 START_MARGIN_S: Final = 1.0
 """How much longer than announced, and than its own duration, a drive waits for the car before it expires."""

@@ -20,10 +20,10 @@ from gateway.control.stop_executor import StopExecutor
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
+from schemas.words import Mode, Motion
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends

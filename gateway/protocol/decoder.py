@@ -14,11 +14,11 @@ import re
 from math import inf
 from typing import Final
 
-from gateway.protocol.enums import Cause
 from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.frames import STANDARD_HEAD
 from gateway.protocol.parser import parse
 from gateway.protocol.sensors import Reject, Sensors, read_sensors, sensors_matcher
+from schemas.words import Cause
 
 __all__ = [
     "ArmReading",

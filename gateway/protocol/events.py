@@ -5,8 +5,8 @@
 
 from dataclasses import dataclass
 
-from gateway.protocol.enums import Cause
 from gateway.protocol.sensors import Reject, Sensors
+from schemas.words import Cause
 
 
 @dataclass(frozen=True, slots=True)

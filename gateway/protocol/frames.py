@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, TypeVar
 
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.modes import MODES
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 
 STANDARD_HEAD: Final = "4WD"
 ARM_JOINTS: Final = 6
@@ -156,16 +156,16 @@ def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
 
 
 def _general(frame: General, dialect: Dialect) -> bytes:
-    run, spin = _member("motion", frame.motion, Motion).digits
-    speed = 0 if frame.speed is None else _member("speed", frame.speed, SpeedStep).digit
-    servo, reset = (0, 0) if frame.servo is None else _member("servo", frame.servo, ServoAction).digits
+    run, spin = _MOTION_DIGITS[_member("motion", frame.motion, Motion)]
+    speed = 0 if frame.speed is None else _SPEED_DIGITS[_member("speed", frame.speed, SpeedStep)]
+    servo, reset = (0, 0) if frame.servo is None else _SERVO_DIGITS[_member("servo", frame.servo, ServoAction)]
     light = 0 if frame.light is None else _light_digit(_member("light", frame.light, Light), dialect)
     places = (run, spin, bool(frame.whistle), speed, servo, bool(frame.sing), light, bool(frame.fan), reset)
     return b"$%d,%d,%d,%d,%d,%d,%d,%d,%d#" % places
 
 
 def _light_digit(light: Light, dialect: Dialect) -> int:
-    return _SWAPPED.get(light, light).digit if dialect.swaps_green_and_blue else light.digit
+    return _LIGHT_DIGITS[_SWAPPED.get(light, light) if dialect.swaps_green_and_blue else light]
 
 
 def _ranged(field: str, value: int, top: int) -> int:
@@ -217,10 +217,47 @@ def _parse_named(value: dict[str, int]) -> Frame:
     return ArmSet(tuple(value[f"j{joint}"] for joint in range(1, ARM_JOINTS + 1)))
 
 
-_MOTION_AT = {motion.digits: motion for motion in Motion}
-_SPEED_AT = {step.digit: step for step in SpeedStep}
-_SERVO_AT = {action.digits: action for action in ServoAction}
-_LIGHT_AT = {light.digit: light for light in Light}
+# docs/reference/protocol.md#general-frame
+_MOTION_DIGITS: Final = {
+    Motion.STOP: (0, 0),
+    Motion.FORWARD: (1, 0),
+    Motion.BACK: (2, 0),
+    Motion.LEFT: (3, 0),
+    Motion.RIGHT: (4, 0),
+    Motion.SPIN_LEFT: (0, 1),
+    Motion.SPIN_RIGHT: (0, 2),
+}
+"""Places 1 (motion) and 2 (rotate in place); a spin leaves place 1 at 0."""
+_SPEED_DIGITS: Final = {SpeedStep.UP: 1, SpeedStep.DOWN: 2}
+"""Place 4; 0 keeps the speed."""
+_SERVO_DIGITS: Final = {
+    ServoAction.FRONT_LEFT: (1, 0),
+    ServoAction.FRONT_RIGHT: (2, 0),
+    ServoAction.VERTICAL_UP: (3, 0),
+    ServoAction.VERTICAL_DOWN: (4, 0),
+    ServoAction.VERTICAL_RESET: (5, 0),
+    ServoAction.HORIZONTAL_LEFT: (6, 0),
+    ServoAction.HORIZONTAL_RIGHT: (7, 0),
+    ServoAction.HORIZONTAL_RESET: (8, 0),
+    ServoAction.FRONT_RESET: (0, 1),
+}
+"""Places 5 (servos) and 9 (servo reset)."""
+_LIGHT_DIGITS: Final = {
+    Light.WHITE: 1,
+    Light.RED: 2,
+    Light.GREEN: 3,
+    Light.BLUE: 4,
+    Light.CYAN: 5,
+    Light.MAGENTA: 6,
+    Light.YELLOW: 7,
+    Light.OFF: 8,
+}
+"""Place 7; 0 means no change."""
+
+_MOTION_AT = {digits: motion for motion, digits in _MOTION_DIGITS.items()}
+_SPEED_AT = {digit: step for step, digit in _SPEED_DIGITS.items()}
+_SERVO_AT = {digits: action for action, digits in _SERVO_DIGITS.items()}
+_LIGHT_AT = {digit: light for light, digit in _LIGHT_DIGITS.items()}
 _SWAPPED = {Light.GREEN: Light.BLUE, Light.BLUE: Light.GREEN}
 _MODE_AT = {row.digit: mode for mode, row in MODES.items()}
 

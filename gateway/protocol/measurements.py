@@ -3,10 +3,10 @@
 The level of the battery is an estimate of the gateway and is not set here.
 """
 
-from gateway.protocol.enums import Mode
 from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import SENSOR_FIELDS, Fields, Sensors
+from schemas.words import Mode
 
 _PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.published) for each in SENSOR_FIELDS)
 _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", "accel_z_raw")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-from gateway.protocol.enums import Mode
 from gateway.protocol.sensors import SENSOR_FIELDS, Sensors, sensors_pattern
+from schemas.words import Mode
 
 EVERY_MEASUREMENT: Final = frozenset(field.measurement for field in SENSOR_FIELDS)
 

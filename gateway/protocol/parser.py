@@ -6,9 +6,9 @@
 import re
 from typing import Final
 
-from gateway.protocol.enums import Cause
 from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected
 from gateway.protocol.sensors import SENSOR_FIELDS, Reject, read_sensors, sensors_matcher
+from schemas.words import Cause
 
 JOINT_MAX: Final = 180.0  # docs/reference/protocol.md#ranges: "ranges a reading must be in"
 

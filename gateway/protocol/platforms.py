@@ -8,7 +8,6 @@ from enum import StrEnum
 from functools import cache
 from typing import Final
 
-from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
 from gateway.protocol.frames import (
     STANDARD_HEAD,
     ArmSet,
@@ -34,6 +33,7 @@ from gateway.protocol.timing import (
     REPORT_INTERVAL_S,
     block_s,
 )
+from schemas.words import Light, Mode, ServoAction, SpeedStep
 
 
 class StopStyle(StrEnum):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from gateway.protocol.enums import Cause
+from schemas.words import Cause
 
 Value = bool | int | float | tuple[float, ...]
 Fields = dict[str, Value]

@@ -9,7 +9,6 @@ from enum import StrEnum
 from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.frames import encode
 from gateway.protocol.modes import candidate_modes
@@ -18,6 +17,7 @@ from gateway.protocol.sensors import Sensors
 from gateway.tools import cli_support
 from gateway.tools.discovery import SerialPort
 from gateway.tools.statistics import LinkStatistics
+from schemas.words import Mode
 
 
 class LinkVerdict(StrEnum):

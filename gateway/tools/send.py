@@ -10,7 +10,6 @@ import shlex
 from typing import Final
 
 from gateway.link import LinkUrl, open_link, parse_url
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import (
     ArmSet,
     ColorLed,
@@ -29,6 +28,7 @@ from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.tools import cli_support
 from schemas.links import TcpUrl
+from schemas.words import Mode, Motion
 
 DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
 EPILOG: Final = """\

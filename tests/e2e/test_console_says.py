@@ -9,9 +9,9 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from playwright.sync_api import Dialog, Page, expect
 
-from gateway.protocol.enums import Motion
 from gateway.protocol.frames import General, encode
 from schemas.topics import TOPICS
+from schemas.words import Motion
 from tests.support.console import CARS, ConsoleStage
 from tests.support.processes import PATIENCE_S, freeze, wait_for
 

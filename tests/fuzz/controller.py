@@ -35,10 +35,10 @@ from gateway.control.events import CommandRecord, FrameOrigin, OutgoingFrame
 from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in SenderKind for number in range(3)]

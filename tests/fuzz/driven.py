@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from gateway.control.commands import EmergencyStop, Find, OneShot, Phase, Resume, SetMode, Stop
 from gateway.control.people import Sender
-from gateway.protocol.enums import Mode
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from schemas.words import Mode
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
 from tests.support.stops import WORLDS, state_of
 from tests.support.virtual import Pair

@@ -23,13 +23,13 @@ from gateway.control.estimate.trust import CarTrust
 from gateway.control.events import CommandRecord
 from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
+from schemas.words import Mode, Motion
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.traits import CarTraits
+from schemas.words import Mode
 from tests.fuzz.stop_search import BYTES_PER_S, Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
 
 PARTS = 4

@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.protocol.enums import Mode, Motion
 from schemas.suggestion import did_you_mean, misspelled, near_names
+from schemas.words import Mode, Motion
 
 CARS = ["red", "green", "blue"]
 

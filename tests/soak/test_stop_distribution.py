@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 from tests.support.stops import LONGEST_S, RATIO, distribution, tsv
 
 MOMENTS = 200

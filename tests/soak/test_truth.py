@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 from tests.support.normal import NormalRun, normal
 from tests.support.truth import WORLDS
 

@@ -13,10 +13,10 @@ from typing import Any, Final
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ModeOpen, encode
 from schemas import messages
 from schemas.bus import Bus, Sample, sample_of
+from schemas.words import Mode
 from tests.support.judge import stamp_ns
 from tests.support.processes import TAKEN, wait_for
 from tests.support.up import Up

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gateway.protocol.enums import Mode
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
+from schemas.words import Mode
 from tests.support.processes import TAKEN
 from tests.support.up import Up
 

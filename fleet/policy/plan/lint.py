@@ -15,8 +15,8 @@ from fleet.policy.plan.lint_conflicts import find_conflicts, implies
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanPhase, Role, Rule
 from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
 from fleet.policy.snapshot import CarSnapshot, topic_of
-from gateway.protocol.enums import Mode
 from schemas.suggestion import misspelled
+from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Problem
 from schemas.yaml_document.messages import suggest
 

@@ -7,8 +7,8 @@ from typing import Final
 from fleet.conditions import Expression, is_contradictory
 from fleet.conditions.expression import Compare, Literal, Name, Op, ValueKind
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Rule
-from gateway.protocol.enums import Mode
 from schemas.colors import format_color
+from schemas.words import Mode
 
 _REMEMBERED: Final = 4096
 """Maximum pairs of conditions whose contradiction is cached: the rules of a large plan, each against each."""

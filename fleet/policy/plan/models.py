@@ -5,9 +5,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from gateway.protocol.enums import Mode
 from schemas import keys
 from schemas.colors import COLOR_PATTERN, parse_color
+from schemas.words import Mode
 from schemas.yaml_document.document import Entry
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]

@@ -31,11 +31,11 @@ from fleet.policy.plan.plan import (
     Rule,
 )
 from fleet.policy.snapshot import ALIASES, NAMES
-from gateway.protocol.enums import Mode
 from gateway.protocol.platform_name import OPTIONS
 from gateway.protocol.platforms import parse_platform
 from schemas import keys
 from schemas.colors import parse_color
+from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.messages import Where, suggest
 

@@ -10,8 +10,8 @@ from enum import StrEnum
 from typing import Final
 
 from fleet.conditions import Expression
-from gateway.protocol.enums import Mode
 from schemas.colors import Rgb
+from schemas.words import Mode
 
 THIS_CAR: Final = "this_car"
 OTHER_CARS: Final = "other_cars"

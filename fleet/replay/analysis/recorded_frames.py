@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.recording.reading.session import Recorded
-from gateway.protocol.enums import Mode
 from schemas import keys, messages
 from schemas.topics import TOPICS
+from schemas.words import Mode
 
 FRAME_KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
 MAX_MESSAGE_DELAY_NS: Final = 10_000_000_000

@@ -13,11 +13,11 @@ from typing import Any, Final
 
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
-from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.frames import STANDARD_HEAD
 from gateway.protocol.measurements import measured, verdict_of
 from gateway.protocol.platforms import Profile, parse_platform
+from schemas.words import Mode
 
 MAX_MODE_DELAY_NS: Final = 500_000_000
 """Maximum delay from a mode change to its publication: the loop of a gateway processes input in batches."""

@@ -18,7 +18,7 @@ from typing import Any, Final
 from fleet.recording import time_spec
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway.protocol.decoder import ECHO_S
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 
 ENDING: Final = ".jsonl"
 FORMAT: Final = 1

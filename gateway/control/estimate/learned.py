@@ -23,10 +23,10 @@ from enum import StrEnum
 from statistics import median
 from typing import Any, Final
 
-from gateway.protocol.enums import Mode
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import SENSOR_FIELDS, Reject, Sensors
+from schemas.words import Mode
 
 KEPT_INTERVALS: Final = 9
 """Number of intervals of a rhythm."""

@@ -11,11 +11,11 @@ from typing import Final
 
 from gateway.control.estimate.learned import Learned
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
-from gateway.protocol.enums import Mode
 from gateway.protocol.modes import SILENT_MODES, candidate_modes
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import Sensors
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
+from schemas.words import Mode
 
 CONTRADICTING_FRAMES: Final = 3
 """Number of consecutive readings of another mode that contradict the commanded one

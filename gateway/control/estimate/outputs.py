@@ -5,9 +5,9 @@ The car confirms none of them. Readings give evidence of its mode only, see mode
 
 from dataclasses import dataclass, field, replace
 
-from gateway.protocol.enums import Motion
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.protocol.platforms import Profile
+from schemas.words import Motion
 
 
 @dataclass(slots=True)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from gateway.protocol.enums import Motion
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Reset
 from gateway.protocol.timing import COLOR_S, FRAME_S, RECOVERY_SILENCE_S
+from schemas.words import Motion
 
 REPEAT_INTERVAL_S: Final = 1.1
 """Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from math import ceil, inf
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.scheduler import EventScheduler
 from gateway.sim.model.traits import CarTraits
+from schemas.words import Mode
 
 # The numbers below repeat those of gateway.protocol on purpose: the simulator is the oracle of the tests, and an oracle
 # that shares its numbers with the tested code finds no wrong number.

@@ -7,10 +7,10 @@ Arduino program here.
 
 from typing import ClassVar, Final
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.firmware import Program, Wait, motion
 from gateway.sim.model.mode_car import ModeCar, to_int
 from gateway.sim.model.traits import CarTraits
+from schemas.words import Mode
 
 STM32_TRAITS: Final = CarTraits(
     interval_s=1.0,

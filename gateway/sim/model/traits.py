@@ -7,7 +7,7 @@ is a parameter of a simulated car, so that each of these cars can be tried.
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 
 # A ranging at 120 cm, where the intervals of real cars were measured: 4 ms, and the echo's way at the speed of sound.
 ECHO_RANGING_S: Final = 0.011

@@ -23,9 +23,9 @@ from gateway.control.commands import (
 )
 from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, Safety
-from gateway.protocol.enums import Light, Mode, Motion, SpeedStep
 from gateway.protocol.frames import General, Ptz
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Light, Mode, Motion, SpeedStep
 from tests.gateway.control.workbench import Workbench
 
 NOW = 1000.0

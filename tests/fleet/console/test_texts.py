@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleet.console import server
-from gateway.protocol.enums import Mode, Motion
+from schemas.words import Mode, Motion
 
 TEXTS = Path(server.__file__).parent / "static" / "texts.js"
 

@@ -15,11 +15,11 @@ from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.events import CommandRecord
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import ImuReading
 from gateway.protocol.platforms import parse_platform
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
+from schemas.words import Mode, Motion
 from tests.gateway.control.workbench import PERSON, READING, SCRIPT, Workbench
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for

@@ -30,12 +30,12 @@ from gateway.control.commands import (
     TakeLease,
 )
 from gateway.control.people import Sender, SenderKind
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, Ptz
 from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 
 NOW = 1_800_000_000_000_000_000
 

@@ -29,9 +29,9 @@ from gateway.control.commands import (
 )
 from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, Hold, LeaseState
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
 NOW = 100.0

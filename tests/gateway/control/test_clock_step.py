@@ -10,9 +10,9 @@ from gateway.bus.requests import ParsedRequest, parse
 from gateway.control.commands import Answer, Phase, Reason
 from gateway.control.people import SenderKind
 from gateway.control.safety import LEASE_S, Loan, PersistedSafety, Safety
-from gateway.protocol.enums import Motion
 from schemas import messages
 from schemas.commands import COMMANDS
+from schemas.words import Motion
 from tests.gateway.control.workbench import Workbench
 
 S = 1_000_000_000

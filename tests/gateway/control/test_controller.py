@@ -32,9 +32,9 @@ from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.sim.model.traits import CarTraits
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.gateway.control.workbench import (
     BACK,
     COORDINATOR,

@@ -27,9 +27,9 @@ from gateway.control.commands import (
 )
 from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
+from schemas.words import Mode, Motion
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
 from tests.support.message_length import MAX_LINES, count_lines
 

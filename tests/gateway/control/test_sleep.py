@@ -6,8 +6,8 @@ from gateway.control.arbiter import AFTER_SLEEP_S
 from gateway.control.commands import Drive, EmergencyStop, Fan, Lend, OneShot, Pause, Phase, Reason, SetMode, Stop
 from gateway.control.estimate.trust import Basis
 from gateway.control.senders import STREAM_PAUSE_S
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
+from schemas.words import Mode, Motion
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
 
 FORWARD = Drive(Motion.FORWARD, 5.0)

@@ -9,11 +9,11 @@ from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
+from schemas.words import Mode
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"

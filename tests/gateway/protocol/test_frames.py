@@ -4,7 +4,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import (
     ArmSet,
     ColorLed,
@@ -19,6 +18,7 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.modes import MODES
+from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.support.vectors import ids, rows, wire
 
 GENERAL, NAMED, REFUSED = rows("general"), rows("named"), rows("refused")

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import parse_platform
 from gateway.tools.send import why_not
+from schemas.words import Mode
 from tests.gateway.conftest import PATIENCE_S, Command
 from tests.support.processes import TcpCar, driving, wait_for
 

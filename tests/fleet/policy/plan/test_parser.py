@@ -8,7 +8,7 @@ from fleet.examples import EXAMPLES
 from fleet.policy.plan.lint import check
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Quantifier
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 from schemas.yaml_document.document import BadFile
 
 

@@ -13,8 +13,8 @@ from fleet.cli import cli
 from fleet.replay.analysis import vector_file
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
-from gateway.protocol.enums import Mode
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Mode
 from tests.fleet.replay.make_session import Made, make
 
 VECTORS = sorted((Path(__file__).parents[3] / "vectors" / "recorded").glob("*.jsonl"))

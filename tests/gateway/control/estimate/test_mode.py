@@ -5,9 +5,9 @@ import pytest
 from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator, Verdict
 from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder, Sensors
-from gateway.protocol.enums import Mode
 from gateway.protocol.modes import only_candidate
 from gateway.protocol.platforms import parse_platform
+from schemas.words import Mode
 
 ASSUMED, CONFIRMED, CONTRADICTED = Verdict.ASSUMED, Verdict.CONFIRMED, Verdict.CONTRADICTED
 SHAPES = {

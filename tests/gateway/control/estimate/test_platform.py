@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from gateway.control.estimate.platform import EVIDENCE_FRAMES, OTHER_HEAD_FRAMES, PlatformDetector
 from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder
-from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
+from schemas.words import Mode
 from tests.support.truth import WORLDS, frame_of
 from tests.support.vectors import ids, rows, wire
 

@@ -17,8 +17,8 @@ from gateway.control.commands import (
 )
 from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, PersistedSafety
-from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import ColorLed
+from schemas.words import Mode, Motion, SpeedStep
 from tests.gateway.control.workbench import (
     COORDINATOR,
     PERSON,

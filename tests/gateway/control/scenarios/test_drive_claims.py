@@ -4,7 +4,7 @@ import pytest
 
 from gateway.control.commands import Drive, Phase, Stop
 from gateway.control.estimate.trust import CarTrust
-from gateway.protocol.enums import Motion
+from schemas.words import Motion
 from tests.gateway.control.workbench import MODE00
 from tests.support.virtual import Pair
 

@@ -3,8 +3,8 @@
 import pytest
 
 from gateway.control.commands import Drive, Find, OneShot, Phase
-from gateway.protocol.enums import Motion
 from gateway.protocol.frames import ColorLed
+from schemas.words import Motion
 from tests.support.virtual import Pair
 
 WHITE, COLOUR = "#ffffff", "#0a141e"

@@ -9,9 +9,9 @@ import pytest
 from gateway.control.commands import Drive, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.estimate.learned import Shows
 from gateway.control.estimate.trust import Basis, CarTrust
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
 from gateway.sim.model.world import World
+from schemas.words import Mode, Motion
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

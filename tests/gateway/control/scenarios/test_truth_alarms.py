@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.raspberry_pi import Transport
+from schemas.words import Mode
 from tests.support.normal import NormalRun, normal
 from tests.support.truth import WORLDS
 

@@ -7,7 +7,7 @@ import pytest
 
 from gateway.control.commands import SetMode
 from gateway.control.estimate.mode import Verdict
-from gateway.protocol.enums import Mode
+from schemas.words import Mode
 from tests.support.truth import WORLDS, car_in, frame_of, lose_next_mode_frame
 from tests.support.vectors import rows
 from tests.support.virtual import Pair

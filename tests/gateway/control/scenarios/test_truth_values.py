@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.control.commands import Drive, Fan, SetMode, Stop
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import Sensors, fullmatch_sensors, read_sensors
+from schemas.words import Mode, Motion
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
 

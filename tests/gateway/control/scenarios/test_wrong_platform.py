@@ -4,7 +4,7 @@ import pytest
 
 from gateway.control.commands import Drive, Fan, Phase, Reason, Stop
 from gateway.control.estimate.trust import Basis
-from gateway.protocol.enums import Mode, Motion
+from schemas.words import Mode, Motion
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

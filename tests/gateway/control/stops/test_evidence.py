@@ -25,12 +25,12 @@ from gateway.control.stops.evidence import (
     StopEvidence,
 )
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.enums import Cause, Mode, Motion
 from gateway.protocol.events import Rejected
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import Sensors
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.words import Cause, Mode, Motion
 from tests.gateway.control.workbench import Workbench
 from tests.support.virtual import Pair
 

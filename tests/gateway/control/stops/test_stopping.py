@@ -16,11 +16,11 @@ from gateway.control.estimate.trust import Basis
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
+from schemas.words import Mode, Motion
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
 

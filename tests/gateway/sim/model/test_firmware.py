@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import pytest
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import CarBodyState, Pose, Truth
@@ -16,6 +15,7 @@ from gateway.sim.model.raspberry_pi import RaspberryPiCar
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.words import Mode
 from tests.gateway.sim.strangers import (
     FAN,
     MODE00,

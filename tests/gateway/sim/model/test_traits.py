@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.protocol.enums import Mode
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.words import Mode
 from tests.gateway.sim.strangers import FAN, MODE00, PTZ90, RUN, STOP, WHISTLE, VirtualStranger, opening, virtual
 
 COLOR = b"$4WD,CLR255,CLG0,CLB0#"
