@@ -28,7 +28,7 @@ REASONS: Final[dict[str, str]] = {
     "no_answer": "No gateway answered for this car.",
     "no_result": "The gateway took the command, and its result did not arrive.",
 }
-"""Reasons of the gateway (`gateway.control.commands.Reason`), and `no_answer` and `no_result` of the client."""
+"""Reasons of the gateway (`schemas.words.Reason`), and `no_answer` and `no_result` of the client."""
 
 
 @dataclass(frozen=True, slots=True)

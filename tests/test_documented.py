@@ -13,9 +13,8 @@ import pytest
 
 from fleet.cli import cli
 from fleet.client.diagnosis import CHECKS
-from gateway.control.commands import Reason
 from schemas.commands import COMMANDS
-from schemas.words import Mode
+from schemas.words import Mode, Reason
 from tests.tools.pages import files, proto
 from tests.tools.pages.command_line import commands, gateway_parsers, options, shown_action, subcommands
 

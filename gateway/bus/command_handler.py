@@ -14,12 +14,13 @@ import zenoh
 from gateway.bus import requests
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
-from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Phase, Reason, Resume, Unpause
+from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.controller import Controller
 from gateway.control.events import Level, LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Phase, Reason
 
 _LOGGING_LEVELS: Final = {
     Level.DEBUG: logging.DEBUG,

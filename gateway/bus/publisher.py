@@ -15,7 +15,6 @@ from gateway.bus.history import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
 from gateway.control.car_model import CarModel
-from gateway.control.commands import Phase
 from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
@@ -26,7 +25,7 @@ from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Mode
+from schemas.words import Mode, Phase
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0

@@ -23,7 +23,6 @@ from gateway.control.commands import (
     Lend,
     OneShot,
     Pause,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -35,7 +34,7 @@ from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
 
 W = TypeVar("W", bound=str)
 

@@ -18,7 +18,6 @@ from gateway.control.commands import (
     FrameAction,
     Lend,
     Pause,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -31,7 +30,7 @@ from gateway.protocol.frames import General
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile
 from schemas.suggestion import did_you_mean
-from schemas.words import Mode, Motion, SpeedStep
+from schemas.words import Mode, Motion, Reason, SpeedStep
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""

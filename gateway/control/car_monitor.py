@@ -4,7 +4,7 @@ from typing import Final
 
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog
-from gateway.control.commands import Phase, Reason, SetMode
+from gateway.control.commands import SetMode
 from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
 from gateway.control.estimate.learned import Blocking, Shows
 from gateway.control.estimate.mode import Verdict
@@ -19,7 +19,7 @@ from gateway.protocol.modes import only_candidate
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
-from schemas.words import Cause, Mode
+from schemas.words import Cause, Mode, Phase, Reason
 
 STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one it stops the car

@@ -4,9 +4,10 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.control.commands import Command, Phase, Reason
+from gateway.control.commands import Command
 from gateway.control.events import CommandRecord, Level, LogRecord, Record
 from gateway.protocol.frames import Frame
+from schemas.words import Phase, Reason
 
 MAX_COMMAND_IDS: Final = 256
 """Maximum accepted commands whose ids are remembered, to detect duplicates."""

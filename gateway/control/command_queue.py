@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.commands import Phase, Reason
 from gateway.control.people import Sender
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
-from schemas.words import Motion
+from schemas.words import Motion, Phase, Reason
 
 MAX_QUEUE_TIME_S: Final = 15.0
 """Maximum time that a command waits for a busy car: longer than the longest stop, that of a connect to a car that sends

@@ -3,52 +3,11 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, Frame, General, Ptz
-from schemas.words import Mode, Motion, SpeedStep
-
-
-class Reason(StrEnum):
-    """Why a command was rejected or ended early. Answers use no other reasons."""
-
-    BAD_VALUE = "bad_value"
-    UNSUPPORTED = "unsupported"
-    WRONG_MODE = "wrong_mode"
-    LEASED = "leased"
-    LENT = "lent"
-    """The car is lent to another person."""
-    NOT_ALLOWED = "not_allowed"
-    """The people table does not allow it to this sender."""
-    PAUSED = "paused"
-    HELD = "held"
-    ESTOPPED = "estopped"
-    BATTERY_LOW = "battery_low"
-    LINK_DOWN = "link_down"
-    WRITE_FAILED = "write_failed"
-    QUEUE_FULL = "queue_full"
-    EXPIRED = "expired"
-    SUPERSEDED = "superseded"
-    DUPLICATE = "duplicate"
-    STALE = "stale"
-    NOT_SHOWN = "not_shown"
-    """The car could have shown the stop and did not."""
-
-
-class Phase(StrEnum):
-    """One step in the life of a command."""
-
-    ASKED = "asked"
-    QUEUED = "queued"
-    SENT = "sent"
-    EFFECT_SEEN = "effect_seen"
-    COMPLETE = "complete"
-    SUPERSEDED = "superseded"
-    EXPIRED = "expired"
-    FAILED = "failed"
-    REJECTED = "rejected"
+from schemas.words import Mode, Motion, Phase, Reason, SpeedStep
 
 
 @dataclass(frozen=True, slots=True)

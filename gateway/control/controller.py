@@ -26,8 +26,6 @@ from gateway.control.commands import (
     FrameAction,
     Lend,
     Pause,
-    Phase,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -46,7 +44,7 @@ from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 
 START_MARGIN_S: Final = 1.0
 """How much longer than announced, and than its own duration, a drive waits for the car before it expires."""

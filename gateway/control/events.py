@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from gateway.control.commands import Command, Phase, Reason
+from gateway.control.commands import Command
 from gateway.protocol.frames import Frame
+from schemas.words import Phase, Reason
 
 
 @dataclass(frozen=True, slots=True)

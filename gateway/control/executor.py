@@ -8,7 +8,7 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
-from gateway.control.commands import Fan, Phase, Reason, SetMode
+from gateway.control.commands import Fan, SetMode
 from gateway.control.estimate.learned import blocking_kind
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, TrustEvent
@@ -23,7 +23,7 @@ from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends

@@ -8,12 +8,12 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gateway.control.commands import Action, Drive, OneShot, Phase, SetMode, Stop
+from gateway.control.commands import Action, Drive, OneShot, SetMode, Stop
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.frames import General, ModeOpen
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
-from schemas.words import Light, Mode, Motion
+from schemas.words import Light, Mode, Motion, Phase
 from tests.support.stops import WORLDS
 from tests.support.virtual import Pair
 

@@ -21,8 +21,6 @@ from gateway.control.commands import (
     Lend,
     OneShot,
     Pause,
-    Phase,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -38,7 +36,7 @@ from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in SenderKind for number in range(3)]

@@ -15,7 +15,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import KEPT_INTERVALS, Learned, Shows
 from gateway.control.estimate.mode import Verdict
@@ -29,7 +29,7 @@ from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 
-from gateway.control.commands import ChangeSpeed, Drive, Fan, Find, OneShot, Phase, SetMode, Stop
+from gateway.control.commands import ChangeSpeed, Drive, Fan, Find, OneShot, SetMode, Stop
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.protocol.frames import ColorLed, General, ModeOpen, Ptz, encode
@@ -20,7 +20,7 @@ from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, ServoAction, SpeedStep
 from tests.support.virtual import Pair
 
 LONGEST_S = 4.6

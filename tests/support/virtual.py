@@ -3,7 +3,7 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Action, Answer, Command, Phase
+from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, Level, LogRecord
 from gateway.control.people import Sender
@@ -14,6 +14,7 @@ from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.words import Phase
 
 TICK_S = 0.05
 """Interval at which control checks silence. Bytes, deadlines and events of the car wake the loop when they are due."""

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from gateway.bus.publisher import ANSWERS_PER_SLICE, CarPublisher
-from gateway.control.commands import Command, Drive, Find, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Command, Drive, Find, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.estimate.platform import PlatformDetector
@@ -19,7 +19,7 @@ from gateway.protocol.events import ImuReading
 from gateway.protocol.platforms import parse_platform
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import PERSON, READING, SCRIPT, Workbench
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for

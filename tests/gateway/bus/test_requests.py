@@ -23,7 +23,6 @@ from gateway.control.commands import (
     Find,
     FrameAction,
     OneShot,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -35,7 +34,7 @@ from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
 
 NOW = 1_800_000_000_000_000_000
 

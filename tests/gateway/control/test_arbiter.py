@@ -20,7 +20,6 @@ from gateway.control.commands import (
     Lend,
     OneShot,
     Pause,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -31,7 +30,7 @@ from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
 NOW = 100.0

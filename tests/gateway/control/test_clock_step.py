@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.bus.requests import ParsedRequest, parse
-from gateway.control.commands import Answer, Phase, Reason
+from gateway.control.commands import Answer
 from gateway.control.people import SenderKind
 from gateway.control.safety import LEASE_S, Loan, PersistedSafety, Safety
 from schemas import messages
 from schemas.commands import COMMANDS
-from schemas.words import Motion
+from schemas.words import Motion, Phase, Reason
 from tests.gateway.control.workbench import Workbench
 
 S = 1_000_000_000

@@ -17,8 +17,6 @@ from gateway.control.commands import (
     Fan,
     Find,
     OneShot,
-    Phase,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -34,7 +32,7 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.sim.model.traits import CarTraits
-from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
 from tests.gateway.control.workbench import (
     BACK,
     COORDINATOR,

@@ -17,8 +17,6 @@ from gateway.control.commands import (
     Lend,
     OneShot,
     Pause,
-    Phase,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -29,7 +27,7 @@ from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
 from tests.support.message_length import MAX_LINES, count_lines
 

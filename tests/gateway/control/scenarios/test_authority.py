@@ -8,8 +8,6 @@ from gateway.control.commands import (
     Drive,
     EmergencyStop,
     OneShot,
-    Phase,
-    Reason,
     Resume,
     SetMode,
     Stop,
@@ -18,7 +16,7 @@ from gateway.control.commands import (
 from gateway.control.people import Sender, SenderKind
 from gateway.control.safety import Estop, PersistedSafety
 from gateway.protocol.frames import ColorLed
-from schemas.words import Mode, Motion, SpeedStep
+from schemas.words import Mode, Motion, Phase, Reason, SpeedStep
 from tests.gateway.control.workbench import (
     COORDINATOR,
     PERSON,

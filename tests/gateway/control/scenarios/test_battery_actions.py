@@ -2,12 +2,12 @@
 
 import pytest
 
-from gateway.control.commands import Drive, OneShot, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Drive, OneShot, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
 from gateway.protocol.frames import General
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion
+from schemas.words import Light, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, REPORT_S, RUN, STOP, Workbench
 
 FORWARD = Drive(Motion.FORWARD, 9.0)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.commands import Drive, Phase, Stop
+from gateway.control.commands import Drive, Stop
 from gateway.control.estimate.trust import CarTrust
-from schemas.words import Motion
+from schemas.words import Motion, Phase
 from tests.gateway.control.workbench import MODE00
 from tests.support.virtual import Pair
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.commands import Drive, Find, OneShot, Phase
+from gateway.control.commands import Drive, Find, OneShot
 from gateway.protocol.frames import ColorLed
-from schemas.words import Motion
+from schemas.words import Motion, Phase
 from tests.support.virtual import Pair
 
 WHITE, COLOUR = "#ffffff", "#0a141e"

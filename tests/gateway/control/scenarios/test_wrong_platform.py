@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.commands import Drive, Fan, Phase, Reason, Stop
+from gateway.control.commands import Drive, Fan, Stop
 from gateway.control.estimate.trust import Basis
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase, Reason
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

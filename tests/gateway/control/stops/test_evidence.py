@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.commands import Drive, Fan, Phase, SetMode, Stop
+from gateway.control.commands import Drive, Fan, SetMode, Stop
 from gateway.control.estimate.learned import AGREEING_DELAYS, UNREACTED, Blocking, Learned, Shows
 from gateway.control.estimate.trust import Basis
 from gateway.control.stops.evidence import (
@@ -30,7 +30,7 @@ from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import Sensors
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.words import Cause, Mode, Motion
+from schemas.words import Cause, Mode, Motion, Phase
 from tests.gateway.control.workbench import Workbench
 from tests.support.virtual import Pair
 

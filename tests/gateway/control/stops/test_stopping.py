@@ -10,7 +10,7 @@ from itertools import product
 
 import pytest
 
-from gateway.control.commands import Drive, Phase, SetMode, Stop
+from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.trust import Basis
 from gateway.control.pacing import Pacing
@@ -20,7 +20,7 @@ from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Phase
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
 
