@@ -11,10 +11,10 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from schemas.atomic_file import write_atomically
 from schemas.process.stdio import printable
+from schemas.words import Rank
 
 MAX_OTHER_LINKS: Final = 16
 """Maximum links besides the present one whose holds, loans and e-stops the file keeps. The oldest is dropped."""
@@ -152,8 +152,8 @@ def _loan(content: Any, now_ns: int) -> Loan | None:
     return loan if 0 < loan.left_s(now_ns) < inf else None
 
 
-def _rank(content: Any) -> SenderKind:
-    return SenderKind(content.get("rank", SenderKind.PERSON))
+def _rank(content: Any) -> Rank:
+    return Rank(content.get("rank", Rank.PERSON))
 
 
 def _text(value: Any) -> str:

@@ -115,3 +115,13 @@ class Phase(StrEnum):
     EXPIRED = "expired"
     FAILED = "failed"
     REJECTED = "rejected"
+
+
+class Rank(StrEnum):
+    """The kind of a sender, which is its rank. Each outranks those below it."""
+
+    LEAD = "lead"
+    """A person whom the people table of the gateway names as a lead. No command may claim it."""
+    PERSON = "person"
+    SCRIPT = "script"
+    COORDINATOR = "coordinator"

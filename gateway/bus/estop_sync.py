@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from gateway.bus.requests import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
-from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, PersistedSafety
 from schemas import bus, keys, messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Rank
 
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
@@ -168,5 +168,5 @@ def _shared(state: pb.Safety) -> PersistedSafety:
     return PersistedSafety(None, tuple(estops), tuple(state.ended), tuple(pauses), tuple(state.ended_pauses))
 
 
-def _rank(text: str) -> SenderKind:
-    return SenderKind(text) if text in tuple(SenderKind) else SenderKind.PERSON
+def _rank(text: str) -> Rank:
+    return Rank(text) if text in tuple(Rank) else Rank.PERSON

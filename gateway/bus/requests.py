@@ -27,14 +27,14 @@ from gateway.control.commands import (
     SetMode,
     Stop,
 )
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
 from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
-from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 
 W = TypeVar("W", bound=str)
 
@@ -46,7 +46,7 @@ MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
-_WIRE_KINDS: Final = tuple(kind for kind in SenderKind if kind is not SenderKind.LEAD)
+_WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
 """The kinds that a command may claim."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
 WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
@@ -151,7 +151,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     try:
         command = replace(command, id=_text("id", message.id) or blank.id)
         command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
-        kind = _word("kind", message.kind or SenderKind.SCRIPT, _WIRE_KINDS)
+        kind = _word("kind", message.kind or Rank.SCRIPT, _WIRE_KINDS)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _action(verb, message, request)

@@ -24,13 +24,13 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.frames import General
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile
 from schemas.suggestion import did_you_mean
-from schemas.words import Mode, Motion, Reason, SpeedStep
+from schemas.words import Mode, Motion, Rank, Reason, SpeedStep
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""
@@ -221,11 +221,11 @@ def _too_fast(step: SpeedStep, context: CommandContext) -> str | None:
 def _may_direct(sender: Sender, deed: str, context: CommandContext) -> Refusal | None:
     """Return why this sender may not pause or lend: where there are leads, only they may; elsewhere every person."""
     leads, person = context.people.leads, sender.person
-    if sender.kind is SenderKind.LEAD:
+    if sender.kind is Rank.LEAD:
         return None
     if leads:
         return Reason.NOT_ALLOWED, f"{person} may not {deed}: only a lead may ({', '.join(leads)})."
-    if sender.kind is not SenderKind.PERSON:
+    if sender.kind is not Rank.PERSON:
         return Reason.NOT_ALLOWED, f'a {sender.kind} may not {deed}: only a person may. Send kind "person".'
     return _unlisted(sender, context) if context.people.role(person) is None else None
 
@@ -241,14 +241,14 @@ def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:
 def _may_drive(sender: Sender, context: CommandContext) -> Refusal | None:
     """Return why the people of the fleet or a loan keep this sender from the car."""
     car, person, people, loan = context.car, sender.person, context.people, context.loan
-    if sender.kind is SenderKind.LEAD:
+    if sender.kind is Rank.LEAD:
         return None
     if loan is not None and person != loan.to and person not in people.leads:
         left = f"{context.loan_until - context.now:.0f} s"
         words = f"{car} is lent to {loan.to} for another {left}. {loan.by} ends that with `fleet lend {car} --end`."
         return Reason.LENT, words
     borrowed = loan is not None and person == loan.to
-    if sender.kind is SenderKind.COORDINATOR or borrowed or people.may_drive(person):
+    if sender.kind is Rank.COORDINATOR or borrowed or people.may_drive(person):
         return None
     if people.role(person) is None:
         return _unlisted(sender, context)
@@ -271,7 +271,7 @@ def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool
     the fleet may end a fleet-wide one, so that all gateways decide alike. Everybody may end their own.
     """
     people, person = context.people, sender.person
-    if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
+    if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
         return False
     mine = person in (Sender(estop.by).person, context.loan and context.loan.to)
     return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
@@ -279,7 +279,7 @@ def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool
 
 def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal | None:
     car = context.car
-    if sender.kind is SenderKind.COORDINATOR:
+    if sender.kind is Rank.COORDINATOR:
         return Reason.HELD, f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
     in_force = {estop.id: estop for estop in context.estops}
     if resume.ids and not set(resume.ids) & {*in_force, *context.ended}:
@@ -345,12 +345,12 @@ def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
         words = f"{car} is emergency-stopped ({first.by}{why}). Release it with `fleet resume {car} --estops`."
         return Reason.ESTOPPED, words
     refusal = _may_drive(sender, context)
-    if refusal is not None or not context.pauses or sender.kind is SenderKind.LEAD:
+    if refusal is not None or not context.pauses or sender.kind is Rank.LEAD:
         return refusal
     last = context.pauses[-1]
     why = f': "{last.why}"' if last.why else ""
     people = context.people
-    by_lead = people.roles is None and any(pause.rank is SenderKind.LEAD for pause in context.pauses)
+    by_lead = people.roles is None and any(pause.rank is Rank.LEAD for pause in context.pauses)
     who = "A lead" if people.leads or by_lead else "A person"
     return Reason.PAUSED, f"{car} is paused with the whole fleet ({last.by}{why}). {who} ends it with `fleet unpause`."
 
@@ -362,7 +362,7 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     if refusal is not None:
         return refusal
     if needed.not_held and context.hold is not None:
-        if sender.kind is SenderKind.COORDINATOR:
+        if sender.kind is Rank.COORDINATOR:
             words = f"{car} is on hold ({context.hold.by} stopped it). End the hold with `fleet resume {car}`."
             return Reason.HELD, words
         refusal = _hold_stays(sender, context)
@@ -371,7 +371,7 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     lease, now = context.lease, context.now
     if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
         words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}) for another {lease.until - now:.1f} s."
-        if sender.kind is lease.holder.kind and sender.kind in (SenderKind.PERSON, SenderKind.LEAD):
+        if sender.kind is lease.holder.kind and sender.kind in (Rank.PERSON, Rank.LEAD):
             return Reason.LEASED, f"{words} Wait, or take the car over (--take)."
         return Reason.LEASED, f"{words} Wait until the car is free."
     if needed.battery and context.battery:

@@ -37,14 +37,14 @@ from gateway.control.estimate.learned import Learned
 from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import LATE_DRIVE_S, Executor
-from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Mode, Motion, Phase, Rank, Reason
 
 START_MARGIN_S: Final = 1.0
 """How much longer than announced, and than its own duration, a drive waits for the car before it expires."""
@@ -235,7 +235,7 @@ class Controller:
         if arbiter.needs(what).lease:
             self._grant_lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
-        if moves and command.sender.kind is not SenderKind.COORDINATOR:  # a release ends no hold
+        if moves and command.sender.kind is not Rank.COORDINATOR:  # a release ends no hold
             self._end_hold(command.sender, now)
         if moves:
             self._mover = command.sender.person
@@ -341,7 +341,7 @@ class Controller:
             why = f": {estop.why}" if estop.why else ""
             self._log.log(Level.ERROR, "estop", f"{self.car} is emergency-stopped by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
-        elif sender.kind is not SenderKind.COORDINATOR:
+        elif sender.kind is not Rank.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self.model.link_open or self.stops.shutting_down:

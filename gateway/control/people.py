@@ -10,16 +10,7 @@ from enum import StrEnum
 from typing import Final, Self
 
 from schemas.keys import NAME_RULE, is_name, person_of
-
-
-class SenderKind(StrEnum):
-    """The kind of a sender, which is its rank. Each outranks those below it."""
-
-    LEAD = "lead"
-    """A person whom the people table of the gateway names as a lead. No command may claim it."""
-    PERSON = "person"
-    SCRIPT = "script"
-    COORDINATOR = "coordinator"
+from schemas.words import Rank
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +18,7 @@ class Sender:
     """The sender of a command."""
 
     name: str = "anonymous"
-    kind: SenderKind = SenderKind.SCRIPT
+    kind: Rank = Rank.SCRIPT
 
     @property
     def person(self) -> str:
@@ -66,10 +57,10 @@ class People:
 
     def ranked(self, sender: Sender) -> Sender:
         """Return the sender with its rank: only a person whom the table names as a lead is one."""
-        if sender.kind not in (SenderKind.PERSON, SenderKind.LEAD):
+        if sender.kind not in (Rank.PERSON, Rank.LEAD):
             return sender
         leads = self.role(sender.person) is PersonRole.LEAD
-        return replace(sender, kind=SenderKind.LEAD if leads else SenderKind.PERSON)
+        return replace(sender, kind=Rank.LEAD if leads else Rank.PERSON)
 
     def role(self, person: str) -> PersonRole | None:
         """Return what a person is to this car; None for a person who is not listed."""
@@ -79,14 +70,14 @@ class People:
         """Return True if this person, and the scripts of this person, may drive the car."""
         return self.role(person) in (PersonRole.DRIVER, PersonRole.LEAD)
 
-    def may_end(self, sender: Sender, by: str, rank: SenderKind) -> bool:
+    def may_end(self, sender: Sender, by: str, rank: Rank) -> bool:
         """Return True if this sender may end what `by` of this rank began. Only a lead ends what a lead began."""
-        if rank is not SenderKind.LEAD or sender.kind is SenderKind.LEAD:
+        if rank is not Rank.LEAD or sender.kind is Rank.LEAD:
             return True
         if self.roles is None:
             # A gateway without a table knows one lead: who began it. If another lead ends a pause or a fleet-wide
             # e-stop at the other gateways, this one learns the end from them.
-            return sender.kind is SenderKind.PERSON and sender.person == person_of(by)
+            return sender.kind is Rank.PERSON and sender.person == person_of(by)
         # After a restart with another table there may be no lead: then the car must not stay stopped for ever.
         return not self.leads
 

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
+from schemas.words import Rank
 
 LEASE_S: Final = 2.0
 """Duration of a lease after the drive (docs/explanation/who-may-drive.md#lease)."""
@@ -20,7 +21,7 @@ MAX_PAUSES: Final = 32
 """Maximum pauses in force. A further one only stops the cars."""
 MAX_ENDED_PAUSES: Final = 2 * MAX_PAUSES
 """Maximum ended pauses that are remembered."""
-_SENDER_RANK: Final = {kind: -number for number, kind in enumerate(SenderKind)}
+_SENDER_RANK: Final = {kind: -number for number, kind in enumerate(Rank)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class Hold:
 
     by: str
     since_ns: int
-    rank: SenderKind = SenderKind.PERSON
+    rank: Rank = Rank.PERSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class Estop:
     why: str
     at_ns: int
     fleet_wide: bool
-    rank: SenderKind = SenderKind.PERSON
+    rank: Rank = Rank.PERSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ class FleetPause:
     by: str
     why: str
     at_ns: int
-    rank: SenderKind = SenderKind.PERSON
+    rank: Rank = Rank.PERSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class Loan:
 
     to: str
     by: str
-    rank: SenderKind
+    rank: Rank
     since_ns: int
     duration_s: float
 
@@ -99,7 +100,7 @@ class LeaseState:
         if now >= self.until or sender == self.holder:
             return False
         mine, theirs = _SENDER_RANK[sender.kind], _SENDER_RANK[self.holder.kind]
-        takes = take and sender.kind in (SenderKind.PERSON, SenderKind.LEAD)
+        takes = take and sender.kind in (Rank.PERSON, Rank.LEAD)
         return mine < theirs or (mine == theirs and not self.gone and not takes)
 
 
@@ -159,11 +160,11 @@ class Safety:
 
     # ------------------------------------------------------------------ hold and e-stops
 
-    def put_on_hold(self, name: str, at_ns: int, rank: SenderKind = SenderKind.PERSON) -> None:
+    def put_on_hold(self, name: str, at_ns: int, rank: Rank = Rank.PERSON) -> None:
         """Put the car on hold, and end a lease of the coordinator. The hold of a lead replaces another."""
-        if self.hold is None or (rank is SenderKind.LEAD and self.hold.rank is not SenderKind.LEAD):
+        if self.hold is None or (rank is Rank.LEAD and self.hold.rank is not Rank.LEAD):
             self.hold = Hold(name, at_ns, rank)
-        if self.lease is not None and self.lease.holder.kind is SenderKind.COORDINATOR:
+        if self.lease is not None and self.lease.holder.kind is Rank.COORDINATOR:
             self.lease = None
 
     def latch(self, estop: Estop) -> Estop:

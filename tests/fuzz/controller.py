@@ -30,16 +30,16 @@ from gateway.control.commands import (
 from gateway.control.controller import Controller
 from gateway.control.estimate.trust import Basis
 from gateway.control.events import CommandRecord, FrameOrigin, OutgoingFrame
-from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import Estop, FleetPause
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, Rank, Reason, ServoAction, SpeedStep
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
-SENDERS = [Sender(f"{kind}-{number}", kind) for kind in SenderKind for number in range(3)]
+SENDERS = [Sender(f"{kind}-{number}", kind) for kind in Rank for number in range(3)]
 TABLES = [
     NO_PEOPLE,
     People.parse(["lead-0:lead", "lead-1:lead", "lead-2", "person-0", "script-0", "person-1:other"]),
@@ -167,7 +167,7 @@ class Wild:
             estops = [Estop(f"id{moments.randrange(40)}", "ann", "", 1, moments.random() < 0.9)]
             shown = estops if moments.random() < 0.1 else []
             self.control.merge_estops(shown, [f"id{moments.randrange(40)}"], "blue", self.now)
-            pauses = [FleetPause(f"id{moments.randrange(40)}", "ann", "", 1, moments.choice(list(SenderKind)))]
+            pauses = [FleetPause(f"id{moments.randrange(40)}", "ann", "", 1, moments.choice(list(Rank)))]
             shown_pauses = pauses if moments.random() < 0.1 else []
             self.control.merge_pauses(shown_pauses, [f"id{moments.randrange(40)}"], "blue", self.now)
         elif chance < 0.9995:
@@ -302,11 +302,11 @@ class Wild:
         pending = queue.mode_change if isinstance(write.frame, ModeOpen) else queue.held and queue.held.pending
         assert pending is not None, "nobody moves it"
         mover, loan = pending.command.sender, safety.loan_at(self.now)
-        if mover.kind is not SenderKind.LEAD:
+        if mover.kind is not Rank.LEAD:
             assert not safety.pauses
             assert loan is None or mover.person == loan.to or mover.person in people.leads
             borrowed = loan is not None and mover.person == loan.to
-            assert borrowed or mover.kind is SenderKind.COORDINATOR or people.may_drive(mover.person)
+            assert borrowed or mover.kind is Rank.COORDINATOR or people.may_drive(mover.person)
 
     def _check_once(self, frame: Frame, why: FrameOrigin) -> None:
         """Require that control writes a one-time action at most once for each accepted command, never as a repeat."""

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.people import SenderKind
 from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from gateway.state_file import MAX_OTHER_LINKS, SafetyStateFile
 from schemas.links import car_link, parse_link
 from schemas.state_dir import directory_of
+from schemas.words import Rank
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
@@ -22,14 +22,14 @@ NOW = 1_800_000_000_000_000_000
 
 def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
     directory = tmp_path / "not" / "yet" / "there"
-    estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True, rank=SenderKind.LEAD)
+    estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True, rank=Rank.LEAD)
     kept = PersistedSafety(
-        Hold("mia", NOW - 5, SenderKind.LEAD),
+        Hold("mia", NOW - 5, Rank.LEAD),
         (estop,),
         ("e0",),
-        (FleetPause("p1", "mia", "listen", NOW - 5, SenderKind.LEAD),),
+        (FleetPause("p1", "mia", "listen", NOW - 5, Rank.LEAD),),
         ("p0",),
-        Loan("bob", "mia", SenderKind.LEAD, NOW - 5, 60.0),
+        Loan("bob", "mia", Rank.LEAD, NOW - 5, 60.0),
     )
     SafetyStateFile(directory, "fleet", "red", LINK).save(kept)
     assert SafetyStateFile(directory, "fleet", "red", LINK).load(NOW) == kept
@@ -45,7 +45,7 @@ def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
     own = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=False)
     everybody = Estop("e2", "mia", "fire", NOW - 5, fleet_wide=True)
     pause = FleetPause("p1", "mia", "listen", NOW - 5)
-    loan = Loan("bob", "mia", SenderKind.LEAD, NOW - 5, 60.0)
+    loan = Loan("bob", "mia", Rank.LEAD, NOW - 5, 60.0)
     kept = PersistedSafety(Hold("mia", NOW - 5), (own, everybody), ("e0",), (pause,), ("p0",), loan)
     SafetyStateFile(tmp_path, "fleet", "red", LINK).save(kept)
     simulated = SafetyStateFile(tmp_path, "fleet", "red", OTHER)
@@ -101,7 +101,7 @@ def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     estop = {"id": "e1", "by": "mia", "why": "", "at_ns": 7, "fleet_wide": True}
     store.path.write_text(json.dumps({"hold": {"by": "mia", "since_ns": 7}, "estops": [estop], "ended": ["e0"]}))
-    person = SenderKind.PERSON
+    person = Rank.PERSON
     assert store.load(NOW) == PersistedSafety(
         Hold("mia", 7, person), (Estop("e1", "mia", "", 7, fleet_wide=True, rank=person),), ("e0",)
     )
@@ -109,7 +109,7 @@ def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
 
 def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
-    loan = Loan("bob", "mia", SenderKind.LEAD, NOW, 60.0)
+    loan = Loan("bob", "mia", Rank.LEAD, NOW, 60.0)
     store.save(PersistedSafety(loan=loan))
     assert store.load(NOW + 59_000_000_000).loan == loan
     assert store.load(NOW + 60_000_000_000).loan is None

@@ -21,15 +21,15 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, Safety
 from gateway.protocol.frames import General, Ptz
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Light, Mode, Motion, SpeedStep
+from schemas.words import Light, Mode, Motion, Rank, SpeedStep
 from tests.gateway.control.workbench import Workbench
 
 NOW = 1000.0
-PERSON, LEAD = SenderKind.PERSON, SenderKind.LEAD
+PERSON, LEAD = Rank.PERSON, Rank.LEAD
 TEACHER, ANN, BOB, EVE, ZED = (
     f"{name}@lab-{number}" for number, name in enumerate(("teacher", "ann", "bob", "eve", "zed"))
 )
@@ -52,7 +52,7 @@ ESTOPS = (
 )
 HOLDS = (None, Hold(ANN, 1, PERSON), Hold(TEACHER, 1, LEAD))
 PAUSES = (None, FleetPause("p1", TEACHER, "listen", 1, LEAD), FleetPause("p2", ANN, "", 1, PERSON))
-LEASES = (None, Sender(ANN, PERSON), Sender(TEACHER, LEAD), Sender("script@lab-9", SenderKind.SCRIPT))
+LEASES = (None, Sender(ANN, PERSON), Sender(TEACHER, LEAD), Sender("script@lab-9", Rank.SCRIPT))
 LOANS = ("", "bob", "eve", "teacher")
 ASKED: dict[str, tuple[Action, ...]] = {
     "move": (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), OneShot(Ptz(90)), ChangeSpeed(SpeedStep.DOWN)),

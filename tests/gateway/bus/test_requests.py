@@ -28,13 +28,13 @@ from gateway.control.commands import (
     Stop,
     TakeLease,
 )
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, Ptz
 from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF
-from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 
 NOW = 1_800_000_000_000_000_000
 
@@ -101,7 +101,7 @@ def general(**fields: Any) -> OneShot:
 def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> None:
     command = ask(verb, payload)
     assert command.what == what
-    assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", SenderKind.SCRIPT), False)
+    assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", Rank.SCRIPT), False)
     assert (command.age_s, command.ttl_s) == (None, 0.5 if verb == "drive" else 2.0)
     assert len(command.id) == 32
     if payload is not None:
@@ -235,7 +235,7 @@ def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:
 
 def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> None:
     error = refused("drive", {"motion": "up", "id": "abc", "sender": "mia", "kind": "person"})
-    assert (error.command.id, error.command.sender) == ("abc", Sender("mia", SenderKind.PERSON))
+    assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Rank.PERSON))
 
 
 def test_a_gateway_may_allow_longer_drives() -> None:

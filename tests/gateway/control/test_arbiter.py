@@ -26,11 +26,11 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
 from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion, Reason, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
 NOW = 100.0
@@ -63,12 +63,12 @@ DIRECTIONS: list[Action] = [Pause("listen"), Unpause(), Lend("bob", 60.0), EndLo
 """Commands that test_people.py tests, with leads and pauses."""
 MOVES = (Drive, SetMode, ChangeSpeed, Fan)
 """Commands that move the car or change how it moves. These, servo and arm need the lease."""
-KINDS = [SenderKind.PERSON, SenderKind.SCRIPT, SenderKind.COORDINATOR]
+KINDS = [Rank.PERSON, Rank.SCRIPT, Rank.COORDINATOR]
 SENDERS = [Sender("ann", kind) for kind in KINDS]
 LEASES = [
     None,
     *(LeaseState(Sender("bob", kind), NOW + 1.0) for kind in KINDS),
-    LeaseState(Sender("bob", SenderKind.PERSON), NOW - 1.0),
+    LeaseState(Sender("bob", Rank.PERSON), NOW - 1.0),
 ]
 MODES = [None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED]
 RANK = list(reversed(KINDS))
@@ -138,7 +138,7 @@ def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
     seen = {each and each[0] for each in found}
     if isinstance(what, Drive) and what.motion is not Motion.STOP:
         every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
-        assert seen == (every | {Reason.HELD} if sender.kind is SenderKind.COORDINATOR else every)
+        assert seen == (every | {Reason.HELD} if sender.kind is Rank.COORDINATOR else every)
 
 
 def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
@@ -149,7 +149,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
         return
     if isinstance(what, Resume):
         in_force = what.ids == ("e1",) and bool(at.estops)
-        allowed = kind is not SenderKind.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
+        allowed = kind is not Rank.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
         assert (reason is None) == allowed
         return
     if what == TakeLease(release=True):
@@ -158,14 +158,14 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     if reason is not None:
         return
     assert not at.estops, "an e-stopped car obeys nothing"
-    assert not (at.hold and kind is SenderKind.COORDINATOR), "no coordinator's command moves a held car"
+    assert not (at.hold and kind is Rank.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
         assert not at.closing
     moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
     if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
         mine, theirs = RANK.index(kind), RANK.index(at.lease.holder.kind)
-        assert mine > theirs or (mine == theirs and command.take and kind is SenderKind.PERSON)
+        assert mine > theirs or (mine == theirs and command.take and kind is Rank.PERSON)
     if at.battery:
         assert not isinstance(what, Drive) or what.motion is Motion.STOP
         assert not isinstance(what, SetMode) or what.mode is Mode.MANUAL
@@ -203,7 +203,7 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     assert refusal is not None
     assert refusal[0] is Reason.STALE
     for stop in (Stop(), EmergencyStop(), Pause()):
-        assert refuse(Command("c", "stop", Sender("ann", SenderKind.PERSON), stop, age_s=1e9, ttl_s=2.0), calm) is None
+        assert refuse(Command("c", "stop", Sender("ann", Rank.PERSON), stop, age_s=1e9, ttl_s=2.0), calm) is None
 
 
 @pytest.mark.parametrize(
@@ -239,6 +239,6 @@ def test_a_time_far_from_now_is_refused_but_a_stop_looks_at_no_clock(
     what: Action, age_s: float, *, refused: bool
 ) -> None:
     calm = replace(situations()[0], profile=PROFILES["stm32+arm"], asked=Mode.MANUAL, closing=False, fan=True)
-    refusal = refuse(Command("c", "verb", Sender("ann", SenderKind.PERSON), what, age_s=age_s, ttl_s=2.0), calm)
+    refusal = refuse(Command("c", "verb", Sender("ann", Rank.PERSON), what, age_s=age_s, ttl_s=2.0), calm)
     is_stale = refusal is not None and refusal[0] is Reason.STALE
     assert is_stale is (refused and not isinstance(what, Stop | EmergencyStop | Pause))

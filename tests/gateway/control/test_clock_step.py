@@ -8,11 +8,10 @@ from hypothesis import strategies as st
 
 from gateway.bus.requests import ParsedRequest, parse
 from gateway.control.commands import Answer
-from gateway.control.people import SenderKind
 from gateway.control.safety import LEASE_S, Loan, PersistedSafety, Safety
 from schemas import messages
 from schemas.commands import COMMANDS
-from schemas.words import Motion, Phase, Reason
+from schemas.words import Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import Workbench
 
 S = 1_000_000_000
@@ -97,6 +96,6 @@ def test_a_sender_whose_clock_is_wrong_may_stop_and_pause_and_nothing_else(verb:
 
 @pytest.mark.parametrize(("step_ns", "left_s"), [(-HOUR, 600.0), (0, 540.0), (HOUR, -3060.0)])
 def test_a_step_while_no_gateway_runs_prolongs_no_loan_beyond_its_duration(step_ns: int, left_s: float) -> None:
-    loan = Loan("mia", "ann", SenderKind.PERSON, BEGAN, 600.0)
+    loan = Loan("mia", "ann", Rank.PERSON, BEGAN, 600.0)
     safety = Safety.restore(PersistedSafety(loan=loan), 50.0, BEGAN + 60 * S + step_ns)
     assert safety.loan_until == 50.0 + left_s

@@ -23,15 +23,15 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Mode, Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
 from tests.support.message_length import MAX_LINES, count_lines
 
-LEAD, PERSON, SCRIPT, COORDINATOR = SenderKind
+LEAD, PERSON, SCRIPT, COORDINATOR = Rank
 NOW = 100.0
 PEOPLE = People.parse(["teacher:lead", "ann", "bob", "cid:other"])
 ACTIONS: dict[str, Action] = {
@@ -65,7 +65,7 @@ SENDERS = {
 """A lead, a person who drives the car, her script, the coordinator, a person of other cars, an unlisted person."""
 
 
-def names(kind: SenderKind) -> str:
+def names(kind: Rank) -> str:
     """Return the name of another sender of this rank."""
     return {LEAD: "head", PERSON: "bob", SCRIPT: "bob", COORDINATOR: "plan2"}[kind] + "@lab-9"
 
@@ -92,16 +92,16 @@ ESTOPS: list[tuple[Estop, ...]] = [
     *(
         (Estop("e1", by, "", 1, wide, rank),)
         for by, rank, wide in [
-            *((names(kind), kind, False) for kind in SenderKind),
+            *((names(kind), kind, False) for kind in Rank),
             ("ann@x", PERSON, False),
             ("cid@x", PERSON, False),
             ("eve@x", PERSON, True),
         ]
     ),
 ]
-HOLDS = [None, *(Hold(names(kind), 1, kind) for kind in SenderKind)]
-PAUSES: list[tuple[FleetPause, ...]] = [(), *((FleetPause("p", names(kind), "", 1, kind),) for kind in SenderKind)]
-LEASES = [None, *(LeaseState(Sender(names(kind), kind), NOW + 1) for kind in SenderKind)]
+HOLDS = [None, *(Hold(names(kind), 1, kind) for kind in Rank)]
+PAUSES: list[tuple[FleetPause, ...]] = [(), *((FleetPause("p", names(kind), "", 1, kind),) for kind in Rank)]
+LEASES = [None, *(LeaseState(Sender(names(kind), kind), NOW + 1) for kind in Rank)]
 LOANS = [None, *(Loan(to, "teacher", LEAD, 1, 60.0) for to in ("ann", "bob", "cid", "dan"))]
 TABLES: dict[str, dict[str, str] | None] = {
     "no people": None,
@@ -153,7 +153,7 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
     directs = lead or (not leads and sender.kind is PERSON and (listed is None or person in listed))
     lent = at.loan is not None and not borrows and not lead and not (leads and person == "teacher")
 
-    def is_protected(rank: SenderKind) -> bool:
+    def is_protected(rank: Rank) -> bool:
         # Without a table none of these senders is a lead, and none of them began anything as a lead.
         return rank is LEAD and not lead and (leads or listed is None)
 
@@ -198,7 +198,7 @@ def resumed(
     at: CommandContext,
     *,
     drives: bool,
-    is_protected: Callable[[SenderKind], bool],
+    is_protected: Callable[[Rank], bool],
 ) -> Reason | None:
     if sender.kind is COORDINATOR:
         return Reason.HELD
@@ -226,7 +226,7 @@ def resumed(
         (People.parse(["ann"]), (LEAD,), "A person"),  # the table has no lead
     ],
 )
-def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[SenderKind, ...], who: str) -> None:
+def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[Rank, ...], who: str) -> None:
     pauses = tuple(FleetPause(f"p{at_ns}", "teacher@lab", "", at_ns, rank) for at_ns, rank in enumerate(ranks))
     at = replace(FREE, people=people, pauses=pauses)
     reason, words = refused(Drive(Motion.FORWARD), SENDERS["person"], at)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
 from gateway.control.safety import (
     MAX_ENDED_ESTOPS,
     MAX_ENDED_PAUSES,
@@ -19,9 +19,10 @@ from gateway.control.safety import (
     PersistedSafety,
     Safety,
 )
+from schemas.words import Rank
 
-ANN, BOB = Sender("ann", SenderKind.PERSON), Sender("bob", SenderKind.PERSON)
-SCRIPT, PLAN = Sender("ann", SenderKind.SCRIPT), Sender("plan", SenderKind.COORDINATOR)
+ANN, BOB = Sender("ann", Rank.PERSON), Sender("bob", Rank.PERSON)
+SCRIPT, PLAN = Sender("ann", Rank.SCRIPT), Sender("plan", Rank.COORDINATOR)
 
 
 def estop(identity: str, *, fleet_wide: bool = True) -> Estop:
@@ -104,11 +105,11 @@ def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
 def test_a_gateway_without_people_learns_that_a_lead_did_an_e_stop() -> None:
     """The e-stop of a lead reaches each gateway directly. A gateway without people latches it as a person's."""
     own = estop("a")
-    lead = replace(own, rank=SenderKind.LEAD)
+    lead = replace(own, rank=Rank.LEAD)
     safety = Safety()
     safety.latch(own)
     assert safety.merge([lead], ()) == ([], []), "nothing new: the car is not stopped once more"
-    assert (safety.estops, safety.hold) == ((lead,), Hold("eve", 7, SenderKind.LEAD))
+    assert (safety.estops, safety.hold) == ((lead,), Hold("eve", 7, Rank.LEAD))
     assert safety.merge([own], ()) == ([], [])
     assert safety.estops == (lead,), "no other gateway lowers the rank"
     safety.end(["a"])
@@ -144,7 +145,7 @@ def test_gateways_agree_on_pauses_in_whatever_order_they_see_each_other(
         if ends:
             cars[number].end_pauses([identity])
         else:
-            cars[number].pause(FleetPause(identity, "eve", "", number, list(SenderKind)[number]))
+            cars[number].pause(FleetPause(identity, "eve", "", number, list(Rank)[number]))
     seen = [(car.pauses, car.ended_pauses) for car in cars]
     first, last = Safety(), Safety()
     for number in order:
@@ -175,17 +176,15 @@ def test_pauses_are_bounded_and_an_ended_one_stays_ended() -> None:
 
 def test_nobody_lowers_the_rank_of_another_ones_e_stop_or_hold() -> None:
     safety = Safety()
-    lead = Estop("a", "eve", "", 1, fleet_wide=False, rank=SenderKind.LEAD)
+    lead = Estop("a", "eve", "", 1, fleet_wide=False, rank=Rank.LEAD)
     safety.latch(lead)
-    assert safety.latch(replace(lead, by="bob", rank=SenderKind.PERSON, fleet_wide=True)) == replace(
-        lead, fleet_wide=True
-    )
-    safety.put_on_hold("bob", 2, SenderKind.PERSON)
-    assert safety.hold == Hold("eve", 1, SenderKind.LEAD)
+    assert safety.latch(replace(lead, by="bob", rank=Rank.PERSON, fleet_wide=True)) == replace(lead, fleet_wide=True)
+    safety.put_on_hold("bob", 2, Rank.PERSON)
+    assert safety.hold == Hold("eve", 1, Rank.LEAD)
 
 
 def test_a_loan_is_restored_for_the_time_that_is_left() -> None:
-    loan = Loan("bob", "eve", SenderKind.LEAD, 1_000_000_000, 10.0)
+    loan = Loan("bob", "eve", Rank.LEAD, 1_000_000_000, 10.0)
     safety = Safety.restore(PersistedSafety(loan=loan), now=500.0, now_ns=4_000_000_000)
     assert safety.loan_until == 507.0
     assert safety.loan_at(506.9) == loan

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
-from gateway.control.people import NO_PEOPLE, People, Sender, SenderKind
+from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
@@ -13,7 +13,7 @@ from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
-from schemas.words import Mode, Phase, Reason
+from schemas.words import Mode, Phase, Rank, Reason
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
@@ -37,9 +37,9 @@ SHOWN_STOP = [MODE00, STOP, MODE00]
 """Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a pause. Two pauses are needed, and
 no frame may follow the last one."""
 
-PERSON = Sender("mia", SenderKind.PERSON)
-SCRIPT = Sender("script", SenderKind.SCRIPT)
-COORDINATOR = Sender("plan", SenderKind.COORDINATOR)
+PERSON = Sender("mia", Rank.PERSON)
+SCRIPT = Sender("script", Rank.SCRIPT)
+COORDINATOR = Sender("plan", Rank.COORDINATOR)
 
 
 class ObedientCar:

@@ -13,10 +13,10 @@ from gateway.control.commands import (
     Stop,
     TakeLease,
 )
-from gateway.control.people import Sender, SenderKind
+from gateway.control.people import Sender
 from gateway.control.safety import Estop, PersistedSafety
 from gateway.protocol.frames import ColorLed
-from schemas.words import Mode, Motion, Phase, Reason, SpeedStep
+from schemas.words import Mode, Motion, Phase, Rank, Reason, SpeedStep
 from tests.gateway.control.workbench import (
     COORDINATOR,
     PERSON,
@@ -30,7 +30,7 @@ from tests.gateway.control.workbench import (
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
 FORWARD = Drive(Motion.FORWARD, 5.0)
-BOB = Sender("bob", SenderKind.PERSON)
+BOB = Sender("bob", Rank.PERSON)
 
 
 @pytest.fixture
