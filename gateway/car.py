@@ -25,8 +25,8 @@ from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
-from gateway.control.estimate.link_health import LinkHealth, LinkState
-from gateway.control.events import Level, OutgoingFrame
+from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.events import OutgoingFrame
 from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
@@ -42,6 +42,7 @@ from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
+from schemas.words import Level, LinkState
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""

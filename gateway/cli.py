@@ -212,9 +212,10 @@ def _run(arguments: argparse.Namespace) -> int:
             from pathlib import Path
 
             from gateway.car import Settings, serve
-            from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
+            from gateway.control.estimate.battery import BatteryPolicy
             from gateway.protocol.platforms import parse_platform
             from schemas.state_dir import directory_of
+            from schemas.words import BatteryAction
 
             logging.basicConfig(
                 format="%(asctime)s %(levelname)s %(message)s",
@@ -232,8 +233,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 state_dir,
                 arguments.retry,
                 battery=BatteryPolicy(
-                    BatteryReaction(arguments.on_battery_low),
-                    BatteryReaction(arguments.on_battery_critical),
+                    BatteryAction(arguments.on_battery_low),
+                    BatteryAction(arguments.on_battery_critical),
                     low_v,
                     critical_v,
                 ),

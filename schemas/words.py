@@ -125,3 +125,106 @@ class Rank(StrEnum):
     PERSON = "person"
     SCRIPT = "script"
     COORDINATOR = "coordinator"
+
+
+class CarTrust(StrEnum):
+    """The known state of the car."""
+
+    UNKNOWN = "unknown"
+    """The link is down. The car may stand or move."""
+    RECOVERING = "recovering"
+    """The link is open, and a stop that brings the car to a known state is in progress."""
+    STOPPING = "stopping"
+    """A stop of a car in a known state is in progress."""
+    STOPPED = "stopped"
+    """The stop is complete: the car has shown it, or cannot show it. See `Basis`."""
+    DRIVING = "driving"
+    """The gateway sent a motion."""
+    IN_MODE = "in_mode"
+    """The gateway opened a mode in which the car drives by itself."""
+    UNHEARD = "unheard"
+    """The link is open, and the car is silent for longer than any normal silence. The stop goes on."""
+    UNPROVEN = "unproven"
+    """The car reports, could have shown the stop, and did not in time. The stop goes on."""
+
+
+class Basis(StrEnum):
+    """The basis of the claim that the motors are off."""
+
+    SHOWN = "shown"
+    """The car's own readings."""
+    SENT = "sent"
+    """The written frames. The car cannot show that it obeyed them."""
+
+
+class Verdict(StrEnum):
+    """The confidence in the commanded mode."""
+
+    ASSUMED = "assumed"
+    CONFIRMED = "confirmed"
+    CONTRADICTED = "contradicted"
+
+
+class LinkState(StrEnum):
+    """The state of a link. `quiet`: an expected silence. `stale`: an unexpected silence. `lost`: the port is closed."""
+
+    ONLINE = "online"
+    QUIET = "quiet"
+    STALE = "stale"
+    LOST = "lost"
+
+
+class BatteryLevel(StrEnum):
+    """The level of the battery, for a person."""
+
+    OK = "ok"
+    LOW = "low"
+    CRITICAL = "critical"
+
+
+class BatteryAction(StrEnum):
+    """The reaction to a battery's level, a value of `gateway run --on-battery-low`."""
+
+    WARN = "warn"
+    REFUSE = "refuse"
+    """Refuse new drives and modes. A running drive or mode goes on."""
+    STOP = "stop"
+    """Refuse new drives and modes, and stop the car."""
+
+
+class Shows(StrEnum):
+    """Whether the car's reports show that a stop arrived."""
+
+    UNKNOWN = "not_known_yet"
+    YES = "yes"
+    """It has shown one."""
+    NO = "no"
+    """Its reports do not react to frames."""
+
+
+class Blocking(StrEnum):
+    """The frames that may delay the next report."""
+
+    MODE_CLOSE = "mode_close"
+    WHISTLE = "whistle"
+    SERVO = "servo"
+    COLOR = "color"
+
+
+class Level(StrEnum):
+    """The severity of a log record."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class FrameOrigin(StrEnum):
+    """The reason for a frame."""
+
+    COMMAND = "command"
+    REPEAT = "repeat"
+    STOP = "stop"
+    RECOVERY = "recovery"
+    SHUTDOWN = "shutdown"

@@ -15,7 +15,6 @@ from fleet.fleetfile.models import (
     CRITICAL_V,
     DEFAULT_MAX_DRIVE_S,
     LOW_V,
-    BatteryAction,
     ConsoleEntry,
     FileEntry,
     LimitsEntry,
@@ -28,6 +27,7 @@ from gateway.protocol.platform_name import AUTO, Platform, normalize_name, parse
 from gateway.protocol.platforms import parse_platform
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.links import BadLink
+from schemas.words import BatteryAction
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 

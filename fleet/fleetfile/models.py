@@ -15,7 +15,7 @@ from gateway.protocol.platforms import parse_platform
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.links import BadLink
-from schemas.words import Mode
+from schemas.words import BatteryAction, Mode
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
 
@@ -29,14 +29,6 @@ class PersonRank(StrEnum):
 
     LEAD = "lead"
     PERSON = "person"
-
-
-class BatteryAction(StrEnum):
-    """The reaction to a battery's level, a value of `gateway run --on-battery-low`."""
-
-    WARN = "warn"
-    REFUSE = "refuse"
-    STOP = "stop"
 
 
 def validate_name(name: str) -> str:

@@ -16,11 +16,11 @@ from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.controller import Controller
-from gateway.control.events import Level, LogRecord
+from gateway.control.events import LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Phase, Reason
+from schemas.words import Level, Phase, Reason
 
 _LOGGING_LEVELS: Final = {
     Level.DEBUG: logging.DEBUG,

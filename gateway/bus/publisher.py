@@ -18,14 +18,14 @@ from gateway.control.car_model import CarModel
 from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
-from gateway.control.events import CommandRecord, Level, LogRecord, OutgoingFrame
+from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.people import PersonRole
 from gateway.control.rate_limit import TokenBucket
 from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Mode, Phase
+from schemas.words import BatteryLevel, Level, Mode, Phase
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
@@ -104,7 +104,7 @@ class CarPublisher:
                 message.charge, message.charge_error = battery.charge(
                     voltage_v, loaded=loaded, cells=self.profile.cells
                 )
-                message.level = self._battery.level or battery.BatteryLevel.OK
+                message.level = self._battery.level or BatteryLevel.OK
             self._put_kept(name, message, event.at, stamp_ns)
             published.append(name)
         if not self._raw.take(1, event.at):

@@ -8,12 +8,11 @@ from typing import Final
 
 from gateway.control.command_log import CommandLog
 from gateway.control.estimate.battery import Battery, BatteryPolicy
-from gateway.control.estimate.learned import Blocking, Learned, Shows
-from gateway.control.estimate.mode import ModeEstimator, Verdict
+from gateway.control.estimate.learned import Learned
+from gateway.control.estimate.mode import ModeEstimator
 from gateway.control.estimate.outputs import StateEstimate
 from gateway.control.estimate.platform import PlatformDetector
-from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
-from gateway.control.events import Level
+from gateway.control.estimate.trust import TrustEvent, TrustState
 from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase, StopEvidence
@@ -21,7 +20,7 @@ from gateway.protocol.frames import ColorLed
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
-from schemas.words import Mode, Motion
+from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Shows, Verdict
 
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""

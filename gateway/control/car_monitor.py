@@ -5,12 +5,8 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog
 from gateway.control.commands import SetMode
-from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
-from gateway.control.estimate.learned import Blocking, Shows
-from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.platform import PlatformDetector
-from gateway.control.estimate.trust import STOP_GOES_ON, CarTrust, TrustEvent
-from gateway.control.events import FrameOrigin, Level
+from gateway.control.estimate.trust import STOP_GOES_ON, TrustEvent
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
@@ -19,7 +15,20 @@ from gateway.protocol.modes import only_candidate
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
-from schemas.words import Cause, Mode, Phase, Reason
+from schemas.words import (
+    BatteryAction,
+    BatteryLevel,
+    Blocking,
+    CarTrust,
+    Cause,
+    FrameOrigin,
+    Level,
+    Mode,
+    Phase,
+    Reason,
+    Shows,
+    Verdict,
+)
 
 STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one it stops the car
@@ -195,7 +204,7 @@ class CarMonitor:
         level, words = model.battery.level, f"{model.name}: {model.battery.words}"
         severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
         self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
-        if model.battery.action is BatteryReaction.STOP and not model.at_rest:
+        if model.battery.action is BatteryAction.STOP and not model.at_rest:
             self._executor.halt(words, now)
             self._stops.begin_full(now)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.commands import Command
-from gateway.control.events import CommandRecord, Level, LogRecord, Record
+from gateway.control.events import CommandRecord, LogRecord, Record
 from gateway.protocol.frames import Frame
-from schemas.words import Phase, Reason
+from schemas.words import Level, Phase, Reason
 
 MAX_COMMAND_IDS: Final = 256
 """Maximum accepted commands whose ids are remembered, to detect duplicates."""

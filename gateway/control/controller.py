@@ -34,8 +34,7 @@ from gateway.control.commands import (
 )
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.learned import Learned
-from gateway.control.estimate.mode import Verdict
-from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
+from gateway.control.events import OutgoingFrame, Record
 from gateway.control.executor import LATE_DRIVE_S, Executor
 from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
@@ -44,7 +43,7 @@ from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
-from schemas.words import Mode, Motion, Phase, Rank, Reason
+from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
 START_MARGIN_S: Final = 1.0
 """How much longer than announced, and than its own duration, a drive waits for the car before it expires."""

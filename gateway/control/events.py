@@ -1,11 +1,10 @@
 """The output of control: records of commands, log records, and frames to write. Values only."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from gateway.control.commands import Command
 from gateway.protocol.frames import Frame
-from schemas.words import Phase, Reason
+from schemas.words import FrameOrigin, Level, Phase, Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,15 +24,6 @@ class CommandRecord:
     """`shown` or `sent`, in the last record of a stop."""
 
 
-class Level(StrEnum):
-    """The severity of a log record."""
-
-    DEBUG = "debug"
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
-
-
 @dataclass(frozen=True, slots=True)
 class LogRecord:
     """One log record. `code` is one word for machines, `words` are for a person."""
@@ -45,16 +35,6 @@ class LogRecord:
 
 
 Record = CommandRecord | LogRecord
-
-
-class FrameOrigin(StrEnum):
-    """The reason for a frame."""
-
-    COMMAND = "command"
-    REPEAT = "repeat"
-    STOP = "stop"
-    RECOVERY = "recovery"
-    SHUTDOWN = "shutdown"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,8 @@ from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
 from gateway.control.commands import Fan, SetMode
 from gateway.control.estimate.learned import blocking_kind
-from gateway.control.estimate.mode import Verdict
-from gateway.control.estimate.trust import Basis, TrustEvent
-from gateway.control.events import FrameOrigin, OutgoingFrame
+from gateway.control.estimate.trust import TrustEvent
+from gateway.control.events import OutgoingFrame
 from gateway.control.pacing import AWAKE_WAIT_S, FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
@@ -23,7 +22,7 @@ from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Basis, FrameOrigin, Mode, Motion, Phase, Reason, Verdict
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends

@@ -8,9 +8,7 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.commands import SetMode
-from gateway.control.estimate.learned import Shows
-from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
-from gateway.control.events import FrameOrigin, Level
+from gateway.control.estimate.trust import STOP_GOES_ON, TrustEvent
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import sequences, stopping
@@ -21,7 +19,7 @@ from gateway.protocol.frames import ModeClose
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
-from schemas.words import Phase, Reason
+from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""

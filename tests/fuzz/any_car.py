@@ -9,11 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gateway.control.commands import Action, Drive, OneShot, SetMode, Stop
-from gateway.control.estimate.mode import Verdict
 from gateway.protocol.frames import General, ModeOpen
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
-from schemas.words import Light, Mode, Motion, Phase
+from schemas.words import Light, Mode, Motion, Phase, Verdict
 from tests.support.stops import WORLDS
 from tests.support.virtual import Pair
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 from gateway.control.estimate.mode import ModeEstimator
-from gateway.control.estimate.trust import Basis
 from gateway.control.stop_executor import StopExecutor
 from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import evidence
@@ -12,6 +11,7 @@ from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol import decoder
 from gateway.protocol.platforms import Profile
+from schemas.words import Basis
 
 Patch = Callable[[object, str, Any], None]
 """`pytest.MonkeyPatch.setattr`."""

@@ -17,9 +17,7 @@ from typing import Any
 
 from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.estimate.learned import KEPT_INTERVALS, Learned, Shows
-from gateway.control.estimate.mode import Verdict
-from gateway.control.estimate.trust import CarTrust
+from gateway.control.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.control.events import CommandRecord
 from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
@@ -29,7 +27,7 @@ from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 

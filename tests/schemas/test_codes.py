@@ -6,10 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from gateway.control.estimate.battery import BatteryLevel
-from gateway.control.events import Level
 from schemas.codes import EVENTS, REASONS
-from schemas.words import Reason
+from schemas.words import BatteryLevel, Level, Reason
 
 ROOT: Final = Path(__file__).parent.parent.parent
 PAGE: Final = ROOT / "docs/how-to/troubleshooting.md"

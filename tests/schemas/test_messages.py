@@ -6,13 +6,10 @@ import pytest
 from google.protobuf import descriptor_pb2
 from google.protobuf.descriptor import FieldDescriptor
 
-from gateway.control.estimate.battery import BatteryLevel
-from gateway.control.estimate.link_health import LinkState
-from gateway.control.estimate.mode import Verdict
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Mode, Motion
+from schemas.words import BatteryLevel, LinkState, Mode, Motion, Verdict
 
 SERVICES = {"fleet.v1.DownCommand", "fleet.v1.ReloadCommand"}
 """Commands of the fleet's own services."""

@@ -4,13 +4,12 @@ import random
 from collections.abc import Callable
 
 from gateway.control.commands import Action, ChangeSpeed, Drive, Fan, Find, OneShot, SetMode, Stop
-from gateway.control.estimate.link_health import LinkHealth, LinkState
-from gateway.control.estimate.mode import Verdict
+from gateway.control.estimate.link_health import LinkHealth
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, General, Ptz
 from gateway.protocol.sensors import Sensors
 from gateway.sim.model.raspberry_pi import Transport
-from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
+from schemas.words import Light, LinkState, Mode, Motion, Phase, Reason, ServoAction, SpeedStep, Verdict
 from tests.support.truth import WORLDS
 from tests.support.virtual import Pair
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
-from gateway.control.events import CommandRecord, Level, LogRecord
+from gateway.control.events import CommandRecord, LogRecord
 from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
@@ -14,7 +14,7 @@ from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.words import Phase
+from schemas.words import Level, Phase
 
 TICK_S = 0.05
 """Interval at which control checks silence. Bytes, deadlines and events of the car wake the loop when they are due."""

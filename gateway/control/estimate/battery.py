@@ -4,8 +4,9 @@ A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.
 """
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import Final
+
+from schemas.words import BatteryAction, BatteryLevel
 
 EMPTY_V: Final = 6.4  # docs/reference/protocol.md#readings: two Li-ion cells, 6.4 V empty
 FULL_V: Final = 8.4  # to 8.4 V full
@@ -23,24 +24,6 @@ LEVEL_DEBOUNCE_S: Final = 5.0
 """Minimum time that all readings must show another level before the level changes. Mode 0 sends one a second."""
 
 
-class BatteryLevel(StrEnum):
-    """The level of the battery, for a person."""
-
-    OK = "ok"
-    LOW = "low"
-    CRITICAL = "critical"
-
-
-class BatteryReaction(StrEnum):
-    """The reaction to a level."""
-
-    WARN = "warn"
-    REFUSE = "refuse"
-    """Refuse new drives and modes. A running drive or mode goes on."""
-    STOP = "stop"
-    """Refuse new drives and modes, and stop the car."""
-
-
 @dataclass(frozen=True, slots=True)
 class BatteryPolicy:
     """The threshold of each level, V at rest of two cells, and the reaction to it.
@@ -48,8 +31,8 @@ class BatteryPolicy:
     By default no level stops the car: a brownout resets the car, which stops it too.
     """
 
-    low: BatteryReaction = BatteryReaction.WARN
-    critical: BatteryReaction = BatteryReaction.REFUSE
+    low: BatteryAction = BatteryAction.WARN
+    critical: BatteryAction = BatteryAction.REFUSE
     low_v: float = LOW_V
     critical_v: float = CRITICAL_V
 
@@ -63,7 +46,7 @@ class BatteryPolicy:
         """Return the policy for so many cells: thresholds are given for two."""
         return replace(self, low_v=self.low_v * cells / 2, critical_v=self.critical_v * cells / 2)
 
-    def action(self, level: BatteryLevel | None) -> BatteryReaction | None:
+    def action(self, level: BatteryLevel | None) -> BatteryAction | None:
         """Return the reaction to a level; None if it is ok or unknown."""
         match level:
             case BatteryLevel.LOW:
@@ -128,7 +111,7 @@ class Battery:
         return self.measured_at - self._loaded_at < LOAD_RECOVERY_S
 
     @property
-    def action(self) -> BatteryReaction | None:
+    def action(self) -> BatteryAction | None:
         """Return the reaction to the current level."""
         return self.policy.action(self.level)
 
@@ -143,7 +126,7 @@ class Battery:
     @property
     def refusal(self) -> str:
         """Return why new drives and modes are refused; empty if they are allowed."""
-        refuses = self.action in (BatteryReaction.REFUSE, BatteryReaction.STOP)
+        refuses = self.action in (BatteryAction.REFUSE, BatteryAction.STOP)
         return f"{self.words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
 
 

@@ -19,14 +19,13 @@ learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from statistics import median
 from typing import Any, Final
 
 from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import SENSOR_FIELDS, Reject, Sensors
-from schemas.words import Mode
+from schemas.words import Blocking, Mode, Shows
 
 KEPT_INTERVALS: Final = 9
 """Number of intervals of a rhythm."""
@@ -50,25 +49,6 @@ REACTED: Final = 3
 """Number of consecutive reactions that end that finding."""
 MAX_KEPT_S: Final = 10.0
 """Maximum interval or block in a state file: three times those of the slowest car."""
-
-
-class Shows(StrEnum):
-    """Whether the car's reports show that a stop arrived."""
-
-    UNKNOWN = "not_known_yet"
-    YES = "yes"
-    """It has shown one."""
-    NO = "no"
-    """Its reports do not react to frames."""
-
-
-class Blocking(StrEnum):
-    """The frames that may delay the next report."""
-
-    MODE_CLOSE = "mode_close"
-    WHISTLE = "whistle"
-    SERVO = "servo"
-    COLOR = "color"
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:

@@ -2,24 +2,15 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Final
 
 from gateway.protocol.timing import BYTES_PER_S
+from schemas.words import LinkState
 
 AIRTIME_WINDOW_S: Final = 10.0
 """Period of which `airtime` is the share."""
 STALE_S: Final = 3.0
 """Maximum silence of an online link in a silent mode."""
-
-
-class LinkState(StrEnum):
-    """The state of a link. `quiet`: an expected silence. `stale`: an unexpected silence. `lost`: the port is closed."""
-
-    ONLINE = "online"
-    QUIET = "quiet"
-    STALE = "stale"
-    LOST = "lost"
 
 
 @dataclass(slots=True)

@@ -6,7 +6,6 @@ modes can be distinguished and how soon; the tests check it.
 
 from collections import deque
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Final
 
 from gateway.control.estimate.learned import Learned
@@ -15,7 +14,7 @@ from gateway.protocol.modes import SILENT_MODES, candidate_modes
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import Sensors
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 
 CONTRADICTING_FRAMES: Final = 3
 """Number of consecutive readings of another mode that contradict the commanded one
@@ -31,14 +30,6 @@ CORRUPTED_MATCH_S: Final = 0.5
 """Period after a reading from another mode in which a single match may be a corrupted frame. Require three in a row."""
 MAX_BLOCKS: Final = 256
 """Maximum blocking frames that excuse a silence: a car that whistles without a pause reports nothing."""
-
-
-class Verdict(StrEnum):
-    """The confidence in the commanded mode."""
-
-    ASSUMED = "assumed"
-    CONFIRMED = "confirmed"
-    CONTRADICTED = "contradicted"
 
 
 @dataclass(slots=True)

@@ -8,35 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-
-class CarTrust(StrEnum):
-    """The known state of the car."""
-
-    UNKNOWN = "unknown"
-    """The link is down. The car may stand or move."""
-    RECOVERING = "recovering"
-    """The link is open, and a stop that brings the car to a known state is in progress."""
-    STOPPING = "stopping"
-    """A stop of a car in a known state is in progress."""
-    STOPPED = "stopped"
-    """The stop is complete: the car has shown it, or cannot show it. See `Basis`."""
-    DRIVING = "driving"
-    """The gateway sent a motion."""
-    IN_MODE = "in_mode"
-    """The gateway opened a mode in which the car drives by itself."""
-    UNHEARD = "unheard"
-    """The link is open, and the car is silent for longer than any normal silence. The stop goes on."""
-    UNPROVEN = "unproven"
-    """The car reports, could have shown the stop, and did not in time. The stop goes on."""
-
-
-class Basis(StrEnum):
-    """The basis of the claim that the motors are off."""
-
-    SHOWN = "shown"
-    """The car's own readings."""
-    SENT = "sent"
-    """The written frames. The car cannot show that it obeyed them."""
+from schemas.words import Basis, CarTrust
 
 
 class TrustEvent(StrEnum):

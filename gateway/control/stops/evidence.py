@@ -52,12 +52,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from gateway.control.estimate.learned import SAME_S, Blocking, Learned, Rhythm, Shows
+from gateway.control.estimate.learned import SAME_S, Learned, Rhythm
 from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import Sensors
 from gateway.protocol.timing import FRAME_S
-from schemas.words import Mode
+from schemas.words import Blocking, Mode, Shows
 
 SETTLED_SHARE: Final = 0.6
 SETTLED_S: Final = 0.8

@@ -5,7 +5,6 @@ from typing import Final
 
 from gateway.control.command_log import Pending
 from gateway.control.estimate.learned import Learned
-from gateway.control.events import FrameOrigin
 from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import sequences
 from gateway.control.stops.evidence import StopCase
@@ -15,7 +14,7 @@ from gateway.protocol.modes import MODES
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
-from schemas.words import Mode
+from schemas.words import FrameOrigin, Mode
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
 RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory never longer outside avoidance

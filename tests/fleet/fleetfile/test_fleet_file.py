@@ -11,13 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, BatteryAction, FileEntry
+from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, FileEntry
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
 from schemas.colors import car_color, hex_color
 from schemas.links import BadLink, parse_link
+from schemas.words import BatteryAction
 from schemas.yaml_document.document import BadFile, schema_of
 
 LAYERS = """\
@@ -113,7 +114,6 @@ def test_what_is_not_said() -> None:
 def test_what_is_not_said_is_as_gateways_have_it() -> None:
     policy = battery.BatteryPolicy()
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
-    assert [*BatteryAction] == [*battery.BatteryReaction]
     assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
     assert requests.DEFAULT_MAX_DRIVE_S == DEFAULT_MAX_DRIVE_S
 

@@ -21,9 +21,6 @@ from gateway.control.commands import (
     SetMode,
     Stop,
 )
-from gateway.control.estimate.mode import Verdict
-from gateway.control.estimate.trust import Basis, CarTrust
-from gateway.control.events import FrameOrigin
 from gateway.control.people import Sender
 from gateway.control.safety import Hold, PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
@@ -32,7 +29,19 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.sim.model.traits import CarTraits
-from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
+from schemas.words import (
+    Basis,
+    CarTrust,
+    FrameOrigin,
+    Light,
+    Mode,
+    Motion,
+    Phase,
+    Reason,
+    ServoAction,
+    SpeedStep,
+    Verdict,
+)
 from tests.gateway.control.workbench import (
     BACK,
     COORDINATOR,

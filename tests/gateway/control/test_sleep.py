@@ -4,10 +4,9 @@ import pytest
 
 from gateway.control.arbiter import AFTER_SLEEP_S
 from gateway.control.commands import Drive, EmergencyStop, Fan, Lend, OneShot, Pause, SetMode, Stop
-from gateway.control.estimate.trust import Basis
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.protocol.frames import ColorLed
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
 
 FORWARD = Drive(Motion.FORWARD, 5.0)

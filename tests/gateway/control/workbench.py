@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
-from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
+from gateway.control.events import CommandRecord, LogRecord
 from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
@@ -13,7 +13,7 @@ from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
-from schemas.words import Mode, Phase, Rank, Reason
+from schemas.words import FrameOrigin, Level, Mode, Phase, Rank, Reason
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"

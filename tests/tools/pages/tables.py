@@ -11,7 +11,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from fleet.conditions.fields import LAST, fields_of
 from gateway.bus.requests import DEFAULT_MAX_DRIVE_S
 from gateway.control.car_monitor import STALL_S
-from gateway.control.estimate.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
+from gateway.control.estimate.trust import TRANSITIONS, TrustEvent, TrustState
 from gateway.control.senders import SENDER_GONE_S, STREAM_PAUSE_S
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
@@ -22,7 +22,7 @@ from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 from schemas.commands import COMMANDS
-from schemas.words import Mode
+from schemas.words import CarTrust, Mode
 from tests.support import vectors
 from tests.tools.vectors import STOPS
 

@@ -6,15 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.battery import (
-    LEVEL_DEBOUNCE_S,
-    LOW_V,
-    Battery,
-    BatteryLevel,
-    BatteryPolicy,
-    BatteryReaction,
-    charge,
-)
+from gateway.control.estimate.battery import LEVEL_DEBOUNCE_S, LOW_V, Battery, BatteryPolicy, charge
+from schemas.words import BatteryAction, BatteryLevel
 
 
 @pytest.mark.parametrize(
@@ -71,12 +64,12 @@ def test_nothing_measured_is_no_level_and_refuses_nothing() -> None:
     ("voltage_v", "expected", "action", "refuses"),
     [
         (8.0, "ok", None, False),
-        (6.9, "low", BatteryReaction.WARN, False),
-        (6.5, "critical", BatteryReaction.REFUSE, True),
+        (6.9, "low", BatteryAction.WARN, False),
+        (6.5, "critical", BatteryAction.REFUSE, True),
     ],
 )
 def test_the_first_readings_say_where_it_stands_when_they_have_held(
-    voltage_v: float, expected: str, action: BatteryReaction | None, refuses: bool
+    voltage_v: float, expected: str, action: BatteryAction | None, refuses: bool
 ) -> None:
     battery = Battery()
     assert not hear(battery, *[voltage_v] * 5)
@@ -157,11 +150,11 @@ def test_readings_on_both_sides_of_critical_are_low_at_least() -> None:
 
 
 def test_a_policy_may_stop_or_only_warn() -> None:
-    assert BatteryPolicy(critical=BatteryReaction.STOP).action(BatteryLevel.CRITICAL) is BatteryReaction.STOP
-    warns = Battery(BatteryPolicy(critical=BatteryReaction.WARN))
+    assert BatteryPolicy(critical=BatteryAction.STOP).action(BatteryLevel.CRITICAL) is BatteryAction.STOP
+    warns = Battery(BatteryPolicy(critical=BatteryAction.WARN))
     hear(warns, *[6.0] * 6)
-    assert (warns.action, warns.refusal) == (BatteryReaction.WARN, "")
-    refuses = Battery(BatteryPolicy(low=BatteryReaction.REFUSE))
+    assert (warns.action, warns.refusal) == (BatteryAction.WARN, "")
+    refuses = Battery(BatteryPolicy(low=BatteryAction.REFUSE))
     hear(refuses, *[6.9] * 6)
     assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%. Charge it")
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from gateway.control.estimate.link_health import LinkHealth, LinkState
+from gateway.control.estimate.link_health import LinkHealth
+from schemas.words import LinkState
 
 
 def judged(

@@ -3,11 +3,11 @@
 import pytest
 
 from gateway.control.estimate.learned import Learned
-from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator, Verdict
+from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator
 from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder, Sensors
 from gateway.protocol.modes import only_candidate
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 
 ASSUMED, CONFIRMED, CONTRADICTED = Verdict.ASSUMED, Verdict.CONFIRMED, Verdict.CONTRADICTED
 SHAPES = {

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.trust import STOP_GOES_ON, TRANSITIONS, Basis, CarTrust, TrustEvent, TrustState
+from gateway.control.estimate.trust import STOP_GOES_ON, TRANSITIONS, TrustEvent, TrustState
+from schemas.words import Basis, CarTrust
 
 EVERYTHING = list(product(CarTrust, TrustEvent))
 ENDS_A_STOP = {TrustEvent.STOP_SHOWN: Basis.SHOWN, TrustEvent.STOP_SENT: Basis.SENT}

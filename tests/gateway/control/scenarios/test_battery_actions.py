@@ -4,10 +4,10 @@ import pytest
 
 from gateway.control.commands import Drive, OneShot, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
+from gateway.control.estimate.battery import BatteryPolicy
 from gateway.protocol.frames import General
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Light, Mode, Motion, Phase, Reason
+from schemas.words import BatteryAction, Light, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, REPORT_S, RUN, STOP, Workbench
 
 FORWARD = Drive(Motion.FORWARD, 9.0)
@@ -46,7 +46,7 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
 def test_a_car_can_be_stopped_by_its_battery() -> None:
     desk = Workbench()
     desk.control = Controller(
-        "red", parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryReaction.STOP)
+        "red", parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryAction.STOP)
     )
     desk.ready()
     desk.ask(FORWARD, identity="d")

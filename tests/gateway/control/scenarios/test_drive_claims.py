@@ -3,8 +3,7 @@
 import pytest
 
 from gateway.control.commands import Drive, Stop
-from gateway.control.estimate.trust import CarTrust
-from schemas.words import Motion, Phase
+from schemas.words import CarTrust, Motion, Phase
 from tests.gateway.control.workbench import MODE00
 from tests.support.virtual import Pair
 

@@ -11,11 +11,10 @@ from itertools import pairwise
 import pytest
 
 from gateway.control.commands import Answer, Drive, Fan, OneShot, SetMode, Stop
-from gateway.control.estimate.trust import Basis
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz, parse_sent
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
-from schemas.words import Light, Mode, Motion, Phase, Reason
+from schemas.words import Basis, Light, Mode, Motion, Phase, Reason
 from tests.gateway.sim.hazards import HAZARDS, Hazard
 from tests.gateway.sim.strangers import virtual
 from tests.support.virtual import Pair

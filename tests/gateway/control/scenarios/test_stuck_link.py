@@ -7,11 +7,9 @@ from itertools import pairwise
 import pytest
 
 from gateway.control.commands import Drive, OneShot, SetMode, Stop
-from gateway.control.estimate.learned import Shows
-from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.protocol.frames import ColorLed
 from gateway.sim.model.world import World
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Basis, CarTrust, Mode, Motion, Phase, Reason, Shows
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

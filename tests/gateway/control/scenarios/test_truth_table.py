@@ -6,8 +6,7 @@ The true mode changes in each way that it can without us: another writer on the 
 import pytest
 
 from gateway.control.commands import SetMode
-from gateway.control.estimate.mode import Verdict
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 from tests.support.truth import WORLDS, car_in, frame_of, lose_next_mode_frame
 from tests.support.vectors import rows
 from tests.support.virtual import Pair

@@ -3,8 +3,7 @@
 import pytest
 
 from gateway.control.commands import Drive, Fan, Stop
-from gateway.control.estimate.trust import Basis
-from schemas.words import Mode, Motion, Phase, Reason
+from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

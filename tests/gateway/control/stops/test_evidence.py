@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.commands import Drive, Fan, SetMode, Stop
-from gateway.control.estimate.learned import AGREEING_DELAYS, UNREACTED, Blocking, Learned, Shows
-from gateway.control.estimate.trust import Basis
+from gateway.control.estimate.learned import AGREEING_DELAYS, UNREACTED, Learned
 from gateway.control.stops.evidence import (
     EARLY_S,
     EVIDENCE,
@@ -30,7 +29,7 @@ from gateway.protocol.platforms import parse_platform
 from gateway.protocol.sensors import Sensors
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.words import Cause, Mode, Motion, Phase
+from schemas.words import Basis, Blocking, Cause, Mode, Motion, Phase, Shows
 from tests.gateway.control.workbench import Workbench
 from tests.support.virtual import Pair
 

@@ -12,7 +12,6 @@ import pytest
 
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.estimate.learned import Learned
-from gateway.control.estimate.trust import Basis
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase
@@ -20,7 +19,7 @@ from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
-from schemas.words import Mode, Motion, Phase
+from schemas.words import Basis, Mode, Motion, Phase
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
 

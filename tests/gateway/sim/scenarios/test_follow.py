@@ -8,11 +8,10 @@ import pytest
 
 from fleet.examples import EXAMPLES
 from gateway.control.commands import SetMode, Stop
-from gateway.control.estimate.mode import Verdict
 from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import WorldSpec, read_world
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 from tests.support.virtual import Pair
 
 ROW = ("red", "green", "blue")
