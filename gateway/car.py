@@ -34,15 +34,15 @@ from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
-from gateway.protocol.platform_name import AUTO
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
 from schemas.links import car_link
+from schemas.platform_name import AUTO
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
-from schemas.words import Level, LinkState
+from schemas.words import FrameVerdict, Level, LinkState, Motors
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
@@ -285,7 +285,7 @@ class CarGateway:
     @property
     def _may_move(self) -> bool:
         """True if the car may be moving while its link is down."""
-        return self._control.was_open and self._control.model.motors != "off"
+        return self._control.was_open and self._control.model.motors is not Motors.OFF
 
     def _check_link(self) -> None:
         """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
@@ -355,12 +355,12 @@ class CarGateway:
         """Publish the measurements of the events, then update the state of the car with them."""
         for event in events:
             confirmed = self._control.model.mode.confirmed
-            if not self._publisher.publish_event(event, confirmed, loaded=self._control.model.motors != "off"):
+            if not self._publisher.publish_event(event, confirmed, loaded=self._control.model.motors is not Motors.OFF):
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
             self._use_profile(self._control.model.profile)
             if isinstance(event, TextLine):
-                self._health.on_rejected("text")  # it shows a program, but not that of a car
+                self._health.on_rejected(FrameVerdict.TEXT)  # it shows a program, but not that of a car
                 continue
             self._health.rx_frames += 1
             if isinstance(event, Rejected):

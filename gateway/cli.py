@@ -13,6 +13,7 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
 from schemas.process.parent import watched_pid
 from schemas.suggestion import did_you_mean
+from schemas.words import BatteryAction, BatteryLevel
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -154,10 +155,13 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--speed-max", metavar="SHARE", type=float, default=1.0, help="no step beyond this share of full speed, 0..1"
     )
-    for level, default, volts in (("low", "warn", 7.0), ("critical", "refuse", 6.6)):
+    for level, default, volts in (
+        (BatteryLevel.LOW, BatteryAction.WARN, 7.0),
+        (BatteryLevel.CRITICAL, BatteryAction.REFUSE, 6.6),
+    ):
         run.add_argument(
             f"--on-battery-{level}",
-            choices=("warn", "refuse", "stop"),
+            choices=tuple(map(str, BatteryAction)),
             default=default,
             help=f"reaction to a {level} battery: warn, refuse new drives and modes, or stop (default {default})",
         )
@@ -177,8 +181,8 @@ def _run(arguments: argparse.Namespace) -> int:
     parent = watched_pid(arguments.parent)
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.link import BadUrl, LinkError, parse_url
-    from gateway.protocol.platform_name import parse_option
     from schemas.bus import BadEndpoint, Bus, BusError
+    from schemas.platform_name import parse_option
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
@@ -215,7 +219,6 @@ def _run(arguments: argparse.Namespace) -> int:
             from gateway.control.estimate.battery import BatteryPolicy
             from gateway.protocol.platforms import parse_platform
             from schemas.state_dir import directory_of
-            from schemas.words import BatteryAction
 
             logging.basicConfig(
                 format="%(asctime)s %(levelname)s %(message)s",

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Final
 
 from schemas.suggestion import nearest
+from schemas.words import UNKNOWN, Basis, BatteryLevel, LinkState, Mode, Motion, MotionSource, Motors, Verdict
 
 PROTOBUF: Final = "application/protobuf"
 HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
@@ -76,11 +77,7 @@ class Topic:
 _READING: Final = 3.0
 _STATE: Final = 3.0
 _TRACKING_HZ: Final = 27.0  # docs/reference/protocol.md#rates: the most frames the UART carries, in tracking
-_MODES: Final = (
-    *("manual", "remote_control", "tracking", "obstacle_avoidance", "color_led", "light_seeking", "following"),
-    "unknown",
-)
-_MOTIONS: Final = ("stop", "forward", "back", "left", "right", "spin_left", "spin_right", "unknown")
+_MODES: Final = (*Mode, UNKNOWN)
 
 CAR_TOPICS: Final = (
     Topic(
@@ -103,7 +100,7 @@ CAR_TOPICS: Final = (
         _READING,
         {"voltage_v": "V", "charge": "1", "charge_error": "1"},
         {"voltage_v": (0.0, 12.0), "charge": (0.0, 1.0), "charge_error": (0.0, 1.0)},
-        {"level": ("ok", "low", "critical")},
+        {"level": tuple(BatteryLevel)},
         entity="battery",
     ),
     Topic(
@@ -157,7 +154,7 @@ CAR_TOPICS: Final = (
         _STATE,
         {"tx_airtime": "1", "since_s": "s", "last_rx_s": "s", "rx_bytes": "B", "tx_bytes": "B"},
         {"tx_airtime": (0.0, 1.0)},
-        {"state": ("online", "quiet", "stale", "lost")},
+        {"state": tuple(LinkState)},
         entity="link",
     ),
     Topic(
@@ -168,7 +165,7 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"evidence_age_s": "s"},
-        words={"asked": _MODES, "inferred": _MODES, "verdict": ("assumed", "confirmed", "contradicted")},
+        words={"asked": _MODES, "inferred": _MODES, "verdict": tuple(Verdict)},
         entity="mode",
     ),
     Topic(
@@ -180,7 +177,7 @@ CAR_TOPICS: Final = (
         _STATE,
         {"speed": "1", "expires_in_s": "s", "servo_deg": "deg"},
         {"speed": (0.0, 1.0), "servo_deg": (0.0, 180.0)},
-        {"motion": _MOTIONS, "source": ("commanded", "assumed", "unknown")},
+        {"motion": (*Motion, UNKNOWN), "source": tuple(MotionSource)},
         entity="motion",
     ),
     Topic(
@@ -191,7 +188,7 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"worst_stop_s": "s", "shown_age_s": "s", "trust_since_s": "s"},
-        words={"motors": ("off", "on", "stopping", "unknown"), "motors_basis": ("shown", "sent")},
+        words={"motors": tuple(Motors), "motors_basis": tuple(Basis)},
         entity="safety",
     ),
     Topic(

@@ -5,6 +5,19 @@ A word has the same spelling in messages, files, commands and code. What a word 
 """
 
 from enum import StrEnum
+from typing import Final
+
+UNKNOWN: Final = "unknown"
+"""What a field of a message holds in place of a word that is not known: of a mode or a motion, say."""
+
+
+class Platform(StrEnum):
+    """The program that runs on a car."""
+
+    ARDUINO = "arduino"
+    STM32 = "stm32"
+    RASPBERRY_PI = "raspberry_pi"
+    UNKNOWN = "unknown"
 
 
 class Motion(StrEnum):
@@ -44,6 +57,21 @@ class Light(StrEnum):
     OFF = "off"
 
 
+class FanState(StrEnum):
+    """The state of the fan that a command asks for."""
+
+    ON = "on"
+    OFF = "off"
+
+
+class Servo(StrEnum):
+    """A servo that a command moves."""
+
+    FRONT = "front"
+    VERTICAL = "vertical"
+    HORIZONTAL = "horizontal"
+
+
 class ServoAction(StrEnum):
     """One movement of one servo."""
 
@@ -65,16 +93,38 @@ class SpeedStep(StrEnum):
     DOWN = "down"
 
 
-class Cause(StrEnum):
-    """Why bytes are not a reading (docs/reference/protocol.md#bad-input)."""
+# ------------------------------------------------------------------ commands
 
-    NO_START = "no_start"
-    OVERLONG = "overlong"
-    UNKNOWN_WORD = "unknown_word"
-    MISSING_WORD = "missing_word"
-    BAD_NUMBER = "bad_number"
-    OUT_OF_RANGE = "out_of_range"
-    TRUNCATED = "truncated"
+
+class Rank(StrEnum):
+    """The kind of a sender, which is its rank. Each outranks those below it."""
+
+    LEAD = "lead"
+    """A person whom the people table of the gateway names as a lead. No command may claim it."""
+    PERSON = "person"
+    SCRIPT = "script"
+    COORDINATOR = "coordinator"
+
+
+class Scope(StrEnum):
+    """What an e-stop stops: one car, or every car of the fleet."""
+
+    CAR = "car"
+    FLEET = "fleet"
+
+
+class Phase(StrEnum):
+    """One step in the life of a command."""
+
+    ASKED = "asked"
+    QUEUED = "queued"
+    SENT = "sent"
+    EFFECT_SEEN = "effect_seen"
+    COMPLETE = "complete"
+    SUPERSEDED = "superseded"
+    EXPIRED = "expired"
+    FAILED = "failed"
+    REJECTED = "rejected"
 
 
 class Reason(StrEnum):
@@ -103,28 +153,42 @@ class Reason(StrEnum):
     """The car could have shown the stop and did not."""
 
 
-class Phase(StrEnum):
-    """One step in the life of a command."""
-
-    ASKED = "asked"
-    QUEUED = "queued"
-    SENT = "sent"
-    EFFECT_SEEN = "effect_seen"
-    COMPLETE = "complete"
-    SUPERSEDED = "superseded"
-    EXPIRED = "expired"
-    FAILED = "failed"
-    REJECTED = "rejected"
+# ------------------------------------------------------------------ states
 
 
-class Rank(StrEnum):
-    """The kind of a sender, which is its rank. Each outranks those below it."""
+class LinkState(StrEnum):
+    """The state of a link. `quiet`: an expected silence. `stale`: an unexpected silence. `lost`: the port is closed."""
 
-    LEAD = "lead"
-    """A person whom the people table of the gateway names as a lead. No command may claim it."""
-    PERSON = "person"
-    SCRIPT = "script"
-    COORDINATOR = "coordinator"
+    ONLINE = "online"
+    QUIET = "quiet"
+    STALE = "stale"
+    LOST = "lost"
+
+
+class Verdict(StrEnum):
+    """The confidence in the commanded mode."""
+
+    ASSUMED = "assumed"
+    CONFIRMED = "confirmed"
+    CONTRADICTED = "contradicted"
+
+
+class MotionSource(StrEnum):
+    """What the current motion of a car is known from."""
+
+    COMMANDED = "commanded"
+    ASSUMED = "assumed"
+    UNKNOWN = "unknown"
+
+
+class Motors(StrEnum):
+    """The claim about a car's motors. What `off` rests on is a `Basis`."""
+
+    OFF = "off"
+    ON = "on"
+    STOPPING = "stopping"
+    """Frames of a stop were sent, and nothing is shown yet."""
+    UNKNOWN = "unknown"
 
 
 class CarTrust(StrEnum):
@@ -155,23 +219,6 @@ class Basis(StrEnum):
     """The car's own readings."""
     SENT = "sent"
     """The written frames. The car cannot show that it obeyed them."""
-
-
-class Verdict(StrEnum):
-    """The confidence in the commanded mode."""
-
-    ASSUMED = "assumed"
-    CONFIRMED = "confirmed"
-    CONTRADICTED = "contradicted"
-
-
-class LinkState(StrEnum):
-    """The state of a link. `quiet`: an expected silence. `stale`: an unexpected silence. `lost`: the port is closed."""
-
-    ONLINE = "online"
-    QUIET = "quiet"
-    STALE = "stale"
-    LOST = "lost"
 
 
 class BatteryLevel(StrEnum):
@@ -211,13 +258,29 @@ class Blocking(StrEnum):
     COLOR = "color"
 
 
-class Level(StrEnum):
-    """The severity of a log record."""
+# ------------------------------------------------------------------ frames and logs
 
-    DEBUG = "debug"
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
+
+class FrameVerdict(StrEnum):
+    """What a received frame was. Bytes that are no frame have a `Cause` instead."""
+
+    SENSORS = "sensors"
+    ARM = "arm"
+    IMU = "imu"
+    ECHO = "echo"
+    TEXT = "text"
+
+
+class Cause(StrEnum):
+    """Why bytes are not a reading (docs/reference/protocol.md#bad-input)."""
+
+    NO_START = "no_start"
+    OVERLONG = "overlong"
+    UNKNOWN_WORD = "unknown_word"
+    MISSING_WORD = "missing_word"
+    BAD_NUMBER = "bad_number"
+    OUT_OF_RANGE = "out_of_range"
+    TRUNCATED = "truncated"
 
 
 class FrameOrigin(StrEnum):
@@ -228,3 +291,25 @@ class FrameOrigin(StrEnum):
     STOP = "stop"
     RECOVERY = "recovery"
     SHUTDOWN = "shutdown"
+
+
+class Level(StrEnum):
+    """The severity of a log record."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+# ------------------------------------------------------------------ processes
+
+
+class RecorderState(StrEnum):
+    """The state of the recorder."""
+
+    RECORDING = "recording"
+    CLOSED = "closed"
+    FULL = "full"
+    FAILED = "failed"
+    STOPPED = "stopped"

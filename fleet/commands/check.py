@@ -27,8 +27,8 @@ from fleet.policy.plan.lint import check as find_findings
 from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
-from gateway.protocol.platform_name import Platform
 from schemas import bus
+from schemas.words import Platform
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text
 

@@ -23,8 +23,8 @@ from fleet.fleetfile.scan import ScanFailed, scan
 from fleet.fleetfile.template import NewCar, format_new_file
 from fleet.links import may_be_same, parse_fleet_link
 from fleet.supervisor.temporary_gateway import temporary_gateway
-from gateway.protocol.platform_name import AUTO
 from schemas.atomic_file import write_atomically
+from schemas.platform_name import AUTO
 from schemas.yaml_document.document import read_text
 
 MAX_SETUP_LINKS: Final = 64

@@ -23,11 +23,11 @@ from fleet.fleetfile.models import (
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
-from gateway.protocol.platform_name import AUTO, Platform, normalize_name, parse_option
 from gateway.protocol.platforms import parse_platform
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.links import BadLink
-from schemas.words import BatteryAction
+from schemas.platform_name import AUTO, normalize_name, parse_option
+from schemas.words import BatteryAction, Platform
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 

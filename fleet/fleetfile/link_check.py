@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Final
 
 from fleet.fleetfile.fleet_file import FleetCar
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
-from gateway.protocol.platform_name import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.suggestion import how_to_install
+from schemas.words import Platform
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo

@@ -10,12 +10,12 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from fleet.links import parse_fleet_link
-from gateway.protocol.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS, Platform, parse_option
 from gateway.protocol.platforms import parse_platform
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.links import BadLink
-from schemas.words import BatteryAction, Mode
+from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS, parse_option
+from schemas.words import BatteryAction, Mode, Platform
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
 

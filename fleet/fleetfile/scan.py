@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fleet.links import parse_fleet_link
-from gateway.protocol.platform_name import AUTO, Platform
 from schemas.links import SerialUrl, UsbUrl
+from schemas.platform_name import AUTO
 from schemas.process.stdio import printable
+from schemas.words import Platform
 
 LIKELY_VERDICTS: Final = ("car", "ble", "given")
 POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")

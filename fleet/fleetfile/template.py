@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fleet.fleetfile.fleet_file import default_color
-from gateway.protocol.platform_name import AUTO
+from schemas.platform_name import AUTO
 
 SCHEMA_URL: Final = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/{}.schema.json"
 

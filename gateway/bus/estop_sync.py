@@ -16,7 +16,7 @@ from gateway.control.safety import Estop, FleetPause, PersistedSafety
 from schemas import bus, keys, messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Rank
+from schemas.words import Rank, Scope
 
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
@@ -81,7 +81,7 @@ class EstopSync:
         payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
         match command.what:
             case EmergencyStop(why, True):
-                payload = pb.EstopCommand(why=why, scope="fleet")
+                payload = pb.EstopCommand(why=why, scope=Scope.FLEET)
             case Resume() if ended_ids := sorted(fleet_wide & set(now.ended)):
                 payload = pb.ResumeCommand(ids=ended_ids)
             case Pause(why) if now.pauses != before.pauses:
@@ -159,7 +159,7 @@ class EstopSync:
 def _shared(state: pb.Safety) -> PersistedSafety:
     """Return the part of a gateway's state that concerns the others."""
     estops = (
-        Estop(each.id, each.by, each.why, messages.stamp_ns(each.stamp), each.scope == "fleet", _rank(each.rank))
+        Estop(each.id, each.by, each.why, messages.stamp_ns(each.stamp), each.scope == Scope.FLEET, _rank(each.rank))
         for each in state.estops
     )
     pauses = (

@@ -25,7 +25,7 @@ from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import BatteryLevel, Level, Mode, Phase
+from schemas.words import UNKNOWN, BatteryLevel, Level, LinkState, Mode, MotionSource, Phase, Scope
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
@@ -193,7 +193,7 @@ class CarPublisher:
         mode, believed, safety = control.model.mode, control.model.believed, control.safety
         lease = safety.lease_at(now)
         changes: dict[str, tuple[object, ...]] = {
-            "state/link": (health.state, health.reconnects, health.state == "lost" and health.reason),
+            "state/link": (health.state, health.reconnects, health.state is LinkState.LOST and health.reason),
             "state/mode": (mode.asked, mode.inferred, mode.verdict),
             "state/motion": (control.model.motion, control.owner, believed.fan, believed.servo_deg, believed.speed),
             "state/safety": (
@@ -319,8 +319,8 @@ def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> No
 
 def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
     mode = control.model.mode
-    message.asked = mode.asked or "unknown"
-    message.inferred = mode.inferred or "unknown"
+    message.asked = mode.asked or UNKNOWN
+    message.inferred = mode.inferred or UNKNOWN
     message.verdict = mode.verdict
     message.evidence = mode.evidence
     if mode.evidence_at is not None:
@@ -331,8 +331,9 @@ def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
 
 
 def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
-    message.motion = control.model.motion or "unknown"
-    message.source = "unknown" if control.model.motion is None else "commanded" if control.owner else "assumed"
+    message.motion = control.model.motion or UNKNOWN
+    known = MotionSource.COMMANDED if control.owner else MotionSource.ASSUMED
+    message.source = MotionSource.UNKNOWN if control.model.motion is None else known
     message.speed = control.model.profile.speed.fraction(control.model.believed.speed)
     message.owner = control.owner
     expires_in_s = control.expires_in_s(now)
@@ -346,7 +347,7 @@ def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
 def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     safety = control.safety
     for estop in safety.estops:
-        scope = "fleet" if estop.fleet_wide else "car"
+        scope = Scope.FLEET if estop.fleet_wide else Scope.CAR
         shown = message.estops.add(id=estop.id, by=estop.by, why=estop.why, scope=scope, rank=estop.rank)
         _set_stamp(shown.stamp, estop.at_ns)
     message.ended.extend(safety.ended)

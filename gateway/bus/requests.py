@@ -34,7 +34,7 @@ from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
-from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
+from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep
 
 W = TypeVar("W", bound=str)
 
@@ -138,7 +138,7 @@ def _readable_estop(request: ParsedRequest) -> EmergencyStop:
             return EmergencyStop()
         fields = {"why": message.why, "scope": message.scope}
     why = fields.get("why")
-    return EmergencyStop(_why(why) if isinstance(why, str) else "", fields.get("scope") == "fleet")
+    return EmergencyStop(_why(why) if isinstance(why, str) else "", fields.get("scope") == Scope.FLEET)
 
 
 def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
@@ -257,38 +257,38 @@ def _led(message: Any) -> Action:
 
 
 _SERVO_ACTIONS: Final = {
-    "front": ("left", "right", "reset"),
-    "vertical": ("up", "down", "reset"),
-    "horizontal": ("left", "right", "reset"),
+    Servo.FRONT: ("left", "right", "reset"),
+    Servo.VERTICAL: ("up", "down", "reset"),
+    Servo.HORIZONTAL: ("left", "right", "reset"),
 }
 
 
 def _servo(message: Any) -> Action:
-    servo = message.servo or "front"
+    servo = message.servo or Servo.FRONT
     if servo not in _SERVO_ACTIONS:
         raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
     if message.HasField("deg"):
-        if servo != "front" or message.action:
+        if servo != Servo.FRONT or message.action:
             raise ValueError("deg: only the front servo takes degrees, and then no action")
         return _checked(Ptz(message.deg))
     if message.action not in _SERVO_ACTIONS[servo]:
         raise ValueError(
             f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
-            + (", or deg 0..180" if servo == "front" else "")
+            + (", or deg 0..180" if servo == Servo.FRONT else "")
         )
     return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
 
 
 def _fan(message: Any) -> Action:
-    if message.state not in ("", "on", "off"):
+    if message.state not in ("", *FanState):
         raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
-    return Fan(None if not message.state else message.state == "on")
+    return Fan(None if not message.state else message.state == FanState.ON)
 
 
 def _estop(message: Any) -> Action:
-    if message.scope not in ("", "car", "fleet"):
+    if message.scope not in ("", *Scope):
         raise ValueError(f"scope {message.scope!r}: allowed are car (the default) and fleet")
-    return EmergencyStop(_why(message.why), message.scope == "fleet")
+    return EmergencyStop(_why(message.why), message.scope == Scope.FLEET)
 
 
 def _why(text: str) -> str:

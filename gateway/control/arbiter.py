@@ -27,10 +27,9 @@ from gateway.control.commands import (
 from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender
 from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.frames import General
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile
 from schemas.suggestion import did_you_mean
-from schemas.words import Mode, Motion, Rank, Reason, SpeedStep
+from schemas.words import Mode, Motion, Platform, Rank, Reason, SpeedStep
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""

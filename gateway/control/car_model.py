@@ -17,10 +17,9 @@ from gateway.control.pacing import FLIGHT_S, Pacing
 from gateway.control.stops import stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase, StopEvidence
 from gateway.protocol.frames import ColorLed
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
-from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Shows, Verdict
+from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Motors, Platform, Shows, Verdict
 
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
@@ -155,17 +154,17 @@ class CarModel:
         return self.trust.state is not CarTrust.UNHEARD
 
     @property
-    def motors(self) -> str:
-        """Return `off`, `on`, `stopping` or `unknown`."""
+    def motors(self) -> Motors:
+        """Return what is claimed of the motors."""
         believed_moving = self.trust.state in (CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.STOPPED)
         if believed_moving and self.mode.verdict is Verdict.CONTRADICTED:
-            return "unknown"
+            return Motors.UNKNOWN
         return self.trust.motors
 
     @property
     def basis(self) -> Basis | None:
         """Return the basis of the claim that the motors are off; None if they are not."""
-        return self.trust.basis if self.motors == "off" else None
+        return self.trust.basis if self.motors is Motors.OFF else None
 
     @property
     def motion(self) -> Motion | None:

@@ -12,7 +12,6 @@ from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import EVIDENCE, Finding, StopCase
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.modes import only_candidate
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.sensors import Sensors
 from schemas.words import (
@@ -24,7 +23,9 @@ from schemas.words import (
     FrameOrigin,
     Level,
     Mode,
+    Motors,
     Phase,
+    Platform,
     Reason,
     Shows,
     Verdict,
@@ -199,7 +200,7 @@ class CarMonitor:
     def _update_battery(self, voltage_v: float, now: float) -> None:
         """Log a change of the battery level, and stop the car if the policy requires it."""
         model = self.model
-        if not model.battery.on_voltage(voltage_v, loaded=model.motors != "off", now=now):
+        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
             return
         level, words = model.battery.level, f"{model.name}: {model.battery.words}"
         severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}

@@ -20,9 +20,8 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
-from schemas.words import Basis, FrameOrigin, Mode, Motion, Phase, Reason, Verdict
+from schemas.words import Basis, FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends

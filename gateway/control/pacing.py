@@ -8,9 +8,8 @@ from typing import Final
 from gateway.control.estimate.learned import Learned, blocking_kind
 from gateway.control.stops.sequences import NAMED_GAP_S, REPEAT_INTERVAL_S, Gate
 from gateway.protocol.frames import ArmSet, Frame, General, Reset
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile
-from schemas.words import ServoAction
+from schemas.words import Platform, ServoAction
 
 FLIGHT_S: Final = 0.06
 """Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""

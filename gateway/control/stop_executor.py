@@ -16,10 +16,9 @@ from gateway.control.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.frames import ModeClose
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
-from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
+from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Platform, Reason, Shows
 
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""

@@ -6,7 +6,7 @@ The level of the battery is an estimate of the gateway and is not set here.
 from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.protocol.sensors import SENSOR_FIELDS, Fields, Sensors
-from schemas.words import Mode
+from schemas.words import FrameVerdict, Mode
 
 _PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.published) for each in SENSOR_FIELDS)
 _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", "accel_z_raw")
@@ -16,15 +16,15 @@ def verdict_of(event: Event) -> str:
     """Return `sensors`, `arm`, `imu`, `echo`, `text`, or the cause of the rejection."""
     match event:
         case Sensors():
-            return "sensors"
+            return FrameVerdict.SENSORS
         case ArmReading():
-            return "arm"
+            return FrameVerdict.ARM
         case ImuReading():
-            return "imu"
+            return FrameVerdict.IMU
         case Echo():
-            return "echo"
+            return FrameVerdict.ECHO
         case TextLine():
-            return "text"
+            return FrameVerdict.TEXT
         case Rejected(cause=cause):
             return str(cause)
 

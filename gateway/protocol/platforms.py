@@ -23,7 +23,6 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
-from gateway.protocol.platform_name import HEAD, NO_READINGS, OPTIONS, Platform, parse_name
 from gateway.protocol.sensors import ATTRIBUTES, Reject, Sensors
 from gateway.protocol.timing import (
     DIGITLESS_OPEN_S,
@@ -33,7 +32,8 @@ from gateway.protocol.timing import (
     REPORT_INTERVAL_S,
     block_s,
 )
-from schemas.words import Light, Mode, ServoAction, SpeedStep
+from schemas.platform_name import HEAD, NO_READINGS, OPTIONS, parse_name
+from schemas.words import Light, Mode, Platform, ServoAction, SpeedStep
 
 
 class StopStyle(StrEnum):

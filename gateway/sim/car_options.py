@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from gateway.protocol.platform_name import HEAD, OPTION_WORDS, OPTIONS, VARIANTS, check_head
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
+from schemas.platform_name import HEAD, OPTION_WORDS, OPTIONS, VARIANTS, check_head
 from schemas.words import Mode
 
 FLAGS: Final[Mapping[str, Mapping[str, Any]]] = {

@@ -20,6 +20,7 @@ from gateway.protocol.events import Event, Rejected
 from gateway.protocol.platforms import Profile
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics, describe
+from schemas.words import FrameVerdict, Platform
 
 DESCRIPTION: Final = "Show what a car sends, decoded beside the raw bytes. Send nothing; Ctrl-C ends."
 EPILOG: Final = """\
@@ -40,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--link", metavar="URL", help=cli_support.LINK_HELP)
     source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="show a file that --raw wrote")
-    parser.add_argument("--platform", default="unknown", help=cli_support.PLATFORM_HELP + "; decides what is filler")
+    parser.add_argument(
+        "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + "; decides what is filler"
+    )
     parser.add_argument("--raw", type=Path, metavar="FILE", help="save the bytes with their times in a new file")
     parser.add_argument("--json", action="store_true", help="one JSON object per event, and a summary at the end")
 
@@ -209,7 +212,7 @@ def _words(fields: dict[str, Any]) -> Iterator[str]:
     for name, value in fields.items():
         match name:
             case "kind":
-                if value not in ("sensors", "rejected"):
+                if value not in (FrameVerdict.SENSORS, "rejected"):
                     yield value
             case "no_echo":
                 yield "no echo"

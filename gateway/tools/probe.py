@@ -17,7 +17,7 @@ from gateway.protocol.sensors import Sensors
 from gateway.tools import cli_support
 from gateway.tools.discovery import SerialPort
 from gateway.tools.statistics import LinkStatistics
-from schemas.words import Mode
+from schemas.words import Mode, Platform
 
 
 class LinkVerdict(StrEnum):
@@ -44,7 +44,7 @@ class LinkProbe:
     answered: bool = False
     """True after a reading of mode 0; if the link was probed, only after the last frame of the probe."""
     _decoder: Decoder = field(default_factory=Decoder)
-    _profile: Profile = field(default_factory=lambda: cli_support.profile_of("unknown"))
+    _profile: Profile = field(default_factory=lambda: cli_support.profile_of(Platform.UNKNOWN))
 
     async def open(self) -> None:
         """Open the link; store an error in `trouble`."""

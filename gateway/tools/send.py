@@ -23,12 +23,11 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.modes import MODES
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.tools import cli_support
 from schemas.links import TcpUrl
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Platform
 
 DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
 EPILOG: Final = """\
@@ -59,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     cli_support.describe(parser, DESCRIPTION, EPILOG)
     parser.add_argument("--link", required=True, metavar="URL", help=cli_support.LINK_HELP)
     platform_help = cli_support.PLATFORM_HELP + "; decides which frames the command sends"
-    parser.add_argument("--platform", default="unknown", help=platform_help)
+    parser.add_argument("--platform", default=Platform.UNKNOWN, help=platform_help)
     parser.add_argument("--wait", metavar="DURATION", help="time between opening the link and sending")
     parser.add_argument("--raw", action="store_true", help="send the text unchecked")
     parser.add_argument("frame", metavar="FRAME", help=f"for example '{_STOP}', in single quotes")

@@ -11,6 +11,7 @@ from gateway.protocol.measurements import measured
 from gateway.protocol.modes import candidate_modes
 from gateway.protocol.platforms import Profile, parse_platform
 from gateway.protocol.sensors import Reject, Sensors
+from schemas.words import FrameVerdict, Platform
 
 
 @dataclass(slots=True)
@@ -24,33 +25,35 @@ class LinkStatistics:
     rejects: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)
     contradictions: Counter[str] = field(default_factory=Counter)
-    detector: PlatformDetector = field(default_factory=lambda: PlatformDetector(parse_platform("unknown"), auto=True))
+    detector: PlatformDetector = field(
+        default_factory=lambda: PlatformDetector(parse_platform(Platform.UNKNOWN), auto=True)
+    )
 
     def count(self, event: Event, profile: Profile) -> None:
         """Count an event. `profile`: the configured platform."""
         self.detector.on_event(event)
         match event:
             case Sensors():
-                self.kinds["sensors"] += 1
+                self.kinds[FrameVerdict.SENSORS] += 1
                 self.modes[" or ".join(candidate_modes(event))] += 1
                 self.rejects.update(reject.cause for reject in profile.rejects(event))
                 self.contradictions.update(profile.contradictions(event))
             case ArmReading():
-                self.kinds["arm"] += 1
+                self.kinds[FrameVerdict.ARM] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
             case ImuReading():
-                self.kinds["imu"] += 1
+                self.kinds[FrameVerdict.IMU] += 1
             case Echo():
-                self.kinds["echo"] += 1
+                self.kinds[FrameVerdict.ECHO] += 1
             case TextLine():
-                self.kinds["text"] += 1
+                self.kinds[FrameVerdict.TEXT] += 1
             case Rejected():
                 self.rejects[event.cause] += 1
 
     @property
     def readings(self) -> int:
         """The number of good frames, without echoes and lines of text."""
-        return self.kinds.total() - self.kinds["echo"] - self.kinds["text"]
+        return self.kinds.total() - self.kinds[FrameVerdict.ECHO] - self.kinds[FrameVerdict.TEXT]
 
     @property
     def seconds(self) -> float:
@@ -80,14 +83,14 @@ class LinkStatistics:
         if self.rejects:
             causes = ", ".join(f"{cause} {count}" for cause, count in self.rejects.most_common())
             text += f", {self.rejects.total()} rejected ({causes})"
-        if self.kinds["echo"]:
-            text += f", {self.kinds['echo']} echoes of what was sent"
-        if self.kinds["text"]:
-            text += f", {self.kinds['text']} lines of text"
+        if self.kinds[FrameVerdict.ECHO]:
+            text += f", {self.kinds[FrameVerdict.ECHO]} echoes of what was sent"
+        if self.kinds[FrameVerdict.TEXT]:
+            text += f", {self.kinds[FrameVerdict.TEXT]} lines of text"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
             text += f"; mode by their shape: {modes}; platform: {self.detector.evidence[0]}"
-        elif not self.readings and not self.kinds["echo"]:
+        elif not self.readings and not self.kinds[FrameVerdict.ECHO]:
             text += ": no car of this protocol, or another baud rate"
         for words, count in self.contradictions.most_common():
             text += f"; {count} times against the platform: {words}"
@@ -98,15 +101,15 @@ def describe(event: Event, profile: Profile) -> dict[str, Any]:
     """Return the kind of an event and its measurements, in the units of the messages."""
     match event:
         case Sensors():
-            return {"kind": "sensors", **_measured(event, profile)}
+            return {"kind": FrameVerdict.SENSORS, **_measured(event, profile)}
         case ArmReading():
-            return {"kind": "arm", "joint_deg": list(event.joint_deg), **_rejected(event.rejects)}
+            return {"kind": FrameVerdict.ARM, "joint_deg": list(event.joint_deg), **_rejected(event.rejects)}
         case ImuReading():
-            return {"kind": "imu", "gyro_raw": list(event.gyro), "accel_raw": list(event.accel)}
+            return {"kind": FrameVerdict.IMU, "gyro_raw": list(event.gyro), "accel_raw": list(event.accel)}
         case Echo():
-            return {"kind": "echo"}
+            return {"kind": FrameVerdict.ECHO}
         case TextLine():
-            return {"kind": "text"}
+            return {"kind": FrameVerdict.TEXT}
         case Rejected():
             return {"kind": "rejected", "cause": event.cause, "detail": event.detail}
 

@@ -33,9 +33,8 @@ from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import Estop, FleetPause
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
-from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Rank, Reason, ServoAction, SpeedStep
+from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Platform, Rank, Reason, ServoAction, SpeedStep
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in Rank for number in range(3)]

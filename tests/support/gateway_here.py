@@ -8,9 +8,9 @@ from pathlib import Path
 from gateway.bus.service import CarService
 from gateway.car import CarGateway, Settings
 from gateway.link import parse_url
-from gateway.protocol.platform_name import parse_option
 from gateway.protocol.platforms import parse_platform
 from schemas import bus
+from schemas.platform_name import parse_option
 from schemas.process.suspend import SleepWatch
 from tests.support.processes import FleetProcesses
 

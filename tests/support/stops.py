@@ -12,13 +12,12 @@ from itertools import product
 
 from gateway.control.commands import ChangeSpeed, Drive, Fan, Find, OneShot, SetMode, Stop
 from gateway.protocol.frames import ColorLed, General, ModeOpen, Ptz, encode
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import StopStyle
 from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
-from schemas.words import Basis, CarTrust, Light, Mode, Motion, Phase, ServoAction, SpeedStep, Verdict
+from schemas.words import Basis, CarTrust, Light, Mode, Motion, Phase, Platform, ServoAction, SpeedStep, Verdict
 from tests.support.virtual import Pair
 
 LONGEST_S = 4.6

@@ -31,10 +31,10 @@ from fleet.policy.plan.plan import (
     Rule,
 )
 from fleet.policy.snapshot import ALIASES, NAMES
-from gateway.protocol.platform_name import OPTIONS
 from gateway.protocol.platforms import parse_platform
 from schemas import keys
 from schemas.colors import parse_color
+from schemas.platform_name import OPTIONS
 from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.messages import Where, suggest

@@ -15,9 +15,9 @@ from fleet.policy.allocation import find_barrier
 from fleet.policy.assignment import assign
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Role, Rule
 from fleet.policy.snapshot import CarSnapshot, topic_of
-from gateway.protocol.platform_name import OPTIONS, Platform
 from gateway.protocol.platforms import Profile, parse_platform
-from schemas.words import Mode
+from schemas.platform_name import OPTIONS
+from schemas.words import Mode, Platform
 
 ANY_CAR: Final = "a car"
 """Name for a car that neither a fleet file nor the plan names."""

@@ -9,10 +9,10 @@ from typing import Final
 
 from gateway.protocol.events import ArmReading, Event, ImuReading, Rejected, TextLine
 from gateway.protocol.modes import candidate_modes, only_candidate
-from gateway.protocol.platform_name import HEAD, NO_READINGS, Platform
 from gateway.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
 from gateway.protocol.sensors import Sensors, head_of
-from schemas.words import Mode
+from schemas.platform_name import HEAD, NO_READINGS
+from schemas.words import Mode, Platform
 
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""

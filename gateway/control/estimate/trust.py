@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from schemas.words import Basis, CarTrust
+from schemas.words import Basis, CarTrust, Motors
 
 
 class TrustEvent(StrEnum):
@@ -68,14 +68,14 @@ STOP_GOES_ON: Final = frozenset({_T.RECOVERING, _T.STOPPING, _T.UNHEARD, _T.UNPR
 """States in which the gateway sends stops until the car shows one."""
 
 _MOTORS: Final = {
-    _T.UNKNOWN: "unknown",
-    _T.RECOVERING: "unknown",
-    _T.STOPPING: "stopping",
-    _T.STOPPED: "off",
-    _T.DRIVING: "on",
-    _T.IN_MODE: "on",
-    _T.UNHEARD: "unknown",
-    _T.UNPROVEN: "unknown",
+    _T.UNKNOWN: Motors.UNKNOWN,
+    _T.RECOVERING: Motors.UNKNOWN,
+    _T.STOPPING: Motors.STOPPING,
+    _T.STOPPED: Motors.OFF,
+    _T.DRIVING: Motors.ON,
+    _T.IN_MODE: Motors.ON,
+    _T.UNHEARD: Motors.UNKNOWN,
+    _T.UNPROVEN: Motors.UNKNOWN,
 }
 
 
@@ -108,8 +108,8 @@ class TrustState:
         return changed
 
     @property
-    def motors(self) -> str:
-        """Return `off`, `on`, `stopping` or `unknown`."""
+    def motors(self) -> Motors:
+        """Return what is claimed of the motors."""
         return _MOTORS[self.state]
 
     @property

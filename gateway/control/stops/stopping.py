@@ -11,10 +11,9 @@ from gateway.control.stops.evidence import StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.protocol.modes import MODES
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
-from schemas.words import FrameOrigin, Mode
+from schemas.words import FrameOrigin, Mode, Platform
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
 RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory never longer outside avoidance

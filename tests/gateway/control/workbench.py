@@ -10,10 +10,9 @@ from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
-from schemas.words import FrameOrigin, Level, Mode, Phase, Rank, Reason
+from schemas.words import FrameOrigin, Level, Mode, Phase, Platform, Rank, Reason
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"

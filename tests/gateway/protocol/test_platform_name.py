@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.protocol.platform_name import OPTION_WORDS, parse_name, parse_option
 from gateway.protocol.platforms import parse_platform
+from schemas.platform_name import OPTION_WORDS, parse_name, parse_option
 
 
 @pytest.mark.parametrize(("told", "name"), [("auto", "unknown"), ("auto+arm", "unknown+arm"), ("stm32", "stm32")])

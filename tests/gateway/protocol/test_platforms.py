@@ -8,10 +8,10 @@ from gateway.protocol.decoder import Decoder, Rejected, Sensors
 from gateway.protocol.frames import ArmSet, Dialect, Frame, General, ModeClose, Ptz, Reset, parse_sent
 from gateway.protocol.measurements import verdict_of
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
-from gateway.protocol.platform_name import OPTION_WORDS, Platform
 from gateway.protocol.platforms import StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
-from schemas.words import Light, Mode, Motion, SpeedStep
+from schemas.platform_name import OPTION_WORDS
+from schemas.words import Light, Mode, Motion, Platform, SpeedStep
 from tests.support.vectors import ids, rows, wire
 
 PLATFORMS, PLACEHOLDERS, BLOCKS, TURNS = rows("platforms"), rows("placeholders"), rows("blocks"), rows("turns")

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.protocol.platform_name import OPTIONS, VARIANTS, Platform, parse_name
 from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec, TcpListen, parse_car, parse_cars, parse_replay
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
-from schemas.words import Mode
+from schemas.platform_name import OPTIONS, VARIANTS, parse_name
+from schemas.words import Mode, Platform
 
 GOOD_CARS = [
     ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyPath())),

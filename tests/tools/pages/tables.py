@@ -18,11 +18,10 @@ from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.modes import MODES
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 from schemas.commands import COMMANDS
-from schemas.words import CarTrust, Mode
+from schemas.words import CarTrust, Mode, Platform
 from tests.support import vectors
 from tests.tools.vectors import STOPS
 

@@ -10,9 +10,9 @@ from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import REACTED, Learned
 from gateway.protocol.decoder import Decoder
-from gateway.protocol.platform_name import parse_option
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
+from schemas.platform_name import parse_option
 from schemas.words import Basis, Mode, Motion, Shows
 from tests.support.virtual import Pair
 

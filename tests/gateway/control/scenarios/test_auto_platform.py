@@ -7,10 +7,10 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import Learned
-from gateway.protocol.platform_name import Platform, parse_option
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
-from schemas.words import Mode, Motion
+from schemas.platform_name import parse_option
+from schemas.words import Mode, Motion, Platform
 from tests.support.virtual import Pair
 
 

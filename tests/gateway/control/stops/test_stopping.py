@@ -15,11 +15,10 @@ from gateway.control.estimate.learned import Learned
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.protocol.platform_name import Platform
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
-from schemas.words import Basis, Mode, Motion, Phase
+from schemas.words import Basis, Mode, Motion, Phase, Platform
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
 

@@ -3,20 +3,10 @@
 # A gateway checks the name before it joins the bus. The profiles would delay that by 10 ms.
 
 import re
-from enum import StrEnum
 from typing import Final
 
 from schemas.suggestion import did_you_mean
-
-
-class Platform(StrEnum):
-    """The program that runs on a car."""
-
-    ARDUINO = "arduino"
-    STM32 = "stm32"
-    RASPBERRY_PI = "raspberry_pi"
-    UNKNOWN = "unknown"
-
+from schemas.words import Platform
 
 OPTIONS: Final = frozenset({"arm", "imu"})
 """Options that add a part to a car."""
