@@ -27,7 +27,6 @@ from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import OutgoingFrame
-from gateway.control.people import People
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.learned_file import LearnedFile
@@ -37,6 +36,7 @@ from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
+from schemas.authority import People
 from schemas.links import car_link
 from schemas.platform_name import AUTO
 from schemas.process import signals

@@ -7,7 +7,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from gateway.control.people import NO_PEOPLE, People
+from schemas.authority import NO_PEOPLE, People
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio

@@ -11,8 +11,9 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
+from gateway.control.safety import PersistedSafety
 from schemas.atomic_file import write_atomically
+from schemas.authority import Estop, FleetPause, Hold, Loan
 from schemas.process.stdio import printable
 from schemas.words import Rank
 

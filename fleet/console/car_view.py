@@ -10,10 +10,9 @@ from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnos
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
-from fleet.console.permissions import CarRules
-from fleet.policy.authority import Authority, merge_authority
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import messages, topics
+from schemas.authority import Authority, People
 
 TREND_WINDOW_S: Final = 240.0
 """Time over which the trend of a battery is measured."""
@@ -65,7 +64,7 @@ class CarView:
         self.color = color
         self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Commands and log records, the newest last."""
-        self.rules = CarRules(name)
+        self.authority = Authority()
         """The rights of each person."""
         self.names_people = False
         """True if a gateway of this car has said who may drive it."""
@@ -100,7 +99,7 @@ class CarView:
                 if topic == "sensor/battery":
                     self._trend.add(value.voltage_v, now)
                 elif topic == "state/safety":
-                    self.rules, self.names_people = CarRules.of(self.name, value), True
+                    self.authority, self.names_people = Authority.of(value), True
 
     def on_presence(self, now: float, *, present: bool) -> None:
         """Handle that the car's gateway is on the bus, or not."""
@@ -334,16 +333,16 @@ class FleetView:
         return [self._cars[name].as_dict(now) for name in self.names]
 
     @property
-    def authority(self) -> Authority | None:
+    def people(self) -> People | None:
         """The people of the fleet. None if no gateway has named them yet."""
-        found = [car.rules.authority for car in self._cars.values() if car.names_people]
-        return merge_authority(found) if found else None
+        found = [car.authority.people for car in self._cars.values() if car.names_people]
+        return People.merged(found) if found else None
 
     def leads_of(self, cars: Iterable[str]) -> frozenset[str]:
         """Return the persons whom the gateways of all these cars know as leads."""
-        return frozenset.intersection(*(frozenset(self.look_up(car).rules.leads) for car in cars))
+        return frozenset.intersection(*(frozenset(self.look_up(car).authority.people.leads) for car in cars))
 
     @property
-    def rules(self) -> dict[str, CarRules]:
-        """The rights of each person, by car."""
-        return {name: self._cars[name].rules for name in self.names}
+    def authority(self) -> dict[str, Authority]:
+        """What decides about the rights of each person, by car."""
+        return {name: self._cars[name].authority for name in self.names}

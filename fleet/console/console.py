@@ -36,9 +36,9 @@ from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessag
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
-from fleet.policy.authority import Authority
 from fleet.policy.requests import PlanRequest
 from schemas import keys
+from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
@@ -203,9 +203,9 @@ class Console:
 
     def _show_rights(self) -> None:
         """Show each page what its person may not do, if that has changed. End presses that are refused by now."""
-        rules = self._view.rules
+        authority = self._view.authority
         rights = {
-            sender: rights_of(sender, rules) for sender in {page.operator.sender for page in self._pages.values()}
+            sender: rights_of(sender, authority) for sender in {page.operator.sender for page in self._pages.values()}
         }
         for page in self._pages.values():
             page.show_new("rights", rights[page.operator.sender])
@@ -283,13 +283,13 @@ class Console:
         return sender if person is None or person_of(sender) == person.name else default_sender(person.name)
 
     @property
-    def authority(self) -> Authority | None:
+    def people(self) -> People | None:
         """The people of the fleet. None if no gateway has named them yet."""
-        return self._view.authority
+        return self._view.people
 
     def management_refusal(self, person: PagePerson | None) -> str:
         """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
-        return management_refusal(self._view.rules.values(), (person or self.person).name)
+        return management_refusal(self._view.authority, (person or self.person).name)
 
     def _check_room(self, person: PagePerson | None, device: str) -> None:
         """Raise TooManyPages if no other page of this device may connect."""
@@ -432,7 +432,7 @@ class Console:
                 self.stop_all(message.text("id"), page.operator, estop_request(why, "fleet"))
             case "pause":
                 why = message.text("why", MAX_REASON_LENGTH)
-                if refused := rights_of(page.operator.sender, self._view.rules)["pause"]:
+                if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
                     raise BadPageMessage(refused)  # it stops no car, so it ends no press
                 self.stop_all(message.text("id"), page.operator, pause_request(why))
             case "unpause":

@@ -31,7 +31,7 @@ from fleet.console.pairing import (
     new_code,
 )
 from fleet.console.people_file import PeopleFile
-from fleet.policy.authority import Authority
+from schemas.authority import People
 
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
@@ -241,10 +241,10 @@ class Lan:
         self.close_revoked()
         return gone
 
-    async def run(self, authority: Callable[[], Authority | None]) -> None:
+    async def run(self, people: Callable[[], People | None]) -> None:
         """Close pages of revoked devices and renew the certificate until the task is cancelled.
 
-        authority: returns the people of the fleet, None if no gateway has named them yet.
+        people: returns the people of the fleet, None if no gateway has named them yet.
         """
         next_look = time.monotonic() + ADDRESS_INTERVAL_S
         while True:
@@ -252,7 +252,7 @@ class Lan:
             self.listener.expire()
             self.close_revoked()
             try:
-                await asyncio.to_thread(self._update_people, authority())
+                await asyncio.to_thread(self._update_people, people())
             except OSError as error:
                 if (words := self._failures.words(str(error), time.monotonic())) is not None:
                     log.error("the list of people cannot be written: %s", words)
@@ -274,9 +274,9 @@ class Lan:
             self.certificate = renewed
             log.warning("the network is now %s, with a new certificate: SHA-256 %s", self.address, renewed.fingerprint)
 
-    def _update_people(self, authority: Authority | None) -> None:
+    def _update_people(self, people: People | None) -> None:
         self.people.serve()
-        if authority is not None and self.people.read().people != (names := _sorted(authority.names)):
+        if people is not None and self.people.read().people != (names := _sorted(people.roles)):
             self._write(names)
 
     def _write(self, names: tuple[str, ...] | None) -> None:

@@ -156,7 +156,7 @@ async def serve(
         config.load()
         config.ssl = lan.context
         servers.append((ConsoleServer(config), lan.listener))
-        running.append(asyncio.ensure_future(lan.run(lambda: console.authority)))
+        running.append(asyncio.ensure_future(lan.run(lambda: console.people)))
 
     def end(_: object) -> None:
         for server, _listener in servers:

@@ -22,7 +22,6 @@ from fleet.client.commands import led_request, mode_request
 from fleet.client.outcome import Outcome
 from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.state_file import CoordinatorStateFile
-from fleet.policy.authority import Authority
 from fleet.policy.decide import Ask, DecisionStep, step
 from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.plan.lint import find_faults
@@ -32,6 +31,7 @@ from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, check_sen
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages, topics
+from schemas.authority import People
 from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
@@ -95,7 +95,7 @@ class Coordinator:
     on_decision: Callable[[Decision], None]
     on_failure: Callable[[str], None]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
-    people: Authority | None = None
+    people: People | None = None
     """The people of the fleet file, who may change the plan. None: those that the gateways know."""
     run_name: str = ""
     """Name of its `fleet up` run: in a new run the plan begins anew."""
@@ -258,7 +258,7 @@ class Coordinator:
         return self._state_file.save(to_persisted(self.plan, memory, time.monotonic(), time.time()))
 
     def _check_sender(self, observer: FleetObserver, by: str) -> None:
-        check_sender(observer.authority if self.people is None else self.people, by)
+        check_sender(observer.people if self.people is None else self.people, by)
 
     def _on_request(self, query: zenoh.Query, request: PlanRequest, observer: FleetObserver) -> None:
         """Carry out a request for the plan in force. It is persisted and recorded before it is confirmed."""

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import PersonRank
-from fleet.policy.authority import Authority, authority_of, merge_authority
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation, Refusal
 from schemas import keys, messages, topics
+from schemas.authority import NO_PEOPLE, People, PersonRole
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -50,10 +50,10 @@ class FleetObserver:
         return frozenset(car for car in self.present if not _all_known(self.readings.get(car, {})))
 
     @property
-    def authority(self) -> Authority:
+    def people(self) -> People:
         """The people of the fleet, as far as the gateways know them."""
         states = (readings.get("state/safety") for readings in self.readings.values())
-        return merge_authority(authority_of(state.fields.get("people")) for state in states if state is not None)
+        return People.merged(People.of(state.fields.get("people")) for state in states if state is not None)
 
     def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
         """Return a snapshot; `busy`: the cars with a pending command."""
@@ -175,13 +175,13 @@ def _all_known(readings: Mapping[str, Observation]) -> bool:
     return all(topic in readings for topic in REQUIRED_TOPICS)
 
 
-def listed_people(file: FleetFile) -> Authority:
+def listed_people(file: FleetFile) -> People:
     """Return the people of a fleet file as the policy knows them."""
     people = file.people
     if people is None:
-        return Authority()
-    leads = tuple(name for name, person in people.items() if person.rank is PersonRank.LEAD)
-    return Authority(leads, frozenset(people))
+        return NO_PEOPLE
+    leads = {name: person.rank is PersonRank.LEAD for name, person in people.items()}
+    return People({name: PersonRole.LEAD if leads[name] else PersonRole.DRIVER for name in people})
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:

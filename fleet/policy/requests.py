@@ -4,11 +4,12 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import Final
 
-from fleet.policy.authority import Authority
+from fleet.policy.denials import fleet_refusal
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState
 from schemas import keys
+from schemas.authority import People
 
 GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"
 
@@ -37,12 +38,12 @@ class RequestRefused(Exception):
         self.reason: Final = reason
 
 
-def check_sender(people: Authority, by: str) -> None:
+def check_sender(people: People, by: str) -> None:
     """Raise RequestRefused if the sender `by` may not set, restart and stop the plan.
 
     The supervisor may: it sets the plan of the fleet file.
     """
-    words = "" if by == keys.SUPERVISOR else people.refusal(keys.person_of(by))
+    words = "" if by == keys.SUPERVISOR else fleet_refusal(people, keys.person_of(by))
     if words:
         raise RequestRefused(f"{words} Say who you are with `--as NAME` or FLEET_AS.", "not_allowed")
 

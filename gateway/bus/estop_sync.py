@@ -12,11 +12,12 @@ from typing import Any, Final
 
 from gateway.bus.requests import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
-from gateway.control.safety import Estop, FleetPause, PersistedSafety
+from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, messages
+from schemas.authority import estops_of, pauses_of
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Rank, Scope
+from schemas.words import Scope
 
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
@@ -158,15 +159,4 @@ class EstopSync:
 
 def _shared(state: pb.Safety) -> PersistedSafety:
     """Return the part of a gateway's state that concerns the others."""
-    estops = (
-        Estop(each.id, each.by, each.why, messages.stamp_ns(each.stamp), each.scope == Scope.FLEET, _rank(each.rank))
-        for each in state.estops
-    )
-    pauses = (
-        FleetPause(each.id, each.by, each.why, messages.stamp_ns(each.stamp), _rank(each.rank)) for each in state.pauses
-    )
-    return PersistedSafety(None, tuple(estops), tuple(state.ended), tuple(pauses), tuple(state.ended_pauses))
-
-
-def _rank(text: str) -> Rank:
-    return Rank(text) if text in tuple(Rank) else Rank.PERSON
+    return PersistedSafety(None, estops_of(state), tuple(state.ended), pauses_of(state), tuple(state.ended_pauses))

@@ -19,7 +19,6 @@ from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
-from gateway.control.people import PersonRole
 from gateway.control.rate_limit import TokenBucket
 from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
@@ -363,12 +362,8 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
         message.loan.to, message.loan.by, message.loan.rank = loan.to, loan.by, loan.rank
         _set_stamp(message.loan.since, loan.since_ns)
         message.loan.expires_in_s = safety.loan_until - now
-    people = control.people
-    if people.roles is not None:
-        message.people.SetInParent()
-        message.people.leads.extend(people.leads)
-        message.people.drivers.extend(people.named(PersonRole.DRIVER))
-        message.people.others.extend(people.named(PersonRole.OTHER))
+    if control.people.roles is not None:
+        control.people.fill(message.people)
     lease = safety.lease_at(now)
     if lease is not None:
         message.lease.holder, message.lease.kind = lease.holder.name, lease.holder.kind

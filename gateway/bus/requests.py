@@ -27,9 +27,9 @@ from gateway.control.commands import (
     SetMode,
     Stop,
 )
-from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
+from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean

@@ -3,7 +3,7 @@
 Pure: takes the context of the car, returns a refusal or None. A stop or e-stop passes in every state.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from gateway.control.commands import (
@@ -24,10 +24,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, PersonRole, Sender
-from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.frames import General
 from gateway.protocol.platforms import Profile
+from schemas.authority import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
 from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Platform, Rank, Reason, SpeedStep
 
@@ -53,11 +52,9 @@ class CommandContext:
     closing: bool
     asked: Mode | None
     """The commanded mode, also one that still waits."""
-    hold: Hold | None
-    estops: tuple[Estop, ...]
+    authority: Authority
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
-    lease: LeaseState | None
     battery: str
     """Why the battery allows no new drive; empty if it does."""
     fan: bool | None
@@ -66,10 +63,8 @@ class CommandContext:
     """Estimated speed, in the unit of the profile's speed model."""
     speed_max: float = 1.0
     """Maximum share of full speed, 0..1, after a speed step."""
-    people: People = NO_PEOPLE
-    pauses: tuple[FleetPause, ...] = ()
-    loan: Loan | None = None
     loan_until: float = 0.0
+    """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")
     """When the last sleep of the computer was noticed."""
 
@@ -78,42 +73,43 @@ class CommandContext:
 class Needs:
     """The conditions for a command."""
 
-    allowed: bool = True
-    """The sender may drive the car, nobody else has borrowed it, and neither an e-stop nor a pause is in force."""
-    not_held: bool = True
-    """The car must not be on hold. This holds for a coordinator; after the stop of a lead for all but leads."""
-    lease: bool = False
-    """No sender of the same or a higher rank may hold the lease."""
+    right: Right | None = Right.ACT
+    """What the sender must be allowed to do; None: everybody may."""
     battery: bool = False
     link: bool = True
     manual: bool = False
     """The car must be in mode 0; it ignores the command in other modes."""
     queue: bool = False
 
+    @property
+    def lease(self) -> bool:
+        """True if the sender needs the lease."""
+        return self.right is Right.MOVE
 
-_ANYTIME: Final = Needs(allowed=False, not_held=False, link=False)
-_MOVES: Final = Needs(lease=True, battery=True, manual=True)
+
+_ANYTIME: Final = Needs(right=None, link=False)
+_MOVES: Final = Needs(Right.MOVE, battery=True, manual=True)
 _ACTS: Final = Needs(manual=True, queue=True)
-_ADJUSTS: Final = Needs(lease=True, manual=True, queue=True)
+_ADJUSTS: Final = Needs(Right.MOVE, manual=True, queue=True)
 
-RELEASE: Final = Needs(lease=True)
+RELEASE: Final = Needs(Right.MOVE)
 """Needs of a drive with motion stop, which moves nothing."""
-CLOSE: Final = Needs(lease=True)
+CLOSE: Final = Needs(Right.MOVE)
 """Needs of mode manual, which stops the car."""
 TABLE: Final[dict[type[Action], Needs]] = {
     Stop: _ANYTIME,
     EmergencyStop: _ANYTIME,
     Resume: _ANYTIME,
-    Pause: _ANYTIME,
-    Unpause: _ANYTIME,
-    Lend: _ANYTIME,
-    EndLoan: _ANYTIME,
-    TakeLease: Needs(lease=True, link=False),
+    Pause: Needs(Right.PAUSE, link=False),
+    Unpause: Needs(Right.UNPAUSE, link=False),
+    Lend: Needs(Right.LEND, link=False),
+    EndLoan: Needs(Right.END_LOAN, link=False),
+    TakeLease: Needs(Right.MOVE, link=False),
     Drive: _MOVES,
-    SetMode: Needs(lease=True, battery=True),
+    SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is no `FrameAction`."""
+"""Needs of each action that is no `FrameAction`. Who may end which e-stop and hold: `_resume`."""
 
 Refusal = tuple[Reason, str]
 
@@ -138,25 +134,16 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
     what, sender = command.what, command.sender
     if isinstance(what, Stop | EmergencyStop):
         return None
-    if isinstance(what, Pause):  # late is better than never, as of a stop
-        return _may_direct(sender, "pause the fleet", context)
-    if (words := _out_of_time(command, context)) is not None:
+    # A late pause is better than none, as is a late stop.
+    if not isinstance(what, Pause) and (words := _out_of_time(command, context)) is not None:
         return Reason.STALE, words
     unknown = _unknown(what, context)
     if unknown is not None:
         return Reason.UNSUPPORTED, unknown
-    match what:
-        case Resume():
-            return _resume(what, sender, context)
-        case Unpause():
-            return _may_direct(sender, "end the pause", context) or _pause_stays(sender, context)
-        case Lend():
-            refusal = _may_direct(sender, f"lend {context.car}", context) or _may_drive(sender, context)
-            return refusal or _unknown_borrower(what.to, context)
-        case EndLoan() if context.loan is not None and context.loan.to != sender.person:
-            return _may_direct(sender, f"end the loan of {context.car}", context)
-        case _:
-            return _unmet(command, needs(what), context)
+    if isinstance(what, Resume):
+        return _resume(what, sender, context)
+    refusal = _unmet(command, needs(what), context)
+    return _unknown_borrower(what.to, context) if refusal is None and isinstance(what, Lend) else refusal
 
 
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
@@ -217,162 +204,41 @@ def _too_fast(step: SpeedStep, context: CommandContext) -> str | None:
     )
 
 
-def _may_direct(sender: Sender, deed: str, context: CommandContext) -> Refusal | None:
-    """Return why this sender may not pause or lend: where there are leads, only they may; elsewhere every person."""
-    leads, person = context.people.leads, sender.person
-    if sender.kind is Rank.LEAD:
-        return None
-    if leads:
-        return Reason.NOT_ALLOWED, f"{person} may not {deed}: only a lead may ({', '.join(leads)})."
-    if sender.kind is not Rank.PERSON:
-        return Reason.NOT_ALLOWED, f'a {sender.kind} may not {deed}: only a person may. Send kind "person".'
-    return _unlisted(sender, context) if context.people.role(person) is None else None
-
-
 def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:
-    roles = context.people.roles
+    roles = context.authority.people.roles
     if roles is None or person in roles:
         return None
     near = did_you_mean(person, roles) or f"There are: {', '.join(sorted(roles))}."
     return Reason.BAD_VALUE, f'`people:` in the fleet file lists no "{person}". {near}'
 
 
-def _may_drive(sender: Sender, context: CommandContext) -> Refusal | None:
-    """Return why the people of the fleet or a loan keep this sender from the car."""
-    car, person, people, loan = context.car, sender.person, context.people, context.loan
-    if sender.kind is Rank.LEAD:
-        return None
-    if loan is not None and person != loan.to and person not in people.leads:
-        left = f"{context.loan_until - context.now:.0f} s"
-        words = f"{car} is lent to {loan.to} for another {left}. {loan.by} ends that with `fleet lend {car} --end`."
-        return Reason.LENT, words
-    borrowed = loan is not None and person == loan.to
-    if sender.kind is Rank.COORDINATOR or borrowed or people.may_drive(person):
-        return None
-    if people.role(person) is None:
-        return _unlisted(sender, context)
-    words = f"{person} may not drive {car}: `people:` in the fleet file gives {person} other cars."
-    who = f"{', '.join(people.leads)} can lend it" if people.leads else "Somebody who drives it can lend it"
-    return Reason.NOT_ALLOWED, f"{words} {who}: `fleet lend {car} --to {person} --for 10m`."
-
-
-def _unlisted(sender: Sender, context: CommandContext) -> Refusal:
-    return Reason.NOT_ALLOWED, (
-        f"{sender.person} may watch and stop {context.car}, nothing else: `people:` in the fleet file does not list "
-        f"{sender.person}. Say who you are with `--as NAME` or FLEET_AS."
-    )
-
-
-def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool:
-    """Return True if the sender may end this e-stop.
-
-    Only a lead may end a lead's e-stop. Whoever may drive this car may end an e-stop of this car, and every person of
-    the fleet may end a fleet-wide one, so that all gateways decide alike. Everybody may end their own.
-    """
-    people, person = context.people, sender.person
-    if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
-        return False
-    mine = person in (Sender(estop.by).person, context.loan and context.loan.to)
-    return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
-
-
 def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal | None:
-    car = context.car
+    car, authority = context.car, context.authority
     if sender.kind is Rank.COORDINATOR:
         return Reason.HELD, f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
-    in_force = {estop.id: estop for estop in context.estops}
+    in_force = {estop.id: estop for estop in authority.estops}
     if resume.ids and not set(resume.ids) & {*in_force, *context.ended}:
         there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
         return Reason.BAD_VALUE, f"{car} has no e-stop {', '.join(resume.ids)}. {there}"
-    named = [estop for estop in context.estops if resume.all or estop.id in resume.ids]
-    stays = [estop for estop in named if not may_end_estop(estop, sender, context)]
+    named = [estop for estop in authority.estops if resume.all or estop.id in resume.ids]
+    stays = [estop for estop in named if not authority.may_end_estop(estop, sender)]
     if len(stays) < len(named) or (resume.ids and not named):
         return None
-    hold = refuse_end_of_hold(sender, context)
-    if stays and (hold is not None or context.hold is None or not resume.all):
-        return _estop_stays(stays[0], sender, context)
-    return hold
-
-
-def refuse_end_of_hold(sender: Sender, context: CommandContext) -> Refusal | None:
-    """Return why the sender may not end a hold, or None. A loan to another person does not matter here."""
-    return _hold_stays(sender, context) or _may_drive_at_all(sender, context)
-
-
-def _may_drive_at_all(sender: Sender, context: CommandContext) -> Refusal | None:
-    loan = context.loan if context.loan is not None and context.loan.to == sender.person else None
-    return _may_drive(sender, replace(context, loan=loan))
-
-
-def _estop_stays(estop: Estop, sender: Sender, context: CommandContext) -> Refusal:
-    if context.people.may_end(sender, estop.by, estop.rank):
-        return _may_drive_at_all(sender, context) or _unlisted(sender, context)
-    why = f': "{estop.why}"' if estop.why else ""
-    words = f"{context.car} stays emergency-stopped: {estop.by} did it{why}, and {_only_leads(context)}"
-    return Reason.ESTOPPED, words
-
-
-def _hold_stays(sender: Sender, context: CommandContext) -> Refusal | None:
-    hold = context.hold
-    if hold is None or context.people.may_end(sender, hold.by, hold.rank):
-        return None
-    return Reason.HELD, f"{context.car} is on hold: {hold.by} stopped it, and {_only_leads(context)}"
-
-
-def _pause_stays(sender: Sender, context: CommandContext) -> Refusal | None:
-    for pause in context.pauses:
-        if not context.people.may_end(sender, pause.by, pause.rank):
-            return Reason.PAUSED, f"{context.car} stays paused: {pause.by} did it, and {_only_leads(context)}"
-    return None
-
-
-def _only_leads(context: CommandContext) -> str:
-    """Return the rule about what a lead began, and who the leads are."""
-    rule, leads = "only a lead ends what a lead began", context.people.leads
-    if leads:
-        return f"{rule} ({', '.join(leads)})."
-    where = "`people:` of the fleet file, or with `--person NAME:lead`"
-    return f"{rule}. The gateway of {context.car} knows no leads: name them in {where}."
-
-
-def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
-    """Return why an e-stop, a pause, a loan or the people of the fleet keep the sender from the car."""
-    car = context.car
-    if context.estops:
-        first = context.estops[0]
-        why = f': "{first.why}"' if first.why else ""
-        words = f"{car} is emergency-stopped ({first.by}{why}). Release it with `fleet resume {car} --estops`."
-        return Reason.ESTOPPED, words
-    refusal = _may_drive(sender, context)
-    if refusal is not None or not context.pauses or sender.kind is Rank.LEAD:
-        return refusal
-    last = context.pauses[-1]
-    why = f': "{last.why}"' if last.why else ""
-    people = context.people
-    by_lead = people.roles is None and any(pause.rank is Rank.LEAD for pause in context.pauses)
-    who = "A lead" if people.leads or by_lead else "A person"
-    return Reason.PAUSED, f"{car} is paused with the whole fleet ({last.by}{why}). {who} ends it with `fleet unpause`."
+    hold = authority.may(sender, Right.RESUME)
+    if stays and (hold is not None or authority.hold is None or not resume.all):
+        hold = authority.estop_stays(stays[0], sender)
+    return None if hold is None else _refusal(hold, sender, context)
 
 
 def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal | None:
     """Return the first need that is not met; None if all are."""
-    car, sender = context.car, command.sender
-    refusal = _not_allowed(sender, context) if needed.allowed else None
-    if refusal is not None:
-        return refusal
-    if needed.not_held and context.hold is not None:
-        if sender.kind is Rank.COORDINATOR:
-            words = f"{car} is on hold ({context.hold.by} stopped it). End the hold with `fleet resume {car}`."
-            return Reason.HELD, words
-        refusal = _hold_stays(sender, context)
-        if refusal is not None:
-            return refusal
-    lease, now = context.lease, context.now
-    if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
-        words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}) for another {lease.until - now:.1f} s."
-        if sender.kind is lease.holder.kind and sender.kind in (Rank.PERSON, Rank.LEAD):
-            return Reason.LEASED, f"{words} Wait, or take the car over (--take)."
-        return Reason.LEASED, f"{words} Wait until the car is free."
+    car, right = context.car, needed.right
+    if right is not None:
+        if right is Right.MOVE and command.take:
+            right = Right.TAKE
+        denial = context.authority.may(command.sender, right)
+        if denial is not None:
+            return _refusal(denial, command.sender, context, right)
     if needed.battery and context.battery:
         return Reason.BATTERY_LOW, context.battery
     if needed.link:
@@ -389,6 +255,75 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     if needed.queue and context.queued >= MAX_QUEUED_COMMANDS:
         return Reason.QUEUE_FULL, f"{car} is busy: {context.queued} commands wait already. Try again in a second."
     return None
+
+
+# ---------------------------------------------------------------------- words
+
+
+def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Right | None = None) -> Refusal:
+    """Return the refusal for a person at a terminal: what keeps the sender from it, and what to do."""
+    return denial.reason, _words(denial, sender, context, right)
+
+
+def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right | None) -> str:
+    car, person, people = context.car, sender.person, context.authority.people
+    deed = {
+        Right.PAUSE: "pause the fleet",
+        Right.UNPAUSE: "end the pause",
+        Right.LEND: f"lend {car}",
+        Right.END_LOAN: f"end the loan of {car}",
+    }.get(right or Right.MOVE, "")
+    mark = denial.mark
+    why = f': "{mark.why}"' if isinstance(mark, Estop | FleetPause) and mark.why else ""
+    by = mark.by if mark is not None else ""
+    match denial.bar:
+        case Bar.NOT_A_LEAD:
+            return f"{person} may not {deed}: only a lead may ({', '.join(people.leads)})."
+        case Bar.NOT_A_PERSON:
+            return f'a {sender.kind} may not {deed}: only a person may. Send kind "person".'
+        case Bar.UNLISTED:
+            return (
+                f"{person} may watch and stop {car}, nothing else: `people:` in the fleet file does not list "
+                f"{person}. Say who you are with `--as NAME` or FLEET_AS."
+            )
+        case Bar.OTHER_CAR:
+            who = f"{', '.join(people.leads)} can lend it" if people.leads else "Somebody who drives it can lend it"
+            words = f"{person} may not drive {car}: `people:` in the fleet file gives {person} other cars."
+            return f"{words} {who}: `fleet lend {car} --to {person} --for 10m`."
+        case Bar.LENT if isinstance(mark, Loan):
+            left = f"{context.loan_until - context.now:.0f} s"
+            return f"{car} is lent to {mark.to} for another {left}. {by} ends that with `fleet lend {car} --end`."
+        case Bar.ESTOPPED:
+            return f"{car} is emergency-stopped ({by}{why}). Release it with `fleet resume {car} --estops`."
+        case Bar.LEADS_ESTOP:
+            return f"{car} stays emergency-stopped: {by} did it{why}, and {_only_leads(context)}"
+        case Bar.PAUSED:
+            by_lead = people.roles is None and any(pause.rank is Rank.LEAD for pause in context.authority.pauses)
+            who = "A lead" if people.leads or by_lead else "A person"
+            return f"{car} is paused with the whole fleet ({by}{why}). {who} ends it with `fleet unpause`."
+        case Bar.LEADS_PAUSE:
+            return f"{car} stays paused: {by} did it, and {_only_leads(context)}"
+        case Bar.ON_HOLD:
+            return f"{car} is on hold ({by} stopped it). End the hold with `fleet resume {car}`."
+        case Bar.LEADS_HOLD:
+            return f"{car} is on hold: {by} stopped it, and {_only_leads(context)}"
+        case Bar.LEASED if isinstance(mark, LeaseState):
+            holder, left_s = mark.holder, mark.until - context.now
+            words = f"{car} is driven by {holder.name} ({holder.kind}) for another {left_s:.1f} s."
+            if sender.kind is holder.kind and sender.kind in (Rank.PERSON, Rank.LEAD):
+                return f"{words} Wait, or take the car over (--take)."
+            return f"{words} Wait until the car is free."
+        case _:
+            raise AssertionError(denial)
+
+
+def _only_leads(context: CommandContext) -> str:
+    """Return the rule about what a lead began, and who the leads are."""
+    rule, leads = "only a lead ends what a lead began", context.authority.people.leads
+    if leads:
+        return f"{rule} ({', '.join(leads)})."
+    where = "`people:` of the fleet file, or with `--person NAME:lead`"
+    return f"{rule}. The gateway of {context.car} knows no leads: name them in {where}."
 
 
 def _unreachable(context: CommandContext) -> Refusal | None:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.people import Sender
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
+from schemas.authority import Sender
 from schemas.words import Motion, Phase, Reason
 
 MAX_QUEUE_TIME_S: Final = 15.0

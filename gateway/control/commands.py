@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, Frame, General, Ptz
+from schemas.authority import Sender
 from schemas.words import Mode, Motion, Phase, Reason, SpeedStep
 
 

@@ -36,13 +36,13 @@ from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.learned import Learned
 from gateway.control.events import OutgoingFrame, Record
 from gateway.control.executor import LATE_DRIVE_S, Executor
-from gateway.control.people import NO_PEOPLE, People, Sender
-from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
+from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
+from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
 START_MARGIN_S: Final = 1.0
@@ -372,11 +372,11 @@ class Controller:
 
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
         """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
-        sender, safety = pending.command.sender, self.safety
+        sender, safety, authority = pending.command.sender, self.safety, self.authority_at(now)
         if not resume.ids and self.model.learned.doubted:  # a person says that the car is fine
             self.stops.end_doubt(now)
         named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
-        mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self._context(now))]
+        mine = [each for each in safety.estops if authority.may_end_estop(each, sender)]
         if ended := safety.end(each.id for each in mine if each.id in named):
             which = " ".join(estop.id for estop in ended)
             self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender.name}", now)
@@ -385,7 +385,7 @@ class Controller:
             count = len(ended) if resume.all else len(named)
             parts.append("e-stop released" if count == 1 else f"{count} e-stops released")
         hold = safety.hold
-        if not resume.ids and arbiter.refuse_end_of_hold(sender, self._context(now)) is None:
+        if not resume.ids and authority.may(sender, Right.RESUME) is None:
             parts.append(f"resumed: the hold by {hold.by} has ended" if hold else "resumed: was not on hold")
             self._end_hold(sender, now)
         if safety.estops:
@@ -465,7 +465,7 @@ class Controller:
             for estop in estops
         ]
         words, them = f"still emergency-stopped {', '.join(each)}", "them" if several else "it"
-        if not any(arbiter.may_end_estop(estop, sender, self._context(now)) for estop in estops):
+        if self.authority_at(now).may(sender, Right.END_ESTOPS) is not None:
             return f"{words}. {sender.person} cannot release {them}"
         return f"{words}. Release {them} with `fleet resume {self.car} --estops`"
 
@@ -635,6 +635,13 @@ class Controller:
             self._log.log(Level.INFO, "hold_ended", words, now)
             self.safety.hold = None
 
+    def authority_at(self, now: float) -> Authority:
+        """Return what decides who may do what with the car."""
+        safety = self.safety
+        return Authority(
+            self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)
+        )
+
     def _context(self, now: float) -> arbiter.CommandContext:
         return arbiter.CommandContext(
             car=self.car,
@@ -644,18 +651,13 @@ class Controller:
             link_reason=self.model.link_reason,
             closing=self.stops.shutting_down,
             asked=Mode.MANUAL if self.model.mode.is_left and self._queue.mode_change is None else self.asked,
-            hold=self.safety.hold,
-            estops=self.safety.estops,
+            authority=self.authority_at(now),
             ended=self.safety.ended,
-            lease=self.safety.lease_at(now),
             battery=self.model.battery.refusal,
             fan=self.model.believed.fan,
             queued=len(self._queue.one_shots),
             speed=self.model.believed.speed,
             speed_max=self._speed_max,
-            people=self.people,
-            pauses=self.safety.pauses,
-            loan=self.safety.loan_at(now),
             loan_until=self.safety.loan_until,
             slept_at=self._slept_at,
         )

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.control.people import Sender
+from schemas.authority import Estop, FleetPause, Hold, LeaseState, Loan, Sender, strength
 from schemas.words import Rank
 
 LEASE_S: Final = 2.0
@@ -21,57 +21,6 @@ MAX_PAUSES: Final = 32
 """Maximum pauses in force. A further one only stops the cars."""
 MAX_ENDED_PAUSES: Final = 2 * MAX_PAUSES
 """Maximum ended pauses that are remembered."""
-_SENDER_RANK: Final = {kind: -number for number, kind in enumerate(Rank)}
-
-
-@dataclass(frozen=True, slots=True)
-class Hold:
-    """Keeps the coordinator from moving a stopped car; after the stop of a lead also persons and scripts.
-
-    `since_ns`: ns since the epoch.
-    """
-
-    by: str
-    since_ns: int
-    rank: Rank = Rank.PERSON
-
-
-@dataclass(frozen=True, slots=True)
-class Estop:
-    """One latched emergency stop. `at_ns`: wall clock, ns since the epoch; `fleet_wide`: every gateway latches it."""
-
-    id: str
-    by: str
-    why: str
-    at_ns: int
-    fleet_wide: bool
-    rank: Rank = Rank.PERSON
-
-
-@dataclass(frozen=True, slots=True)
-class FleetPause:
-    """One pause of the whole fleet. `at_ns`: wall clock, ns since the epoch."""
-
-    id: str
-    by: str
-    why: str
-    at_ns: int
-    rank: Rank = Rank.PERSON
-
-
-@dataclass(frozen=True, slots=True)
-class Loan:
-    """The car is lent to the person `to`. `since_ns`: wall clock, ns since the epoch."""
-
-    to: str
-    by: str
-    rank: Rank
-    since_ns: int
-    duration_s: float
-
-    def left_s(self, now_ns: int) -> float:
-        """Return the remaining time by the wall clock. A clock that was set back prolongs no loan."""
-        return self.duration_s - max(0.0, (now_ns - self.since_ns) / 1e9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,24 +33,6 @@ class PersistedSafety:
     pauses: tuple[FleetPause, ...] = ()
     ended_pauses: tuple[str, ...] = ()
     loan: Loan | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LeaseState:
-    """The sender who controls the car, and until when (s, monotonic)."""
-
-    holder: Sender
-    until: float
-    gone: bool = False
-    """True if the holder has disconnected. A sender of the same rank need not wait then."""
-
-    def refuses(self, sender: Sender, now: float, *, take: bool) -> bool:
-        """Return True if `sender` may not drive now. `take`: a person takes the car from another person."""
-        if now >= self.until or sender == self.holder:
-            return False
-        mine, theirs = _SENDER_RANK[sender.kind], _SENDER_RANK[self.holder.kind]
-        takes = take and sender.kind in (Rank.PERSON, Rank.LEAD)
-        return mine < theirs or (mine == theirs and not self.gone and not takes)
 
 
 @dataclass(slots=True)
@@ -182,7 +113,7 @@ class Safety:
         if first is None:
             self._estops[estop.id] = estop
         else:  # nobody lowers the rank of another's e-stop
-            stronger = max(first, estop, key=lambda each: _SENDER_RANK[each.rank])
+            stronger = max(first, estop, key=lambda each: strength(each.rank))
             self._estops[estop.id] = replace(stronger, fleet_wide=first.fleet_wide or estop.fleet_wide)
         return self._estops[estop.id]
 
@@ -200,7 +131,7 @@ class Safety:
         latched = [self.latch(each) for each in shared if each.id not in known]
         for each in shared:  # a gateway without people latches the e-stop of a lead as that of a person
             first = self._estops.get(each.id)
-            if first is not None and _SENDER_RANK[each.rank] > _SENDER_RANK[first.rank]:
+            if first is not None and strength(each.rank) > strength(first.rank):
                 self.latch(each)
         return [each for each in latched if each.id in self._estops], removed
 
@@ -274,4 +205,4 @@ def _remember(ended: dict[str, None], ids: Iterable[str], maximum: int) -> None:
 
 def _strength(pause: FleetPause) -> tuple[int, int, str, str]:
     """Order two reports of one pause, so that gateways agree on the same in whatever order they arrive."""
-    return _SENDER_RANK[pause.rank], -pause.at_ns, pause.by, pause.why
+    return strength(pause.rank), -pause.at_ns, pause.by, pause.why

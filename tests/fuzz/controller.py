@@ -29,11 +29,10 @@ from gateway.control.commands import (
 )
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, OutgoingFrame
-from gateway.control.people import NO_PEOPLE, People, Sender
-from gateway.control.safety import Estop, FleetPause
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.platforms import parse_platform
+from schemas.authority import NO_PEOPLE, Estop, FleetPause, People, Sender
 from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Platform, Rank, Reason, ServoAction, SpeedStep
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")

@@ -4,9 +4,9 @@ import random
 from dataclasses import dataclass
 
 from gateway.control.commands import EmergencyStop, Find, OneShot, Resume, SetMode, Stop
-from gateway.control.people import Sender
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from schemas.authority import Sender
 from schemas.words import Mode, Phase
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
 from tests.support.stops import WORLDS, state_of

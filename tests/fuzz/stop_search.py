@@ -19,7 +19,6 @@ from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneS
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.control.events import CommandRecord
-from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
@@ -27,6 +26,7 @@ from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
+from schemas.authority import Sender
 from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black

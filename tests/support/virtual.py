@@ -6,7 +6,6 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, LogRecord
-from gateway.control.people import Sender
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
@@ -14,6 +13,7 @@ from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.authority import Sender
 from schemas.words import Level, Phase
 
 TICK_S = 0.05

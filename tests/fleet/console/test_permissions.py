@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
-from fleet.console.permissions import ACTIONS, CarRules, management_refusal, refusals, rights_of
+from fleet.console.permissions import management_refusal, refusals, rights_of
 from gateway.bus.publisher import _fill_safety
 from gateway.control import arbiter
 from gateway.control.commands import (
@@ -21,9 +21,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, Sender
-from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, Safety
+from gateway.control.safety import Safety
 from gateway.protocol.frames import General, Ptz
+from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Right, Sender
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Light, Mode, Motion, Rank, SpeedStep
 from tests.gateway.control.workbench import Workbench
@@ -54,22 +54,22 @@ HOLDS = (None, Hold(ANN, 1, PERSON), Hold(TEACHER, 1, LEAD))
 PAUSES = (None, FleetPause("p1", TEACHER, "listen", 1, LEAD), FleetPause("p2", ANN, "", 1, PERSON))
 LEASES = (None, Sender(ANN, PERSON), Sender(TEACHER, LEAD), Sender("script@lab-9", Rank.SCRIPT))
 LOANS = ("", "bob", "eve", "teacher")
-ASKED: dict[str, tuple[Action, ...]] = {
-    "move": (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), OneShot(Ptz(90)), ChangeSpeed(SpeedStep.DOWN)),
-    "act": (OneShot(General(Motion.STOP, light=Light.RED)), Find()),
-    "take": (TakeLease(),),
-    "resume": (Resume(),),
-    "pause": (Pause("listen"),),
-    "unpause": (Unpause(),),
-    "lend": (Lend("bob", 60.0),),
-    "end_loan": (EndLoan(),),
+ASKED: dict[Right, tuple[Action, ...]] = {
+    Right.MOVE: (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), OneShot(Ptz(90)), ChangeSpeed(SpeedStep.DOWN)),
+    Right.ACT: (OneShot(General(Motion.STOP, light=Light.RED)), Find()),
+    Right.TAKE: (TakeLease(),),
+    Right.RESUME: (Resume(),),
+    Right.PAUSE: (Pause("listen"),),
+    Right.UNPAUSE: (Unpause(),),
+    Right.LEND: (Lend("bob", 60.0),),
+    Right.END_LOAN: (EndLoan(),),
 }
 RULES = {"leased", "lent", "not_allowed", "paused", "held", "estopped"}
 """Reasons about rights. All others are about the car."""
 
 
-def cars() -> Iterator[tuple[arbiter.CommandContext, CarRules]]:
-    """Yield each state of a car: the gateway's own, and the console's by state/safety."""
+def cars() -> Iterator[tuple[arbiter.CommandContext, Authority]]:
+    """Yield each state of a car: the gateway's own, and what its state/safety says."""
     control = Workbench().control
     for people, estops, hold, pause, lease, loan in itertools.product(TABLES, ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
         if lease is not None and lease.kind is LEAD and not people.leads:
@@ -86,58 +86,63 @@ def cars() -> Iterator[tuple[arbiter.CommandContext, CarRules]]:
             safety.lease = LeaseState(lease, NOW + 1.0)
         message = pb.Safety()
         _fill_safety(message, control, NOW)
-        yield control._context(NOW), CarRules.of(control.car, message)
+        yield control._context(NOW), Authority.of(message)
 
 
-def decided(context: arbiter.CommandContext, sender: str, action: Action) -> str | None:
+def decided(context: arbiter.CommandContext, sender: Sender, action: Action) -> str | None:
     """Return the rule of RULES by which the gateway rejects an action, None if it has another reason or accepts."""
-    ranked = context.people.ranked(Sender(sender, PERSON))
-    refusal = arbiter.refuse(Command("1", "any", ranked, action, take=isinstance(action, TakeLease)), context)
+    refusal = arbiter.refuse(Command("1", "any", sender, action, take=isinstance(action, TakeLease)), context)
     return str(refusal[0]) if refusal is not None and str(refusal[0]) in RULES else None
 
 
-def test_the_page_and_the_gateway_decide_alike() -> None:
+def test_the_page_shows_what_the_gateway_decides() -> None:
     seen = set()
-    for context, rules in cars():
-        asked = ASKED | {"end_estops": (Resume(tuple(each.id for each in context.estops)),) if context.estops else ()}
-        for sender in SENDERS:
-            refused = refusals(rules, sender)
-            for name, actions in asked.items():
-                code = refused[name][0] if name in refused else None
+    for context, authority in cars():
+        estops = context.authority.estops
+        asked = ASKED | {Right.END_ESTOPS: (Resume(tuple(each.id for each in estops)),) if estops else ()}
+        for name in SENDERS:
+            sender = authority.people.ranked(Sender(name, PERSON))
+            refused = refusals("red", authority, name)
+            for right, actions in asked.items():
+                denial = authority.may(sender, right)
+                code = None if denial is None else str(denial.reason)
+                assert (right in refused) is (denial is not None)
                 for action in actions:
-                    assert code == decided(context, sender, action), (sender, action, rules)
-                    seen.add((name, code))
-    assert {name for name, _ in seen} == set(ACTIONS)
+                    assert code == decided(context, sender, action), (sender, action, authority)
+                    seen.add((right, code))
+    assert {right for right, _ in seen} == set(Right)
     assert {code for _, code in seen} == {None, *RULES}
 
 
 def test_the_words_name_the_person_the_car_and_the_rule() -> None:
-    rules = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",), others=("eve",))
-    assert refusals(rules, EVE)["move"] == ("not_allowed", "eve drives other cars, not red.")
-    assert refusals(rules, ZED)["act"] == ("not_allowed", "zed watches and stops: the fleet file does not list zed.")
-    assert refusals(rules, ANN)["pause"] == ("not_allowed", "Only a lead may (teacher).")
-    assert refusals(rules, TEACHER) == {}
+    red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
+    assert refusals("red", red, EVE)[Right.MOVE] == "eve drives other cars, not red."
+    assert refusals("red", red, ZED)[Right.ACT] == "zed watches and stops: the fleet file does not list zed."
+    assert refusals("red", red, ANN)[Right.PAUSE] == "Only a lead may (teacher)."
+    assert refusals("red", red, TEACHER) == {}
 
 
 def test_the_recorder_and_the_plan_are_for_leads_where_the_fleet_has_some() -> None:
-    red = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",), others=("eve",))
-    blue = CarRules("blue", listed=True, leads=("teacher",), drivers=("eve",), others=("ann",))
-    assert [management_refusal([red, blue], each) for each in (TEACHER, ANN, EVE, ZED)] == [
+    red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
+    blue = Authority(People.parse(["teacher:lead", "eve", "ann:other"]))
+    assert [management_refusal({"red": red, "blue": blue}, each) for each in (TEACHER, ANN, EVE, ZED)] == [
         "",
         *["Only a lead may (teacher)."] * 3,
     ]
-    assert management_refusal([CarRules("green"), blue], ANN) == "Only a lead may (teacher).", "one car has leads"
-    no_leads = CarRules("red", listed=True, drivers=("ann",), others=("eve",))
-    assert [management_refusal([no_leads], each) for each in (ANN, EVE)] == ["", ""]
-    assert management_refusal([no_leads], ZED) == "zed watches and stops: the fleet file does not list zed."
-    assert management_refusal([CarRules("red")], ZED) == "", "nobody is listed"
+    assert management_refusal({"green": Authority(), "blue": blue}, ANN) == "Only a lead may (teacher).", (
+        "one car has leads"
+    )
+    no_leads = Authority(People.parse(["ann", "eve:other"]))
+    assert [management_refusal({"red": no_leads}, each) for each in (ANN, EVE)] == ["", ""]
+    assert management_refusal({"red": no_leads}, ZED) == "zed watches and stops: the fleet file does not list zed."
+    assert management_refusal({"red": Authority()}, ZED) == "", "nobody is listed"
     assert rights_of(ANN, {"red": red})["manage"] == "Only a lead may (teacher)."
     assert rights_of(ANN, {})["manage"] == ""
 
 
 def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
-    strict = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",))
+    strict = Authority(People.parse(["teacher:lead", "ann"]))
     assert rights_of(ANN, {"red": strict})["pause"] == "Only a lead may (teacher)."
-    assert rights_of(ANN, {"red": strict, "blue": CarRules("blue")})["pause"] == ""
+    assert rights_of(ANN, {"red": strict, "blue": Authority()})["pause"] == ""
     assert rights_of(TEACHER, {"red": strict})["cars"] == {"red": {}}
     assert rights_of(ANN, {})["pause"] == ""

@@ -3,12 +3,12 @@
 import pytest
 
 from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS, REQUIRED_TOPICS, FleetObserver
-from fleet.policy.authority import Authority
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.state import PolicyState
 from schemas import messages, topics
+from schemas.authority import NO_PEOPLE, People
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -128,16 +128,16 @@ def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> No
 def test_the_people_are_those_that_any_gateway_knows() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
-    assert observer.authority == Authority()
+    assert observer.people == NO_PEOPLE
     observer.on_token("blue", 100.0, alive=True)
     people = pb.CarPeople(leads=["teacher"], drivers=["ann"], others=["bob"])
     safety = pb.Safety(car="blue", seq=1, people=people).SerializeToString()
     observer.on_sample(
         Sample("fleet/blue/state/safety", safety, messages.encoding_of("fleet.v1.Safety"), 0, 1), 101.0, None
     )
-    assert observer.authority == Authority(("teacher",), frozenset({"teacher", "ann", "bob"}))
+    assert observer.people == People.parse(["teacher:lead", "ann", "bob:other"])
     observer.on_token("blue", 102.0, alive=False)
-    assert observer.authority == Authority()
+    assert observer.people == NO_PEOPLE
 
 
 def test_a_token_that_names_no_car_is_ignored() -> None:

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from fleet.policy.authority import Authority, merge_authority
 from fleet.policy.plan.parser import parse
 from fleet.policy.requests import PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import FleetSnapshot, Refusal
 from fleet.policy.state import PersistedPolicy, carry_over, restore, to_persisted
+from schemas.authority import People
 from tests.fleet.policy.cars import PolicyRun
 
 PHASES = parse(
@@ -161,9 +161,9 @@ def test_restart_and_set_go_on(how: str) -> None:
 
 SAY = "Say who you are with `--as NAME` or FLEET_AS. [not_allowed]"
 ONLY_A_LEAD, UNLISTED = "Only a lead may (teacher).", "{} watches and stops: the fleet file does not list {}."
-EVERYONE = Authority()
-NO_LEADS = Authority((), frozenset({"ann", "bob"}))
-LEADS = Authority(("teacher",), frozenset({"teacher", "ann", "bob"}))
+EVERYONE = People()
+NO_LEADS = People.parse(["ann", "bob"])
+LEADS = People.parse(["teacher:lead", "ann", "bob"])
 
 
 @pytest.mark.parametrize(
@@ -174,14 +174,14 @@ LEADS = Authority(("teacher",), frozenset({"teacher", "ann", "bob"}))
         *((NO_LEADS, by, UNLISTED) for by in ("teacher@lab-1", "zed@x", "anonymous", "@lead")),
         *((LEADS, by, None) for by in ("teacher", "teacher@lab-1", "@supervisor")),
         *((LEADS, by, ONLY_A_LEAD) for by in ("ann@lab-2", "zed@x", "anonymous", "ann@teacher", "teacher2")),
-        (merge_authority([EVERYONE, LEADS]), "ann", ONLY_A_LEAD),
-        (merge_authority([EVERYONE, NO_LEADS]), "ann", None),
-        (merge_authority([NO_LEADS, LEADS]), "zed", ONLY_A_LEAD),
-        (merge_authority([EVERYONE, EVERYONE]), "zed", None),
-        (merge_authority([]), "zed", None),
+        (People.merged([EVERYONE, LEADS]), "ann", ONLY_A_LEAD),
+        (People.merged([EVERYONE, NO_LEADS]), "ann", None),
+        (People.merged([NO_LEADS, LEADS]), "zed", ONLY_A_LEAD),
+        (People.merged([EVERYONE, EVERYONE]), "zed", None),
+        (People.merged([]), "zed", None),
     ],
 )
-def test_where_there_are_leads_only_they_change_the_plan(people: Authority, by: str, words: str | None) -> None:
+def test_where_there_are_leads_only_they_change_the_plan(people: People, by: str, words: str | None) -> None:
     if words is None:
         check_sender(people, by)
         return

@@ -10,7 +10,6 @@ import pytest
 from fleet.commands import record
 from fleet.coordinator.observer import listed_people
 from fleet.fleetfile.fleet_file import parse_fleet
-from fleet.policy.authority import Authority
 from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
     SIMULATED,
@@ -24,6 +23,7 @@ from fleet.supervisor.spec import (
     recorder_command,
     simulator_command,
 )
+from schemas.authority import NO_PEOPLE, People
 
 FILE = """
 name: lab
@@ -79,8 +79,7 @@ def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> N
         listed_people(parse_fleet(coordinator_fleet_file(each), tmp_path / "copy.yaml", unbound=True))
         for each in (spec, nobody, everyone)
     ]
-    people = frozenset({"lee", "ana", "kim", "teacher"})
-    assert known == [Authority(("teacher",), people), Authority((), frozenset()), Authority()]
+    assert known == [People.parse(["lee", "ana", "kim", "teacher:lead"]), People({}), NO_PEOPLE]
     assert compare(everyone, spec).spec.people == spec.people
 
 

@@ -28,9 +28,9 @@ from gateway.control.commands import (
     Stop,
     TakeLease,
 )
-from gateway.control.people import Sender
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, Ptz
 from schemas import messages
+from schemas.authority import Sender
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF

@@ -26,10 +26,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import Sender
-from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
+from schemas.authority import Authority, Estop, Hold, LeaseState, Sender
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
@@ -68,7 +67,6 @@ SENDERS = [Sender("ann", kind) for kind in KINDS]
 LEASES = [
     None,
     *(LeaseState(Sender("bob", kind), NOW + 1.0) for kind in KINDS),
-    LeaseState(Sender("bob", Rank.PERSON), NOW - 1.0),
 ]
 MODES = [None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED]
 RANK = list(reversed(KINDS))
@@ -82,7 +80,7 @@ def situations() -> tuple[CommandContext, ...]:
 
 
 def _situations() -> Iterator[CommandContext]:
-    """Yield 5,120 states: link, closing, hold, e-stop, lease, battery, queue, mode, platform."""
+    """Yield 4,096 states: link, closing, hold, e-stop, lease, battery, queue, mode, platform."""
     for (
         (link, closing, held, estopped, lease, battery, queued),
         asked,
@@ -108,10 +106,8 @@ def _situations() -> Iterator[CommandContext]:
             link_reason="gone",
             closing=closing,
             asked=asked,
-            hold=held,
-            estops=estopped,
+            authority=Authority(hold=held, estops=estopped, lease=lease),
             ended=("over",),
-            lease=lease,
             battery=battery,
             fan=None,
             queued=queued,
@@ -148,7 +144,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
         assert reason is None, "stop wins from every state"
         return
     if isinstance(what, Resume):
-        in_force = what.ids == ("e1",) and bool(at.estops)
+        in_force = what.ids == ("e1",) and bool(at.authority.estops)
         allowed = kind is not Rank.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
         assert (reason is None) == allowed
         return
@@ -157,14 +153,14 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
         return
     if reason is not None:
         return
-    assert not at.estops, "an e-stopped car obeys nothing"
-    assert not (at.hold and kind is Rank.COORDINATOR), "no coordinator's command moves a held car"
+    assert not at.authority.estops, "an e-stopped car obeys nothing"
+    assert not (at.authority.hold and kind is Rank.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
         assert not at.closing
     moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
-    if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
-        mine, theirs = RANK.index(kind), RANK.index(at.lease.holder.kind)
+    if (moves or isinstance(what, TakeLease)) and at.authority.lease is not None:
+        mine, theirs = RANK.index(kind), RANK.index(at.authority.lease.holder.kind)
         assert mine > theirs or (mine == theirs and command.take and kind is Rank.PERSON)
     if at.battery:
         assert not isinstance(what, Drive) or what.motion is Motion.STOP

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from gateway.bus.requests import ParsedRequest, parse
 from gateway.control.commands import Answer
-from gateway.control.safety import LEASE_S, Loan, PersistedSafety, Safety
+from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from schemas import messages
+from schemas.authority import Loan
 from schemas.commands import COMMANDS
 from schemas.words import Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import Workbench

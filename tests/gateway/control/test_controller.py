@@ -21,14 +21,14 @@ from gateway.control.commands import (
     SetMode,
     Stop,
 )
-from gateway.control.people import Sender
-from gateway.control.safety import Hold, PersistedSafety
+from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.sim.model.traits import CarTraits
+from schemas.authority import Hold, Sender
 from schemas.words import (
     Basis,
     CarTrust,

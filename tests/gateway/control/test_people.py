@@ -23,10 +23,10 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.people import NO_PEOPLE, People, Sender
-from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
+from gateway.control.safety import PersistedSafety
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
+from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
 from tests.support.message_length import MAX_LINES, count_lines
@@ -78,14 +78,11 @@ FREE = CommandContext(
     link_reason="",
     closing=False,
     asked=Mode.MANUAL,
-    hold=None,
-    estops=(),
+    authority=Authority(PEOPLE),
     ended=(),
-    lease=None,
     battery="",
     fan=False,
     queued=0,
-    people=PEOPLE,
 )
 ESTOPS: list[tuple[Estop, ...]] = [
     (),
@@ -130,12 +127,10 @@ def test_every_rank_every_action_every_state(who: str, table: str) -> None:
     for estops, hold, pauses, lease, loan in itertools.product(ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
         if sum(map(bool, (estops, hold, pauses, lease, loan))) > 3:
             continue
-        at = replace(
-            FREE, people=people, estops=estops, hold=hold, pauses=pauses, lease=lease, loan=loan, loan_until=NOW + 60
-        )
+        at = replace(FREE, authority=Authority(people, estops, pauses, hold, loan, lease), loan_until=NOW + 60)
         for action, what in ACTIONS.items():
             reason, words = refused(what, sender, at)
-            assert reason == expected(action, sender, listed, at), (action, sender, at)
+            assert reason == expected(action, sender, listed, at.authority), (action, sender, at)
             assert reason in (None, Reason.BAD_VALUE, Reason.LEASED) or words[-1] == "."
             seen.add(reason)
             texts.add(words)
@@ -144,14 +139,14 @@ def test_every_rank_every_action_every_state(who: str, table: str) -> None:
     assert [text for text in printed if count_lines(text) > MAX_LINES] == []
 
 
-def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: CommandContext) -> Reason | None:
+def expected(action: str, sender: Sender, listed: dict[str, str] | None, state: Authority) -> Reason | None:
     """Return the expected reason, by the rules of docs/explanation/who-may-drive.md."""
     person, lead, plan = sender.person, sender.kind is LEAD, sender.kind is COORDINATOR
     leads = listed is not None and "lead" in listed.values()
-    borrows = at.loan is not None and at.loan.to == person
+    borrows = state.loan is not None and state.loan.to == person
     drives = listed is None or listed.get(person) in ("", "lead") or borrows
     directs = lead or (not leads and sender.kind is PERSON and (listed is None or person in listed))
-    lent = at.loan is not None and not borrows and not lead and not (leads and person == "teacher")
+    lent = state.loan is not None and not borrows and not lead and not (leads and person == "teacher")
 
     def is_protected(rank: Rank) -> bool:
         # Without a table none of these senders is a lead, and none of them began anything as a lead.
@@ -160,33 +155,33 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
     if action in ("stop", "e-stop", "free"):
         return None
     if action == "lend stranger":
-        known = expected("lend", sender, listed, at)
+        known = expected("lend", sender, listed, state)
         return known if known is not None or listed is None else Reason.BAD_VALUE
-    if action in ("pause", "unpause", "lend") or (action == "end loan" and at.loan is not None and not borrows):
+    if action in ("pause", "unpause", "lend") or (action == "end loan" and state.loan is not None and not borrows):
         if not directs:
             return Reason.NOT_ALLOWED
         if action == "lend" and not lead:
             return Reason.LENT if lent else None if drives else Reason.NOT_ALLOWED
-        if action == "unpause" and any(is_protected(pause.rank) for pause in at.pauses):
+        if action == "unpause" and any(is_protected(pause.rank) for pause in state.pauses):
             return Reason.PAUSED
         return None
     if action == "end loan":
         return None
     if action.startswith("resume"):
-        return resumed(action, sender, listed, at, drives=drives, is_protected=is_protected)
-    if at.estops:
+        return resumed(action, sender, listed, state, drives=drives, is_protected=is_protected)
+    if state.estops:
         return Reason.ESTOPPED
     if lent:
         return Reason.LENT
     if not (drives or plan):
         return Reason.NOT_ALLOWED
-    if at.pauses and not lead:
+    if state.pauses and not lead:
         return Reason.PAUSED
-    if at.hold is not None and (plan or is_protected(at.hold.rank)):
+    if state.hold is not None and (plan or is_protected(state.hold.rank)):
         return Reason.HELD
     ranks = [COORDINATOR, SCRIPT, PERSON, LEAD]
     needs_lease = action in ("drive", "release", "mode", "manual", "lease")
-    if needs_lease and at.lease is not None and ranks.index(at.lease.holder.kind) >= ranks.index(sender.kind):
+    if needs_lease and state.lease is not None and ranks.index(state.lease.holder.kind) >= ranks.index(sender.kind):
         return Reason.LEASED
     return None
 
@@ -195,7 +190,7 @@ def resumed(
     action: str,
     sender: Sender,
     listed: dict[str, str] | None,
-    at: CommandContext,
+    state: Authority,
     *,
     drives: bool,
     is_protected: Callable[[Rank], bool],
@@ -203,16 +198,16 @@ def resumed(
     if sender.kind is COORDINATOR:
         return Reason.HELD
     hold = None if drives else Reason.NOT_ALLOWED
-    if at.hold is not None and is_protected(at.hold.rank):
+    if state.hold is not None and is_protected(state.hold.rank):
         hold = Reason.HELD
-    if action == "resume" or (action == "resume all" and not at.estops):
+    if action == "resume" or (action == "resume all" and not state.estops):
         return hold
-    if not at.estops:
+    if not state.estops:
         return Reason.BAD_VALUE
-    (estop,) = at.estops
+    (estop,) = state.estops
     own, fleet = estop.by.startswith(sender.person + "@"), estop.fleet_wide and sender.person in (listed or ())
     estopped = Reason.ESTOPPED if is_protected(estop.rank) else None if own or fleet or drives else Reason.NOT_ALLOWED
-    if action == "resume all" and at.hold is not None and hold is None:
+    if action == "resume all" and state.hold is not None and hold is None:
         return None
     return estopped
 
@@ -228,7 +223,7 @@ def resumed(
 )
 def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[Rank, ...], who: str) -> None:
     pauses = tuple(FleetPause(f"p{at_ns}", "teacher@lab", "", at_ns, rank) for at_ns, rank in enumerate(ranks))
-    at = replace(FREE, people=people, pauses=pauses)
+    at = replace(FREE, authority=Authority(people, pauses=pauses))
     reason, words = refused(Drive(Motion.FORWARD), SENDERS["person"], at)
     assert reason is Reason.PAUSED
     assert words.endswith(f". {who} ends it with `fleet unpause`.")

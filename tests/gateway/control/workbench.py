@@ -5,13 +5,13 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, LogRecord
-from gateway.control.people import NO_PEOPLE, People, Sender
 from gateway.control.safety import PersistedSafety
 from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platforms import parse_platform
 from gateway.protocol.timing import FRAME_S
+from schemas.authority import NO_PEOPLE, People, Sender
 from schemas.words import FrameOrigin, Level, Mode, Phase, Platform, Rank, Reason
 from tests.support.virtual import SHORTEST_S
 

@@ -13,9 +13,9 @@ from gateway.control.commands import (
     Stop,
     TakeLease,
 )
-from gateway.control.people import Sender
-from gateway.control.safety import Estop, PersistedSafety
+from gateway.control.safety import PersistedSafety
 from gateway.protocol.frames import ColorLed
+from schemas.authority import Estop, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason, SpeedStep
 from tests.gateway.control.workbench import (
     COORDINATOR,

@@ -1,0 +1,46 @@
+"""What keeps a person from a car or from the fleet, in a few words for a page or an answer. Pure.
+
+The gateway's own words are longer: they say what to type.
+"""
+
+from schemas.authority import Bar, Denial, Estop, FleetPause, LeaseState, Loan, People, Sender
+from schemas.keys import person_of
+from schemas.words import Rank
+
+
+def describe(denial: Denial, sender: Sender, people: People, car: str) -> str:
+    """Return a denial to a person, in words. `car` is not used for those of the whole fleet."""
+    mark, person = denial.mark, sender.person
+    by = person_of(mark.by) if mark is not None else ""
+    who = f"{by}: {mark.why}" if isinstance(mark, Estop | FleetPause) and mark.why else by
+    match denial.bar:
+        case Bar.NOT_A_LEAD:
+            return f"Only a lead may ({', '.join(people.leads)})."
+        case Bar.UNLISTED:
+            return f"{person} watches and stops: the fleet file does not list {person}."
+        case Bar.OTHER_CAR:
+            return f"{person} drives other cars, not {car}."
+        case Bar.LENT if isinstance(mark, Loan):
+            return f"{car} is lent to {mark.to} (by {by})."
+        case Bar.ESTOPPED:
+            return f"{car} is emergency-stopped ({who})."
+        case Bar.LEADS_ESTOP:
+            return f"{who}: only a lead ends this e-stop."
+        case Bar.PAUSED:
+            return f"The fleet is paused ({who})."
+        case Bar.LEADS_PAUSE:
+            return f"{who}: only a lead ends this pause."
+        case Bar.LEADS_HOLD:
+            return f"{by} stopped {car}: only a lead lets it go."
+        case Bar.LEASED if isinstance(mark, LeaseState):
+            todo = "Take it over." if sender.kind is mark.holder.kind else "Wait until the car is free."
+            return f"{by} drives {car}. {todo}"
+        case _:
+            raise AssertionError(f"no person meets {denial}")
+
+
+def fleet_refusal(people: People, person: str) -> str:
+    """Return why a person may not change the plan or the recorder, which are of the whole fleet; empty if allowed."""
+    sender = people.ranked(Sender(person, Rank.PERSON))
+    denial = people.may_direct(sender)
+    return "" if denial is None else describe(denial, sender, people, "")

@@ -1,0 +1,425 @@
+"""Decides who may do what with a car: people and ranks, e-stops, pauses, holds, loans and leases. Pure.
+
+Gateway, console and coordinator ask the same object. A gateway makes its `Authority` of its own state, everybody else
+of the `state/safety` that it publishes. Only the gateway decides; the others show beforehand what it would say.
+
+Without people every person may drive every car, and nobody is a lead. A name on the bus is a convention: the gateway
+checks nobody's identity. A stop or an e-stop needs no right.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from math import inf
+from typing import Any, Final, Self
+
+from schemas.keys import NAME_RULE, is_name, person_of
+from schemas.messages import stamp_ns
+from schemas.words import Rank, Reason, Scope
+
+_STRENGTH: Final = {rank: -number for number, rank in enumerate(Rank)}
+
+
+def strength(rank: Rank) -> int:
+    """Return a number that is higher for a rank that outranks another."""
+    return _STRENGTH[rank]
+
+
+def rank_of(text: str) -> Rank:
+    """Return the rank that a message names; that of a person for another version's word."""
+    return Rank(text) if text in tuple(Rank) else Rank.PERSON
+
+
+# ---------------------------------------------------------------------- people
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """The sender of a command."""
+
+    name: str = "anonymous"
+    kind: Rank = Rank.SCRIPT
+
+    @property
+    def person(self) -> str:
+        """Return the person: `group_a` of `group_a@host-4711`."""
+        return person_of(self.name)
+
+
+class PersonRole(StrEnum):
+    """The role of a person for this car."""
+
+    DRIVER = "driver"
+    LEAD = "lead"
+    OTHER = "other"
+    """A person of the fleet who drives other cars."""
+
+
+@dataclass(frozen=True, slots=True)
+class People:
+    """The people of a fleet, as one car sees them. `roles` is None if the fleet has no people."""
+
+    roles: Mapping[str, PersonRole] | None = None
+
+    def __hash__(self) -> int:
+        return hash(None if self.roles is None else frozenset(self.roles.items()))
+
+    @classmethod
+    def parse(cls, entries: Iterable[str]) -> Self:
+        """Return the table of the entries `teacher:lead`, `group_a`, `group_b:other`. Raises ValueError."""
+        return cls(dict(_parse(entry) for entry in entries))
+
+    @classmethod
+    def of(cls, message: Any) -> Self:
+        """Return the people of a fleet.v1.CarPeople. None: the fleet has no people."""
+        if message is None:
+            return cls()
+        roles = dict.fromkeys(message.others, PersonRole.OTHER) | dict.fromkeys(message.drivers, PersonRole.DRIVER)
+        return cls(roles | dict.fromkeys(message.leads, PersonRole.LEAD))
+
+    @classmethod
+    def merged(cls, parts: Iterable["People"]) -> Self:
+        """Return the people of several cars: whoever is a lead of one is a lead of all."""
+        listed = [each for each in parts if each.roles is not None]
+        if not listed:
+            return cls()
+        roles = {name: role for each in listed for name, role in (each.roles or {}).items()}
+        return cls(roles | {name: PersonRole.LEAD for each in listed for name in each.leads})
+
+    def fill(self, message: Any) -> None:
+        """Write these people to a fleet.v1.CarPeople."""
+        message.SetInParent()
+        message.leads.extend(self.leads)
+        message.drivers.extend(self.named(PersonRole.DRIVER))
+        message.others.extend(self.named(PersonRole.OTHER))
+
+    @property
+    def leads(self) -> tuple[str, ...]:
+        """Return the names of the leads, sorted."""
+        return self.named(PersonRole.LEAD)
+
+    def named(self, role: PersonRole) -> tuple[str, ...]:
+        """Return the names of the people with this role, sorted."""
+        return tuple(sorted(name for name, each in (self.roles or {}).items() if each is role))
+
+    def ranked(self, sender: Sender) -> Sender:
+        """Return the sender with its rank: only a person whom the table names as a lead is one."""
+        if sender.kind not in (Rank.PERSON, Rank.LEAD):
+            return sender
+        leads = self.role(sender.person) is PersonRole.LEAD
+        return replace(sender, kind=Rank.LEAD if leads else Rank.PERSON)
+
+    def role(self, person: str) -> PersonRole | None:
+        """Return what a person is to this car; None for a person who is not listed."""
+        return PersonRole.DRIVER if self.roles is None else self.roles.get(person)
+
+    def may_drive(self, person: str) -> bool:
+        """Return True if this person, and the scripts of this person, may drive the car."""
+        return self.role(person) in (PersonRole.DRIVER, PersonRole.LEAD)
+
+    def may_end(self, sender: Sender, by: str, rank: Rank) -> bool:
+        """Return True if this sender may end what `by` of this rank began. Only a lead ends what a lead began."""
+        if rank is not Rank.LEAD or sender.kind is Rank.LEAD:
+            return True
+        if self.roles is None:
+            # A gateway without a table knows one lead: who began it. If another lead ends a pause or a fleet-wide
+            # e-stop at the other gateways, this one learns the end from them.
+            return sender.kind is Rank.PERSON and sender.person == person_of(by)
+        # After a restart with another table there may be no lead: then the car must not stay stopped for ever.
+        return not self.leads
+
+    def may_direct(self, sender: Sender) -> "Denial | None":
+        """Return why this sender may not act on the whole fleet: pause it, lend a car, change its plan.
+
+        Where there are leads, only they may; elsewhere every person of the fleet.
+        """
+        if sender.kind is Rank.LEAD:
+            return None
+        if self.leads:
+            return Denial(Bar.NOT_A_LEAD)
+        if sender.kind is not Rank.PERSON:
+            return Denial(Bar.NOT_A_PERSON)
+        return Denial(Bar.UNLISTED) if self.role(sender.person) is None else None
+
+
+NO_PEOPLE: Final = People()
+"""A fleet without people."""
+_ROLES: Final = {"": PersonRole.DRIVER, "lead": PersonRole.LEAD, "other": PersonRole.OTHER}
+
+
+def _parse(entry: str) -> tuple[str, PersonRole]:
+    name, _, role = entry.partition(":")
+    if not is_name(name) or role not in _ROLES:
+        raise ValueError(f"{entry!r} is no person: write NAME, NAME:lead or NAME:other ({NAME_RULE})")
+    return name, _ROLES[role]
+
+
+# ---------------------------------------------------------------------- what may keep somebody from a car
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Keeps the coordinator from moving a stopped car; after the stop of a lead also persons and scripts.
+
+    `since_ns`: ns since the epoch.
+    """
+
+    by: str
+    since_ns: int
+    rank: Rank = Rank.PERSON
+
+
+@dataclass(frozen=True, slots=True)
+class Estop:
+    """One latched emergency stop. `at_ns`: wall clock, ns since the epoch; `fleet_wide`: every gateway latches it."""
+
+    id: str
+    by: str
+    why: str
+    at_ns: int
+    fleet_wide: bool
+    rank: Rank = Rank.PERSON
+
+
+@dataclass(frozen=True, slots=True)
+class FleetPause:
+    """One pause of the whole fleet. `at_ns`: wall clock, ns since the epoch."""
+
+    id: str
+    by: str
+    why: str
+    at_ns: int
+    rank: Rank = Rank.PERSON
+
+
+@dataclass(frozen=True, slots=True)
+class Loan:
+    """The car is lent to the person `to`. `since_ns`: wall clock, ns since the epoch. `duration_s` is not published."""
+
+    to: str
+    by: str
+    rank: Rank
+    since_ns: int
+    duration_s: float = inf
+
+    def left_s(self, now_ns: int) -> float:
+        """Return the remaining time by the wall clock. A clock that was set back prolongs no loan."""
+        return self.duration_s - max(0.0, (now_ns - self.since_ns) / 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseState:
+    """The sender who controls the car. `until`: s, monotonic, of the gateway; elsewhere it is not known."""
+
+    holder: Sender
+    until: float = inf
+    gone: bool = False
+    """True if the holder has disconnected. A sender of the same rank need not wait then."""
+
+    @property
+    def by(self) -> str:
+        """Return the name of the holder."""
+        return self.holder.name
+
+    def refuses(self, sender: Sender, *, take: bool) -> bool:
+        """Return True if `sender` may not drive. `take`: a person takes the car from another person."""
+        if sender == self.holder:
+            return False
+        mine, theirs = strength(sender.kind), strength(self.holder.kind)
+        takes = take and sender.kind in (Rank.PERSON, Rank.LEAD)
+        return mine < theirs or (mine == theirs and not self.gone and not takes)
+
+
+Mark = Hold | Estop | FleetPause | Loan | LeaseState
+
+
+# ---------------------------------------------------------------------- rights
+
+
+class Right(StrEnum):
+    """What somebody may do with a car."""
+
+    MOVE = "move"
+    """Drive it, change its mode or speed, move its servos or arm, switch its fan."""
+    ACT = "act"
+    """Use its lights and its whistle."""
+    TAKE = "take"
+    """Take it from another person, and move it."""
+    RESUME = "resume"
+    """End its hold."""
+    END_ESTOPS = "end_estops"
+    """End one of its e-stops."""
+    PAUSE = "pause"
+    UNPAUSE = "unpause"
+    LEND = "lend"
+    END_LOAN = "end_loan"
+
+
+class Bar(StrEnum):
+    """What keeps somebody from it."""
+
+    NOT_A_LEAD = "not_a_lead"
+    NOT_A_PERSON = "not_a_person"
+    UNLISTED = "unlisted"
+    OTHER_CAR = "other_car"
+    """The people table gives this person other cars."""
+    LENT = "lent"
+    ESTOPPED = "estopped"
+    PAUSED = "paused"
+    ON_HOLD = "on_hold"
+    """A hold keeps the coordinator from the car."""
+    LEADS_HOLD = "leads_hold"
+    LEADS_ESTOP = "leads_estop"
+    LEADS_PAUSE = "leads_pause"
+    LEASED = "leased"
+
+
+_REASONS: Final = {
+    Bar.NOT_A_LEAD: Reason.NOT_ALLOWED,
+    Bar.NOT_A_PERSON: Reason.NOT_ALLOWED,
+    Bar.UNLISTED: Reason.NOT_ALLOWED,
+    Bar.OTHER_CAR: Reason.NOT_ALLOWED,
+    Bar.LENT: Reason.LENT,
+    Bar.ESTOPPED: Reason.ESTOPPED,
+    Bar.PAUSED: Reason.PAUSED,
+    Bar.ON_HOLD: Reason.HELD,
+    Bar.LEADS_HOLD: Reason.HELD,
+    Bar.LEADS_ESTOP: Reason.ESTOPPED,
+    Bar.LEADS_PAUSE: Reason.PAUSED,
+    Bar.LEASED: Reason.LEASED,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Denial:
+    """Why a right is denied. `mark`: the e-stop, pause, hold, loan or lease that it rests on."""
+
+    bar: Bar
+    mark: Mark | None = None
+
+    @property
+    def reason(self) -> Reason:
+        """Return the reason of the answer."""
+        return _REASONS[self.bar]
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """What decides who may do what with one car now. e-stops and pauses: oldest first."""
+
+    people: People = NO_PEOPLE
+    estops: tuple[Estop, ...] = ()
+    pauses: tuple[FleetPause, ...] = ()
+    hold: Hold | None = None
+    loan: Loan | None = None
+    lease: LeaseState | None = None
+
+    @classmethod
+    def of(cls, safety: Any) -> Self:
+        """Return what a fleet.v1.Safety says."""
+        hold, loan, lease = safety.hold, safety.loan, safety.lease
+        return cls(
+            People.of(safety.people if safety.HasField("people") else None),
+            estops_of(safety),
+            pauses_of(safety),
+            Hold(hold.by, stamp_ns(hold.since), rank_of(hold.rank)) if safety.HasField("hold") else None,
+            Loan(loan.to, loan.by, rank_of(loan.rank), stamp_ns(loan.since)) if loan.to else None,
+            LeaseState(Sender(lease.holder, rank_of(lease.kind))) if safety.HasField("lease") else None,
+        )
+
+    def may(self, sender: Sender, right: Right) -> Denial | None:
+        """Return why this sender may not do it; None if it may. The sender has its rank, see `People.ranked`."""
+        people = self.people
+        match right:
+            case Right.MOVE | Right.TAKE:
+                return self._kept_away(sender) or self._held(sender) or self._leased(sender, take=right is Right.TAKE)
+            case Right.ACT:
+                return self._kept_away(sender) or self._held(sender)
+            case Right.RESUME:
+                return self._held(sender) or self._may_drive_at_all(sender)
+            case Right.END_ESTOPS:
+                stays = [each for each in self.estops if not self.may_end_estop(each, sender)]
+                return self.estop_stays(stays[0], sender) if stays and len(stays) == len(self.estops) else None
+            case Right.LEND:
+                return people.may_direct(sender) or self.may_drive(sender)
+            case Right.UNPAUSE:
+                return people.may_direct(sender) or self._pause_stays(sender)
+            case Right.END_LOAN if self.loan is None or self.loan.to == sender.person:
+                return None
+            case _:
+                return people.may_direct(sender)
+
+    def may_drive(self, sender: Sender) -> Denial | None:
+        """Return why the people of the fleet or a loan keep this sender from the car."""
+        person, people, loan = sender.person, self.people, self.loan
+        if sender.kind is Rank.LEAD:
+            return None
+        if loan is not None and person != loan.to and person not in people.leads:
+            return Denial(Bar.LENT, loan)
+        borrowed = loan is not None and person == loan.to
+        if sender.kind is Rank.COORDINATOR or borrowed or people.may_drive(person):
+            return None
+        return Denial(Bar.UNLISTED if people.role(person) is None else Bar.OTHER_CAR)
+
+    def may_end_estop(self, estop: Estop, sender: Sender) -> bool:
+        """Return True if the sender may end this e-stop. The coordinator ends none.
+
+        Only a lead ends a lead's e-stop. One of a person is ended by who latched it, by who may drive this car, and if
+        it is fleet-wide by every person of the fleet, so that all gateways decide alike.
+        """
+        people, person = self.people, sender.person
+        if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
+            return False
+        mine = person in (person_of(estop.by), self.loan and self.loan.to)
+        return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
+
+    def estop_stays(self, estop: Estop, sender: Sender) -> Denial:
+        """Return why an e-stop stays that the sender may not end."""
+        if self.people.may_end(sender, estop.by, estop.rank):
+            return self._may_drive_at_all(sender) or Denial(Bar.UNLISTED)
+        return Denial(Bar.LEADS_ESTOP, estop)
+
+    def _may_drive_at_all(self, sender: Sender) -> Denial | None:
+        """Return why the people keep this sender from the car. A loan to another person does not matter."""
+        loan = self.loan if self.loan is not None and self.loan.to == sender.person else None
+        return replace(self, loan=loan).may_drive(sender)
+
+    def _kept_away(self, sender: Sender) -> Denial | None:
+        """Return why an e-stop, a pause, a loan or the people of the fleet keep the sender from the car."""
+        if self.estops:
+            return Denial(Bar.ESTOPPED, self.estops[0])
+        denial = self.may_drive(sender)
+        if denial is not None or not self.pauses or sender.kind is Rank.LEAD:
+            return denial
+        return Denial(Bar.PAUSED, self.pauses[-1])
+
+    def _held(self, sender: Sender) -> Denial | None:
+        hold = self.hold
+        if hold is None:
+            return None
+        if sender.kind is Rank.COORDINATOR:
+            return Denial(Bar.ON_HOLD, hold)
+        return None if self.people.may_end(sender, hold.by, hold.rank) else Denial(Bar.LEADS_HOLD, hold)
+
+    def _pause_stays(self, sender: Sender) -> Denial | None:
+        stays = (each for each in self.pauses if not self.people.may_end(sender, each.by, each.rank))
+        return next((Denial(Bar.LEADS_PAUSE, each) for each in stays), None)
+
+    def _leased(self, sender: Sender, *, take: bool) -> Denial | None:
+        lease = self.lease
+        return Denial(Bar.LEASED, lease) if lease is not None and lease.refuses(sender, take=take) else None
+
+
+def estops_of(safety: Any) -> tuple[Estop, ...]:
+    """Return the e-stops of a fleet.v1.Safety, oldest first."""
+    return tuple(
+        Estop(each.id, each.by, each.why, stamp_ns(each.stamp), each.scope == Scope.FLEET, rank_of(each.rank))
+        for each in safety.estops
+    )
+
+
+def pauses_of(safety: Any) -> tuple[FleetPause, ...]:
+    """Return the pauses of a fleet.v1.Safety, oldest first."""
+    return tuple(
+        FleetPause(each.id, each.by, each.why, stamp_ns(each.stamp), rank_of(each.rank)) for each in safety.pauses
+    )
