@@ -158,7 +158,7 @@ class ProcessSet:
             action = process.status.turn(now, since(process), leave_s)
             if action is RestartAction.KILL and process.child is not None:
                 if process.status.words.startswith(HUNG):
-                    self._admission.count_kill()
+                    self._admission.count_kill(now)
                 self._on_event(process.name, process.status.words)
                 process.child.kill()
             elif action is RestartAction.START and may_start(process) and self._is_admitted(process, now):

@@ -19,11 +19,11 @@ from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
-from gateway.control.rate_limit import TokenBucket
 from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.token_bucket import TokenBucket
 from schemas.words import UNKNOWN, BatteryLevel, Level, LinkState, Mode, MotionSource, Phase, Scope
 
 VERSION: Final = "0.1.0"

@@ -1,7 +1,5 @@
 """The processes that may start or be killed now, by tables and on virtual time."""
 
-import itertools
-
 import pytest
 
 from fleet.supervisor.admission import (
@@ -11,7 +9,6 @@ from fleet.supervisor.admission import (
     RESTARTS_AT_ONCE,
     START_SLOT_TIMEOUT_S,
     Admission,
-    Budget,
 )
 
 
@@ -31,17 +28,6 @@ def test_the_next_is_admitted_when_one_before_it_is_heard_or_has_had_its_time(
     assert Admission(2).admit_start(100.0, starting_since, restart=False) is admitted
 
 
-def test_a_budget_allows_some_at_once_and_then_one_for_each_interval() -> None:
-    budget, taken = Budget(3, 2.0), []
-    for tenth in range(200):
-        if budget.has(tenth / 10):
-            budget.take()
-            taken.append(tenth / 10)
-    assert taken[:3] == [0.0, 0.1, 0.2]
-    assert len(taken) == 3 + 9
-    assert all(later - earlier >= 1.9 for earlier, later in itertools.pairwise(taken[2:]))
-
-
 def test_restarts_have_a_budget_for_the_whole_fleet_and_first_starts_have_none() -> None:
     admission = Admission(100)
     assert all(admission.admit_start(0.0, [], restart=False) for _ in range(1000))
@@ -54,7 +40,7 @@ def test_kills_have_a_budget_for_the_whole_fleet() -> None:
     admission, killed = Admission(2), 0
     for tenth in range(round(10 * 4 * KILL_INTERVAL_S)):
         if admission.may_kill(tenth / 10):
-            admission.count_kill()
+            admission.count_kill(tenth / 10)
             killed += 1
     assert killed == KILLS_AT_ONCE + 3
 

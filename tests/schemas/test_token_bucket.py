@@ -1,6 +1,6 @@
 """Tests of the rate limit."""
 
-from gateway.control.rate_limit import TokenBucket
+from schemas.token_bucket import TokenBucket
 
 
 def test_so_much_at_once_and_so_much_a_second() -> None:

@@ -1,4 +1,4 @@
-"""Limits a rate, so that a car that sends garbage without end costs little. No clock."""
+"""Limits a rate: a burst, and so much in the long run. Pure."""
 
 from dataclasses import dataclass, field
 
@@ -15,10 +15,14 @@ class TokenBucket:
     def __post_init__(self) -> None:
         self._left = self.at_once
 
-    def take(self, requested: int, now: float) -> int:
-        """Return how many of the requested may pass now, 0..requested."""
+    def has(self, now: float) -> bool:
+        """Return True if one may pass now."""
         self._left = min(self.at_once, self._left + self.per_s * max(0.0, now - self._at))
         self._at = max(self._at, now)
-        granted = min(requested, int(self._left))
+        return self._left >= 1.0
+
+    def take(self, requested: int, now: float) -> int:
+        """Return how many of the requested may pass now, 0..requested."""
+        granted = min(requested, int(self._left)) if self.has(now) else 0
         self._left -= granted
         return granted
