@@ -1,7 +1,6 @@
 """Tests rules of names, imports and messages that no linter has. CONTRIBUTING.md explains them."""
 
 import ast
-import re
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
@@ -23,13 +22,6 @@ TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 
 LAZY_IMPORTS = 133
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
-
-NO_MODULE_NAMES = re.compile(
-    r"(asking|asked|hearing|heard|telling|told|saying|said|keeping|kept|waiting|wanted|known|seen|shown|found|begun|given"
-    r"|looking|making|acting|showing|reading_out|before|after|company|desk|doors|ear|wall|crew|farewell|tape|walk|salvage"
-    r"|sound|things|who|what|why|how)"
-)
-"""Participles, metaphors and question words: a module is a noun of the field."""
 
 
 def source_files(*packages: str) -> Iterator[Path]:
@@ -60,11 +52,6 @@ def test_a_class_name_stands_for_one_class() -> None:
     for name in TWINS:
         places[name] = [each for each in places[name] if each != "fleet.aio"]
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
-
-
-def test_a_module_is_named_after_a_noun_of_the_field() -> None:
-    names = {module_name(path).rpartition(".")[2]: path for path in source_files(*PRODUCT)}
-    assert [str(path) for name, path in names.items() if NO_MODULE_NAMES.fullmatch(name)] == []
 
 
 def number(node: ast.expr) -> float | None:
