@@ -10,6 +10,7 @@ from google.protobuf.message import DecodeError, Message
 
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import PROTOBUF
+from schemas.words import Level
 
 JSON: Final = "application/json"
 
@@ -53,6 +54,16 @@ def to_dict(message: Message) -> dict[str, Any]:
 def to_json(message: Message) -> str:
     """Return `to_dict` as one line of JSON."""
     return json.dumps(to_dict(message), separators=(",", ":"))
+
+
+_FOXGLOVE_LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}
+
+
+def log_message(at_ns: int, level: Level, name: str, words: str) -> Message:
+    """Return a foxglove.Log. at_ns: ns since the epoch."""
+    message: Any = message_class("foxglove.Log")(level=_FOXGLOVE_LEVELS[level], name=name, message=words)
+    message.timestamp.seconds, message.timestamp.nanos = divmod(at_ns, 1_000_000_000)
+    return message  # type: ignore[no-any-return]  # the class has no types
 
 
 def stamp_ns(stamp: Any) -> int:

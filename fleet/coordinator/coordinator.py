@@ -36,6 +36,7 @@ from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, rep
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.topics import Qos
+from schemas.words import Level
 
 SENDER: Final = "coordinator-"
 """Prefix of every coordinator's sender name, so that a second coordinator can name the first."""
@@ -59,7 +60,6 @@ INTERNAL_ERROR: Final = "internal_error"
 """Code of the event about an unexpected exception. The coordinator goes on."""
 _MAX_ERROR_LENGTH: Final = 500
 """Maximum characters of such an exception's text, which may quote payloads from the bus."""
-_LEVEL_INFO, _LEVEL_ERROR = 2, 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 _ANONYMOUS: Final = "anonymous"
@@ -277,7 +277,7 @@ class Coordinator:
         self._memory = memory
         saved = self._save(memory)
         code, did = EVENTS[request]
-        self._log(_LEVEL_INFO, code, f"{keys.name_of(by)} {did} ({words})")
+        self._log(Level.INFO, code, f"{keys.name_of(by)} {did} ({words})")
         self._reply_result(query, pb.Result(status="sent", words=words if saved else f"{words}. {_UNSAVED}"))
 
     def _drop_decisions(self) -> None:
@@ -324,7 +324,7 @@ class Coordinator:
         self._drop_decisions()
         self._put_in_force(plan, by)
         self._save(self._memory)
-        self._log(_LEVEL_INFO, _PLAN_SET, f"{keys.name_of(by)} put plan {plan.version} in force")
+        self._log(Level.INFO, _PLAN_SET, f"{keys.name_of(by)} put plan {plan.version} in force")
         self._query_states()
 
     # ------------------------------------------------------------------ samples and queries
@@ -446,19 +446,16 @@ class Coordinator:
         }
         if words not in self._internal_errors:
             self._internal_errors[words] = now
-            self._log(_LEVEL_ERROR, INTERNAL_ERROR, words)
+            self._log(Level.ERROR, INTERNAL_ERROR, words)
             with contextlib.suppress(Exception):  # the error may come from `on_failure` itself
                 self.on_failure(words)
         return words
 
-    def _log(self, level: int, code: str, words: str) -> None:
+    def _log(self, level: Level, code: str, words: str) -> None:
         """Publish an event as foxglove.Log."""
         now_ns = time.time_ns()
-        message: Any = messages.message_class("foxglove.Log")(
-            level=level, name=f"{keys.COORDINATOR} {code}", message=words
-        )
-        message.timestamp.seconds, message.timestamp.nanos = divmod(now_ns, 1_000_000_000)
-        self._publisher("log").put(message, now_ns)
+        name = f"{keys.COORDINATOR} {code}"
+        self._publisher("log").put(messages.log_message(now_ns, level, name, words), now_ns)
 
     # ------------------------------------------------------------------ other coordinators, the hub, publishers
 

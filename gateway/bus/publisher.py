@@ -24,7 +24,7 @@ from gateway.protocol.measurements import measured, verdict_of
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.token_bucket import TokenBucket
-from schemas.words import UNKNOWN, BatteryLevel, Level, LinkState, Mode, MotionSource, Phase, Scope
+from schemas.words import UNKNOWN, BatteryLevel, LinkState, Mode, MotionSource, Phase, Scope
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
@@ -49,7 +49,6 @@ _CLASSES: Final[dict[str, Any]] = {
 """Message classes by topic. Each message is a new object: a cleared one would keep its old memory."""
 _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
 """Phases at the arrival of a command. They have no `took_s`."""
-_FOXGLOVE_LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 
 class CarPublisher:
@@ -156,11 +155,8 @@ class CarPublisher:
 
     def publish_log(self, record: LogRecord) -> None:
         """Publish a log record as foxglove.Log."""
-        message: Any = messages.message_class("foxglove.Log")()
-        message.timestamp.seconds, message.timestamp.nanos = divmod(self._wall.ns(record.at), 1_000_000_000)
-        message.level = _FOXGLOVE_LEVELS[record.level]
-        message.name = f"{self._car} {record.code}"
-        message.message = record.words
+        name = f"{self._car} {record.code}"
+        message = messages.log_message(self._wall.ns(record.at), record.level, name, record.words)
         self._put_record("event/log", message, record.at)
 
     def _put_record(self, name: str, message: Any, at: float) -> None:

@@ -25,6 +25,7 @@ from schemas import keys, messages
 from schemas.bus import Bus, messages_of, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
+from schemas.words import Level
 
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
@@ -443,10 +444,7 @@ class Recorder:
         if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
             raise _CommandRefused(f"text needs 1 to {MAX_MARK_CHARACTERS} characters, by at most {MAX_MARK_CHARACTERS}")
         now = self._now()
-        message: Any = messages.message_class("foxglove.Log")()
-        message.timestamp.seconds, message.timestamp.nanos = divmod(now, 1_000_000_000)
-        message.level, message.name, message.message = 2, by, text
-        self._marks.put(message, now)
+        self._marks.put(messages.log_message(now, Level.INFO, by, text), now)
         with contextlib.suppress(OSError):  # the disk is full: the bus has the mark, and `close` writes it
             self._session.mark(text, by, now)
         self._last = self._status()
