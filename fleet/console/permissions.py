@@ -10,10 +10,11 @@ from typing import Any, Final, Self
 
 from fleet.policy.authority import Authority, authority_of, merge_authority, unlisted_words
 from schemas.keys import person_of
+from schemas.words import Rank, Reason, Scope, Verb
 
 ACTIONS: Final = ("move", "act", "take", "resume", "end_estops", "pause", "unpause", "lend", "end_loan")
 """`move`: drive, modes, speed, servos, arm, fan. `act`: lights and sound. A stop is always allowed."""
-_RANKS: Final = {"lead": 3, "person": 2, "script": 1, "coordinator": 0}
+_RANKS: Final = {str(rank): number for number, rank in enumerate(reversed(Rank))}
 
 Refusal = tuple[str, str]
 """The gateway's reason, and words."""
@@ -56,14 +57,14 @@ class CarRules:
     def of(cls, car: str, safety: Any) -> Self:
         """Return the rules of a car from its newest `state/safety`."""
         people = safety.people
-        pause = max(reversed(safety.pauses), key=lambda each: each.rank == "lead", default=None)
+        pause = max(reversed(safety.pauses), key=lambda each: each.rank == Rank.LEAD, default=None)
         return cls(
             car,
             safety.HasField("people"),
             tuple(people.leads),
             tuple(people.drivers),
             tuple(people.others),
-            tuple(Mark(each.by, each.rank, each.why, each.scope == "fleet") for each in safety.estops),
+            tuple(Mark(each.by, each.rank, each.why, each.scope == Scope.FLEET) for each in safety.estops),
             Mark(safety.hold.by, safety.hold.rank) if safety.HasField("hold") else None,
             None if pause is None else Mark(pause.by, pause.rank, pause.why),
             Mark(safety.lease.holder, safety.lease.kind) if safety.HasField("lease") else None,
@@ -114,15 +115,15 @@ class _Judge:
                 return self._kept_away() or self._held()
             case "take":
                 return self._kept_away() or self._held() or self._leased(take=True)
-            case "resume":
+            case Verb.RESUME:
                 return self._held() or self._not_a_driver(even_if_lent=True)
             case "end_estops":
                 return self._estopped()
             case "end_loan" if self.rules.loan_to in ("", self.person):
                 return None
-            case "lend":
+            case Verb.LEND:
                 return self._cannot_direct() or self._not_a_driver()
-            case "unpause":
+            case Verb.UNPAUSE:
                 return self._cannot_direct() or self._paused()
             case _:
                 return self._cannot_direct()
@@ -130,14 +131,14 @@ class _Judge:
     def _cannot_direct(self) -> Refusal | None:
         """Return why this person may not pause or lend."""
         words = self.rules.authority.refusal(self.person)
-        return ("not_allowed", words) if words else None
+        return (Reason.NOT_ALLOWED, words) if words else None
 
     @property
     def _is_unlisted(self) -> bool:
         return not self.rules.authority.lists(self.person)
 
     def _unlisted(self) -> Refusal:
-        return "not_allowed", unlisted_words(self.person)
+        return Reason.NOT_ALLOWED, unlisted_words(self.person)
 
     def _not_a_driver(self, *, even_if_lent: bool = False) -> Refusal | None:
         """Return why the people of the fleet or a loan keep this person from the car."""
@@ -145,25 +146,25 @@ class _Judge:
         if self._is_lead or (rules.loan_to and self.person == rules.loan_to):
             return None
         if rules.loan_to and not even_if_lent:
-            return "lent", f"{rules.car} is lent to {rules.loan_to} (by {rules.loan_by})."
+            return Reason.LENT, f"{rules.car} is lent to {rules.loan_to} (by {rules.loan_by})."
         if not rules.listed or self.person in rules.drivers:
             return None
         if self._is_unlisted:
             return self._unlisted()
-        return "not_allowed", f"{self.person} drives other cars, not {rules.car}."
+        return Reason.NOT_ALLOWED, f"{self.person} drives other cars, not {rules.car}."
 
     def _kept_away(self) -> Refusal | None:
         rules = self.rules
         if rules.estops:
-            return "estopped", f"{rules.car} is emergency-stopped ({_words(rules.estops[0])})."
+            return Reason.ESTOPPED, f"{rules.car} is emergency-stopped ({_words(rules.estops[0])})."
         refusal = self._not_a_driver()
         if refusal is not None or rules.pause is None or self._is_lead:
             return refusal
-        return "paused", f"The fleet is paused ({_words(rules.pause)})."
+        return Reason.PAUSED, f"The fleet is paused ({_words(rules.pause)})."
 
     def _may_end(self, mark: Mark) -> bool:
         """Return True if this person's rank ends this. Only a lead ends what a lead began."""
-        if mark.rank != "lead" or self._is_lead:
+        if mark.rank != Rank.LEAD or self._is_lead:
             return True
         return not self.rules.leads if self.rules.listed else self.person == mark.person
 
@@ -171,13 +172,13 @@ class _Judge:
         pause = self.rules.pause
         if pause is None or self._may_end(pause):
             return None
-        return "paused", f"{_words(pause)}: only a lead ends this pause."
+        return Reason.PAUSED, f"{_words(pause)}: only a lead ends this pause."
 
     def _held(self) -> Refusal | None:
         hold = self.rules.hold
         if hold is None or self._may_end(hold):
             return None
-        return "held", f"{hold.person} stopped {self.rules.car}: only a lead lets it go."
+        return Reason.HELD, f"{hold.person} stopped {self.rules.car}: only a lead lets it go."
 
     def _estopped(self) -> Refusal | None:
         """Return why this person may end none of the e-stops; None if there is none."""
@@ -187,7 +188,7 @@ class _Judge:
             return None
         if self._may_end(stays[0]):
             return self._not_a_driver(even_if_lent=True) or self._unlisted()
-        return "estopped", f"{_words(stays[0])}: only a lead ends this e-stop."
+        return Reason.ESTOPPED, f"{_words(stays[0])}: only a lead ends this e-stop."
 
     def _may_end_estop(self, estop: Mark) -> bool:
         rules = self.rules
@@ -200,11 +201,11 @@ class _Judge:
         lease = self.rules.lease
         if lease is None or lease.by == self.sender:
             return None
-        mine, theirs = _RANKS["lead" if self._is_lead else "person"], _RANKS.get(lease.rank, 0)
+        mine, theirs = _RANKS[Rank.LEAD if self._is_lead else Rank.PERSON], _RANKS.get(lease.rank, 0)
         if mine > theirs or (mine == theirs and take):
             return None
         todo = "Take it over." if mine == theirs else "Wait until the car is free."
-        return "leased", f"{lease.person} drives {self.rules.car}. {todo}"
+        return Reason.LEASED, f"{lease.person} drives {self.rules.car}. {todo}"
 
 
 def _words(mark: Mark) -> str:
@@ -214,7 +215,7 @@ def _words(mark: Mark) -> str:
 def rights_of(sender: str, cars: Mapping[str, CarRules]) -> dict[str, Any]:
     """Return the words of what is refused to this sender, by car and action, and for the whole fleet."""
     by_car = {car: _cached(rules, sender) for car, rules in cars.items()}
-    fleet = {action: next(_common(by_car, action), "") for action in ("pause", "unpause")}
+    fleet = {action: next(_common(by_car, action), "") for action in map(str, (Verb.PAUSE, Verb.UNPAUSE))}
     fleet["manage"] = management_refusal(cars.values(), sender)
     return {"cars": by_car, **fleet, "lead": any(person_of(sender) in rules.leads for rules in cars.values())}
 
