@@ -32,6 +32,7 @@ from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, re
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
+from schemas.words import Rank, Scope, Verb
 
 _THREADS: Final = 256
 """Maximum number of concurrent calls. A drive blocks its thread until its end."""
@@ -49,7 +50,7 @@ class Fleet:
         *,
         person: str | None = None,
         sender: str | None = None,
-        kind: str = "script",
+        kind: str = Rank.SCRIPT,
         start_hub: bool = False,
     ) -> None:
         self._open = lambda: client.Fleet(endpoint, name, person=person, sender=sender, kind=kind, start_hub=start_hub)
@@ -128,7 +129,7 @@ class Fleet:
 
     async def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
         """E-stop these cars, or the fleet."""
-        return await self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
+        return await self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     async def resume(
         self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False
@@ -142,7 +143,7 @@ class Fleet:
 
     async def unpause(self) -> list[Outcome]:
         """End the pause of the fleet. No car moves."""
-        return await self.ask(plain_request("unpause"))
+        return await self.ask(plain_request(Verb.UNPAUSE))
 
     async def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
         """Lend these cars to a person: until then only that person and leads drive them."""

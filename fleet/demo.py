@@ -21,7 +21,6 @@ from typing import Any, Final
 
 import click
 
-from fleet.client.claims import SHOWN
 from fleet.client.client import Fleet
 from fleet.client.outcome import Outcome
 from fleet.client.reading import Reading
@@ -30,9 +29,10 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
 from schemas.process.parent import parent_option
 from schemas.suggestion import how_to_install
+from schemas.words import Basis, LinkState, Mode, Motion, Motors, Platform, Rank, Verdict
 
 DEFAULT_OUT: Final = Path("sessions")
-DEMO_CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
+DEMO_CARS: Final = {"red": Platform.ARDUINO, "green": Platform.ARDUINO, "blue": Platform.RASPBERRY_PI}
 DEMO_PLAN: Final = """\
 # Red follows the line, green keeps clear of walls, blue is driven by hand.
 fixed:
@@ -165,7 +165,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
             ),
         )
         session = Path(_line(recorder, "recorder")["session"])
-        client = stack.enter_context(Fleet(run.endpoint, sender="demo", kind="person"))
+        client = stack.enter_context(Fleet(run.endpoint, sender="demo", kind=Rank.PERSON))
         watcher = stack.enter_context(bus.Bus.open(run.endpoint))
         watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.on_sample)
         simulator, links = _simulator(run, stack, session)
@@ -198,7 +198,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
 def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Popen[str]", session: Path) -> None:
     run.say("three gateways bring their cars to a known state")
     ready = run.wait_until(
-        lambda: _motors(client) == dict.fromkeys(DEMO_CARS, "off") and run.truth.keys() == DEMO_CARS.keys()
+        lambda: _motors(client) == dict.fromkeys(DEMO_CARS, Motors.OFF) and run.truth.keys() == DEMO_CARS.keys()
     )
     run.check("cars ready", _listed({car: f"motors {state}" for car, state in _motors(client).items()}), ok=ready)
     if not ready:
@@ -233,16 +233,16 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
             *("run", str(plan), "--connect", run.endpoint, *parent_option()),
         ),
     )
-    for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
+    for car, mode in (("red", Mode.TRACKING), ("green", Mode.OBSTACLE_AVOIDANCE)):
         seen = run.wait_for_truth(car, "mode", mode)
         run.check(f"{car} mode", mode if seen else f"should be {mode}, is {run.truth[car].mode}", ok=seen)
-    seen = run.wait_until(lambda: _state(client, "red", "mode").verdict == "confirmed")
+    seen = run.wait_until(lambda: _state(client, "red", "mode").verdict == Verdict.CONFIRMED)
     run.check("red mode known", _state(client, "red", "mode").evidence, ok=seen)
 
     run.say("red's link is cut; meanwhile blue is driven by hand")
     _ask(simulator, {"car": "red", "fault": "link_drop"})
     start = (run.truth["blue"].x_m, run.truth["blue"].y_m)
-    outcome = client.car("blue").drive("forward", 1.0)
+    outcome = client.car("blue").drive(Motion.FORWARD, 1.0)
     moved = run.wait_until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start)
     stood = run.wait_until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right)
     run.check(
@@ -252,7 +252,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         else f"{'moved' if moved else 'did not move'}, {'stopped' if stood else 'did not stop'}: {outcome}",
         ok=outcome.ok and moved and stood,
     )
-    lost = run.wait_until(lambda: _state(client, "red", "link").state == "lost")
+    lost = run.wait_until(lambda: _state(client, "red", "link").state == LinkState.LOST)
     run.check(
         "red cut",
         f"link {_state(client, 'red', 'link').state}, motors {_state(client, 'red', 'safety').motors}",
@@ -262,9 +262,9 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     _ask(simulator, {"car": "red", "fault": "link_drop", "for_s": 0})
     back = run.wait_until(
         lambda: (
-            _state(client, "red", "mode").verdict == "confirmed"
-            and _state(client, "red", "link").state == "online"
-            and run.truth["red"].mode == "tracking"
+            _state(client, "red", "mode").verdict == Verdict.CONFIRMED
+            and _state(client, "red", "link").state == LinkState.ONLINE
+            and run.truth["red"].mode == Mode.TRACKING
         )
     )
     run.check("red back", f"link {_state(client, 'red', 'link').state}, {run.truth['red'].mode} again", ok=back)
@@ -298,7 +298,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
 
 def _shown(outcomes: Sequence[Outcome]) -> str:
     """Return the cars whose own readings show that they stopped."""
-    return ", ".join(each.car for each in outcomes if each.basis == SHOWN) or "none"
+    return ", ".join(each.car for each in outcomes if each.basis == Basis.SHOWN) or "none"
 
 
 def _ends(codes: Mapping[str, int | None]) -> str:
@@ -317,7 +317,7 @@ def _state(client: Fleet, car: str, name: str) -> Any:
 
 
 def _at_rest(truth: pb.Truth) -> bool:
-    return truth.mode == "manual" and truth.motor_left == 0 == truth.motor_right
+    return truth.mode == Mode.MANUAL and truth.motor_left == 0 == truth.motor_right
 
 
 def _motors(client: Fleet) -> dict[str, str]:

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
+from schemas.words import Verb
+
 
 @dataclass(frozen=True, slots=True)
 class CommandType:
     """One row: a command under `<fleet>/<car>/@cmd/<verb>`."""
 
-    verb: str
+    verb: Verb
     about: str
     effect: str = ""
     """Text of the outcome when its frames were sent. Empty if `fleet.client.effects` has its texts."""
@@ -40,37 +42,39 @@ class CommandType:
 
 _ROWS: Final = (
     CommandType(
-        "drive",
+        Verb.DRIVE,
         "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
         ttl_s=0.5,
     ),
-    CommandType("mode", "bring the car into a mode; `manual` closes whatever is open", "switching to mode{detail}"),
-    CommandType("led", "the color LED, 0..255 each", "LED color sent"),
-    CommandType("light", "the light's color, or `off`", "light{detail} sent"),
-    CommandType("servo", "move a servo a step, or the front one to `deg` (0..180)", "servo angle sent"),
-    CommandType("arm", "six joints, 0..180 degrees each (option `+arm`)", "arm joints sent"),
-    CommandType("whistle", "sound the whistle once", "whistle sent", subcommand="whistle", section="Lights and parts"),
-    CommandType("speed", "one step `up` or `down`: cars have no absolute speed", "speed step{detail} sent"),
-    CommandType("fan", "toggle; `on` or `off` while its state is known", "fan{detail} sent"),
-    CommandType("stop", "stop, and hold the car against the coordinator", wildcard=True, stops=True),
+    CommandType(Verb.MODE, "bring the car into a mode; `manual` closes whatever is open", "switching to mode{detail}"),
+    CommandType(Verb.LED, "the color LED, 0..255 each", "LED color sent"),
+    CommandType(Verb.LIGHT, "the light's color, or `off`", "light{detail} sent"),
+    CommandType(Verb.SERVO, "move a servo a step, or the front one to `deg` (0..180)", "servo angle sent"),
+    CommandType(Verb.ARM, "six joints, 0..180 degrees each (option `+arm`)", "arm joints sent"),
     CommandType(
-        "estop",
+        Verb.WHISTLE, "sound the whistle once", "whistle sent", subcommand="whistle", section="Lights and parts"
+    ),
+    CommandType(Verb.SPEED, "one step `up` or `down`: cars have no absolute speed", "speed step{detail} sent"),
+    CommandType(Verb.FAN, "toggle; `on` or `off` while its state is known", "fan{detail} sent"),
+    CommandType(Verb.STOP, "stop, and hold the car against the coordinator", wildcard=True, stops=True),
+    CommandType(
+        Verb.ESTOP,
         "stop, and reject everything until it is resumed by its id; `scope` is car or fleet",
         wildcard=True,
         stops=True,
     ),
-    CommandType("resume", "end the e-stops of these ids; without ids, the hold; `all` ends both", wildcard=True),
-    CommandType("pause", "stop, and let only leads move the cars of the fleet until `unpause`", wildcard=True),
-    CommandType("unpause", "end the pause of the fleet; move nothing", "{words}", wildcard=True),
+    CommandType(Verb.RESUME, "end the e-stops of these ids; without ids, the hold; `all` ends both", wildcard=True),
+    CommandType(Verb.PAUSE, "stop, and let only leads move the cars of the fleet until `unpause`", wildcard=True),
+    CommandType(Verb.UNPAUSE, "end the pause of the fleet; move nothing", "{words}", wildcard=True),
     CommandType(
-        "lend",
+        Verb.LEND,
         "let only one person drive the car for `duration_s`, or `end` that",
         "{words}",
         max_duration_s=86_400.0,
     ),
-    CommandType("lease", "reserve the car for a moment, or release it", "done"),
+    CommandType(Verb.LEASE, "reserve the car for a moment, or release it", "done"),
     CommandType(
-        "find",
+        Verb.FIND,
         "blink and beep, without moving: shows which car is which",
         "blinks and beeps sent",
         subcommand="identify",

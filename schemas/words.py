@@ -96,6 +96,28 @@ class SpeedStep(StrEnum):
 # ------------------------------------------------------------------ commands
 
 
+class Verb(StrEnum):
+    """What a command does. `commands` has a row for each."""
+
+    DRIVE = "drive"
+    MODE = "mode"
+    LED = "led"
+    LIGHT = "light"
+    SERVO = "servo"
+    ARM = "arm"
+    WHISTLE = "whistle"
+    SPEED = "speed"
+    FAN = "fan"
+    STOP = "stop"
+    ESTOP = "estop"
+    RESUME = "resume"
+    PAUSE = "pause"
+    UNPAUSE = "unpause"
+    LEND = "lend"
+    LEASE = "lease"
+    FIND = "find"
+
+
 class Rank(StrEnum):
     """The kind of a sender, which is its rank. Each outranks those below it."""
 
@@ -305,6 +327,15 @@ class Level(StrEnum):
 # ------------------------------------------------------------------ processes
 
 
+class RecorderVerb(StrEnum):
+    """A command under `<fleet>/@recorder/@cmd/`. The payload of `mark` is JSON with `text` and `by`."""
+
+    START = "start"
+    STOP = "stop"
+    STATUS = "status"
+    MARK = "mark"
+
+
 class RecorderState(StrEnum):
     """The state of the recorder."""
 
@@ -313,3 +344,26 @@ class RecorderState(StrEnum):
     FULL = "full"
     FAILED = "failed"
     STOPPED = "stopped"
+
+
+class ProcessKind(StrEnum):
+    """The kind of a process."""
+
+    HUB = "hub"
+    SIMULATOR = "simulator"
+    GATEWAY = "gateway"
+    COORDINATOR = "coordinator"
+    RECORDER = "recorder"
+    CONSOLE = "console"
+
+
+class RunState(StrEnum):
+    """The state of one process. ELSEWHERE: another program does its work."""
+
+    WAITING = "waiting"
+    STARTING = "starting"
+    RUNNING = "running"
+    ENDING = "ending"
+    ENDED = "ended"
+    REFUSED = "refused"
+    ELSEWHERE = "elsewhere"

@@ -10,6 +10,7 @@ from fleet.client.reading import MAX_STAMP_AHEAD_S
 from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import ProcessKind, RecorderState, RunState
 
 _EVENT = topics.TOPICS["event/command"]
 
@@ -22,7 +23,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
         each.name: each
         for status in supervisions
         for each in status.processes
-        if each.kind == "gateway" and each.state != "ended"
+        if each.kind == ProcessKind.GATEWAY and each.state != RunState.ENDED
     }
     states: dict[str, dict[str, Any]] = {}
     for expression in ("*/state/*", "*/sensor/battery"):
@@ -32,7 +33,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     commands = _commands(client)
     recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
     if recording is None and (lost := [each.unrecorded for each in supervisions if each.unrecorded]):
-        recording = pb.Recording(state="failed", error=lost[0])
+        recording = pb.Recording(state=RecorderState.FAILED, error=lost[0])
     assignment = next((each.value for each in client.get(f"{client.name}/{keys.COORDINATOR}/assignment")), None)
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {

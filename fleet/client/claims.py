@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from schemas import topics
+from schemas.words import UNKNOWN, Basis, LinkState, Motors
 
 STOPPED: Final = "stopped"
 """First words of a stop that the car's own readings show."""
@@ -21,11 +22,7 @@ NOT_CONFIRMED: Final = "NOT CONFIRMED"
 """First words of a stop that the car could have shown and did not."""
 NOT_STOPPED: Final = "NOT STOPPED"
 """First words of a stop that did not reach a car that may be moving."""
-UNKNOWN: Final = "unknown"
-SHOWN: Final = "shown"
-SENT: Final = "sent"
 NO_GATEWAY: Final = "no gateway"
-OFF: Final = "off"
 _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
@@ -119,9 +116,9 @@ def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
 
 def rest_words(motors: CarClaim, car: str) -> str:
     """Return what a gateway's last claim says of its stop: stopped, stop sent, or not confirmed."""
-    if motors.what != OFF:
+    if motors.what != Motors.OFF:
         return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
-    if motors.basis == SHOWN:
+    if motors.basis == Basis.SHOWN:
         return STOPPED
     return ", ".join(filter(None, (STOP_SENT, motors.why)))
 
@@ -213,9 +210,9 @@ def why_not_ready(link: str, reason: str, waits_for: str) -> str:
 
     What a car has not shown delays no command. link, reason: of `state/link`. waits_for: of `state/safety`.
     """
-    if link == "lost":
+    if link == LinkState.LOST:
         return f"link lost: {reason}" if reason else "link lost"
-    if link == "stale":  # it gets commands all the same
+    if link == LinkState.STALE:  # it gets commands all the same
         return "silent: is it switched on?"
     return f"waits for {waits_for}" if waits_for else ""
 

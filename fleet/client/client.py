@@ -48,6 +48,7 @@ from schemas import keys, messages, topics
 from schemas.bus import Bus, BusError, Failure, Sample, canon
 from schemas.commands import COMMANDS
 from schemas.topics import Qos
+from schemas.words import ProcessKind, Rank, RunState, Scope, Verb
 
 _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
@@ -93,7 +94,7 @@ class Fleet:
         *,
         person: str | None = None,
         sender: str | None = None,
-        kind: str = "script",
+        kind: str = Rank.SCRIPT,
         start_hub: bool = False,
     ) -> None:
         self.name = keys.check_name(name, "fleet name")
@@ -242,7 +243,7 @@ class Fleet:
 
     def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
         """E-stop these cars. Without an argument, e-stop the whole fleet."""
-        return self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
+        return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
         """End the e-stops of these ids. Without ids, end the hold. None: of every car.
@@ -257,7 +258,7 @@ class Fleet:
 
     def unpause(self) -> list[Outcome]:
         """End the pause of the fleet. No car moves."""
-        return self.ask(plain_request("unpause"))
+        return self.ask(plain_request(Verb.UNPAUSE))
 
     def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
         """Lend these cars to a person: until then only that person and leads drive them."""
@@ -343,7 +344,11 @@ class Fleet:
         names: set[str] = set()
         try:
             for status in ask_status(self.bus, self.name, ANSWER_TIMEOUT_S):
-                names |= {each.name for each in status.processes if each.kind == "gateway" and each.state != "ended"}
+                names |= {
+                    each.name
+                    for each in status.processes
+                    if each.kind == ProcessKind.GATEWAY and each.state != RunState.ENDED
+                }
         except messages.BadPayload as error:
             log.warning("a supervisor's status is unreadable: %s", error)
         finally:

@@ -13,6 +13,7 @@ from fleet.client.outcome import Outcome, Progress
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.commands import STOPS
+from schemas.words import Verb
 
 ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
@@ -72,7 +73,7 @@ class PendingCommand:
         self.id = command_id
         self.request = request
         self.queries: list[Future[None]] = []
-        self.is_stop = request.verb in STOPS or request.verb == "pause"
+        self.is_stop = request.verb in STOPS or request.verb == Verb.PAUSE
         self._send_again = send_again
         self._present = set(present)
         self._named = named

@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
+from fleet.client.effects import ESTOP_FLEET, RELEASE
 from fleet.client.outcome import Until
 from schemas import keys, messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Motion, Scope, Verb
 
 R = TypeVar("R")
 
@@ -42,21 +44,21 @@ class CommandRequest:
     @property
     def effect_verb(self) -> str:
         """The verb in `effects.EFFECTS`."""
-        if self.verb == "estop" and self.message.scope == "fleet":
-            return "estop_fleet"
-        return "release" if self.verb == "drive" and self.until is Until.STOPPED else self.verb
+        if self.verb == Verb.ESTOP and self.message.scope == Scope.FLEET:
+            return ESTOP_FLEET
+        return RELEASE if self.verb == Verb.DRIVE and self.until is Until.STOPPED else self.verb
 
     @property
     def detail(self) -> str:
         """The part of the request that the text of its outcome repeats."""
         match self.verb:
-            case "drive":
+            case Verb.DRIVE:
                 return f"{self.duration_s:.1f} s" if self.duration_s >= 1 else f"{self.duration_s:g} s"
-            case "mode" | "light":
+            case Verb.MODE | Verb.LIGHT:
                 return str(getattr(self.message, self.verb))
-            case "speed":
+            case Verb.SPEED:
                 return str(self.message.step)
-            case "fan":
+            case Verb.FAN:
                 return self.message.state or "toggle"
             case _:
                 return ""
@@ -72,22 +74,22 @@ def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) ->
             "to go on, drive again"
         )
     message = pb.DriveCommand(motion=motion, duration_s=duration_s)
-    if motion == "stop":
+    if motion == Motion.STOP:
         message.ttl_s = STOP_TTL_S
-        return CommandRequest("drive", message, Until.STOPPED)
-    return CommandRequest("drive", message, Until.OVER if wait else Until.SENT, duration_s)
+        return CommandRequest(Verb.DRIVE, message, Until.STOPPED)
+    return CommandRequest(Verb.DRIVE, message, Until.OVER if wait else Until.SENT, duration_s)
 
 
 def mode_request(mode: str) -> CommandRequest:
     """Request a mode."""
-    return CommandRequest("mode", pb.ModeCommand(mode=mode))
+    return CommandRequest(Verb.MODE, pb.ModeCommand(mode=mode))
 
 
 def led_request(r: int, g: int, b: int) -> CommandRequest:
     """Request a color of the LED, 0..255 each."""
     for name, value in (("r", r), ("g", g), ("b", b)):
         _check_range(name, value, 255)
-    return CommandRequest("led", pb.LedCommand(r=r, g=g, b=b))
+    return CommandRequest(Verb.LED, pb.LedCommand(r=r, g=g, b=b))
 
 
 def servo_request(servo: str, action: str = "", deg: int | None = None) -> CommandRequest:
@@ -96,7 +98,7 @@ def servo_request(servo: str, action: str = "", deg: int | None = None) -> Comma
     if deg is not None:
         _check_range("deg", deg, 180)
         message.deg = deg
-    return CommandRequest("servo", message)
+    return CommandRequest(Verb.SERVO, message)
 
 
 def arm_request(joint_deg: Sequence[int]) -> CommandRequest:
@@ -105,12 +107,12 @@ def arm_request(joint_deg: Sequence[int]) -> CommandRequest:
         raise ValueError(f"an arm has six joints, {len(joint_deg)} given")
     for number, value in enumerate(joint_deg, start=1):
         _check_range(f"joint {number}", value, 180)
-    return CommandRequest("arm", pb.ArmCommand(joint_deg=joint_deg))
+    return CommandRequest(Verb.ARM, pb.ArmCommand(joint_deg=joint_deg))
 
 
 def light_request(light: str) -> CommandRequest:
     """Request a color of the light, or off."""
-    return CommandRequest("light", pb.LightCommand(light=light))
+    return CommandRequest(Verb.LIGHT, pb.LightCommand(light=light))
 
 
 def plain_request(verb: str, **fields: Any) -> CommandRequest:
@@ -120,47 +122,47 @@ def plain_request(verb: str, **fields: Any) -> CommandRequest:
 
 def speed_request(step: str) -> CommandRequest:
     """Request one speed step up or down."""
-    return CommandRequest("speed", pb.SpeedCommand(step=step))
+    return CommandRequest(Verb.SPEED, pb.SpeedCommand(step=step))
 
 
 def fan_request(state: str | None = None) -> CommandRequest:
     """Request a toggle of the fan, or a state."""
-    return CommandRequest("fan", pb.FanCommand(state=state or ""))
+    return CommandRequest(Verb.FAN, pb.FanCommand(state=state or ""))
 
 
 def lease_request(*, take: bool = False, release: bool = False) -> CommandRequest:
     """Request a lease for 2 s, or its release. take: as a person, take the car over from another person."""
-    return CommandRequest("lease", pb.LeaseCommand(release=release), take=take)
+    return CommandRequest(Verb.LEASE, pb.LeaseCommand(release=release), take=take)
 
 
 def stop_request() -> CommandRequest:
     """Request a stop and a hold against the coordinator."""
-    return CommandRequest("stop", pb.StopCommand(), Until.STOPPED)
+    return CommandRequest(Verb.STOP, pb.StopCommand(), Until.STOPPED)
 
 
 def estop_request(why: str, scope: str) -> CommandRequest:
     """Request an e-stop. scope: car or fleet."""
-    return CommandRequest("estop", pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
+    return CommandRequest(Verb.ESTOP, pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
     """Request the end of the e-stops of these ids. Without ids, request the end of the hold. everything: of both."""
-    return CommandRequest("resume", pb.ResumeCommand(ids=ids, all=everything))
+    return CommandRequest(Verb.RESUME, pb.ResumeCommand(ids=ids, all=everything))
 
 
 def pause_request(why: str = "") -> CommandRequest:
     """Request a stop, and a pause of the whole fleet."""
-    return CommandRequest("pause", pb.PauseCommand(why=why), Until.STOPPED)
+    return CommandRequest(Verb.PAUSE, pb.PauseCommand(why=why), Until.STOPPED)
 
 
 def lend_request(to: str, duration_s: float) -> CommandRequest:
     """Request that of all persons and scripts only this person and leads drive the car, for `duration_s`."""
-    return CommandRequest("lend", pb.LendCommand(to=keys.check_name(to, "person"), duration_s=duration_s))
+    return CommandRequest(Verb.LEND, pb.LendCommand(to=keys.check_name(to, "person"), duration_s=duration_s))
 
 
 def end_loan_request() -> CommandRequest:
     """Request the end of a loan."""
-    return CommandRequest("lend", pb.LendCommand(end=True))
+    return CommandRequest(Verb.LEND, pb.LendCommand(end=True))
 
 
 def _check_range(name: str, value: int, top: int) -> None:
@@ -216,7 +218,7 @@ class CarCommands(ABC, Generic[R]):
 
     def whistle(self) -> R:
         """Sound once."""
-        return self.do(plain_request("whistle"))
+        return self.do(plain_request(Verb.WHISTLE))
 
     def speed(self, step: str) -> R:
         """Change the speed by one step `up` or `down`: the car has no absolute speed."""
@@ -232,7 +234,7 @@ class CarCommands(ABC, Generic[R]):
 
     def estop(self, why: str = "") -> R:
         """E-stop this car."""
-        return self.do(estop_request(why, "car"))
+        return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
         """End the e-stops of these ids. Without ids, end the hold. everything: end all that this sender may end."""
@@ -248,4 +250,4 @@ class CarCommands(ABC, Generic[R]):
 
     def find(self) -> R:
         """Blink and beep, without moving."""
-        return self.do(plain_request("find"))
+        return self.do(plain_request(Verb.FIND))

@@ -13,6 +13,7 @@ from fleet.client.services import why_unrecorded
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import name_of
 from schemas.local_time import clock
+from schemas.words import BatteryLevel, CarTrust, LinkState, Mode, Phase, Platform, Reason, Shows, Verdict
 
 RECENT_COMMAND_S: Final = 600.0
 """Maximum age of a command that `fleet doctor` looks at."""
@@ -33,10 +34,10 @@ _OUT_OF_RANGE: Final = {
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are no rejected frames."""
-FAILED_PHASES: Final = ("rejected", "failed", "expired")
+FAILED_PHASES: Final = (Phase.REJECTED, Phase.FAILED, Phase.EXPIRED)
 """Phases of a command that was not carried out."""
-_CARRIED_OUT: Final = ("sent", "effect_seen", "complete")
-_NO_TROUBLE: Final = ("superseded", "duplicate")
+_CARRIED_OUT: Final = (Phase.SENT, Phase.EFFECT_SEEN, Phase.COMPLETE)
+_NO_TROUBLE: Final = (Reason.SUPERSEDED, Reason.DUPLICATE)
 """Reasons of commands that ended early as somebody intended."""
 
 
@@ -130,14 +131,14 @@ def _hung(e: CarEvidence) -> str:
 
 def _adapter_full(e: CarEvidence) -> str:
     link = e.of("state/link")
-    if link is None or link.state != "lost" or ADAPTER_FULL not in link.reason:
+    if link is None or link.state != LinkState.LOST or ADAPTER_FULL not in link.reason:
         return ""
     return f"Adapter full: {link.reason}."
 
 
 def _lost(e: CarEvidence) -> str:
     link = e.of("state/link")
-    if link is None or link.state != "lost" or _adapter_full(e):
+    if link is None or link.state != LinkState.LOST or _adapter_full(e):
         return ""
     return f"The link has been lost for {link.since_s:.0f} s: {link.reason or 'no reason is known'}."
 
@@ -152,7 +153,7 @@ def _contradicted(e: CarEvidence) -> str:
 def _doubted(e: CarEvidence) -> str:
     safety, health = e.of("state/safety"), e.of("state/health")
     doubted = health is not None and health.doubted
-    if not doubted and (safety is None or safety.trust != "unproven"):
+    if not doubted and (safety is None or safety.trust != CarTrust.UNPROVEN):
         return ""
     if not doubted:
         return "Its reports do not show its last stop yet. Look at the car: it may be moving."
@@ -171,8 +172,8 @@ def _out_of_range(e: CarEvidence) -> str:
 
 def _silent(e: CarEvidence) -> bool:
     link, safety = e.of("state/link"), e.of("state/safety")
-    stale = link is not None and link.state in ("stale", "quiet")
-    return stale and (link.state == "stale" or (safety is not None and safety.trust == "unheard"))
+    stale = link is not None and link.state in (LinkState.STALE, LinkState.QUIET)
+    return stale and (link.state == LinkState.STALE or (safety is not None and safety.trust == CarTrust.UNHEARD))
 
 
 def _fan_runs(e: CarEvidence) -> bool:
@@ -237,21 +238,21 @@ def _paused(e: CarEvidence) -> str:
 
 def _lent(e: CarEvidence) -> str:
     safety = e.of("state/safety")
-    if safety is None or not safety.HasField("loan") or not any(event.reason == "lent" for _, event in e.failed):
+    if safety is None or not safety.HasField("loan") or not any(event.reason == Reason.LENT for _, event in e.failed):
         return ""
     return f"It is lent to {safety.loan.to} by {_who(safety.loan, safety.loan.since)}, so others are refused."
 
 
 def _other_mode(e: CarEvidence) -> str:
     mode = e.of("state/mode")
-    if mode is None or mode.verdict != "contradicted":
+    if mode is None or mode.verdict != Verdict.CONTRADICTED:
         return ""
     return f"It should be in mode {mode.asked} and is probably in {mode.inferred}: {mode.evidence}."
 
 
 def _weak(e: CarEvidence) -> str:
     battery = e.of("sensor/battery")
-    if battery is None or battery.level not in ("low", "critical"):
+    if battery is None or battery.level not in (BatteryLevel.LOW, BatteryLevel.CRITICAL):
         return ""
     return f"The battery is {battery.level} ({battery.voltage_v:.2f} V). Motors may not start, and the car may reset."
 
@@ -265,7 +266,7 @@ def _held(e: CarEvidence) -> str:
 
 def _leased(e: CarEvidence) -> str:
     safety = e.of("state/safety")
-    refused = any(event.reason == "leased" for _, event in e.failed)
+    refused = any(event.reason == Reason.LEASED for _, event in e.failed)
     if safety is None or not safety.HasField("lease") or not refused:
         return ""
     return f"{name_of(safety.lease.holder)} ({safety.lease.kind}) drives it, so others are refused."
@@ -303,7 +304,7 @@ def _refused(e: CarEvidence) -> str:
         return ""
     age, event = e.failed[-1]
     mode = e.of("state/mode")
-    is_over = event.reason == "wrong_mode" and mode is not None and mode.asked == "manual"
+    is_over = event.reason == Reason.WRONG_MODE and mode is not None and mode.asked == Mode.MANUAL
     # Or the car has done since then what was refused.
     if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
         return ""
@@ -414,7 +415,7 @@ def describe_reports(health: Any) -> str:
         rhythm = f"every {health.interval_s:.2f} s (spread {health.interval_spread_s:.2f} s{blocks}); "
     words = f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
     # The reports of most arduino programs react, if the frames arrive.
-    is_odd = health.shows_stops == "no" and health.platform.partition("+")[0] == "arduino"
+    is_odd = health.shows_stops == Shows.NO and health.platform.partition("+")[0] == Platform.ARDUINO
     return f"{words}. If it obeys nothing: look at the wire to its RX pin" if is_odd else words
 
 

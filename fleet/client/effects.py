@@ -3,56 +3,66 @@
 from typing import Final
 
 from fleet.client.claims import NOT_CONFIRMED, STOP_SENT, STOPPED
-from schemas.commands import COMMANDS
+from schemas.commands import COMMANDS, STOPS
+from schemas.words import Basis, Phase, Reason, Verb
 
 _ANY: Final = "*"
+UNCONFIRMED: Final = "unconfirmed"
+"""The result of a stop or a drive whose basis is `sent`."""
+RELEASE: Final = "release"
+ESTOP_FLEET: Final = "estop_fleet"
+"""Verbs of this module: a drive with motion stop, and an e-stop of all cars."""
 _ESTOP: Final[dict[str, str]] = {
-    "shown": "emergency-stopped ({took_s:.1f} s)",
-    "complete": "emergency-stopped ({took_s:.1f} s)",
-    "unconfirmed": "emergency stop sent, {words}",
-    "sent": "emergency stop sent",
+    Basis.SHOWN: "emergency-stopped ({took_s:.1f} s)",
+    Phase.COMPLETE: "emergency-stopped ({took_s:.1f} s)",
+    UNCONFIRMED: "emergency stop sent, {words}",
+    Phase.SENT: "emergency stop sent",
 }
 _STOP: Final[dict[str, str]] = {
-    "shown": f"{STOPPED} ({{took_s:.1f}} s)",
-    "complete": f"{STOPPED} ({{took_s:.1f}} s)",
-    "unconfirmed": f"{STOP_SENT}, {{words}}",
-    "sent": STOP_SENT,
+    Basis.SHOWN: f"{STOPPED} ({{took_s:.1f}} s)",
+    Phase.COMPLETE: f"{STOPPED} ({{took_s:.1f}} s)",
+    UNCONFIRMED: f"{STOP_SENT}, {{words}}",
+    Phase.SENT: STOP_SENT,
 }
 
 EFFECTS: Final[dict[str, dict[str, str]]] = {
-    **{verb: {"sent": row.effect} for verb, row in COMMANDS.items() if row.effect},
-    "drive": {
-        "shown": "drove{detail}",
-        "complete": "drive over{detail}",
-        "unconfirmed": "{words}",
-        "sent": "drive sent,{detail}",
+    **{verb: {Phase.SENT: row.effect} for verb, row in COMMANDS.items() if row.effect},
+    Verb.DRIVE: {
+        Basis.SHOWN: "drove{detail}",
+        Phase.COMPLETE: "drive over{detail}",
+        UNCONFIRMED: "{words}",
+        Phase.SENT: "drive sent,{detail}",
     },
-    "release": {"shown": STOPPED, "unconfirmed": f"{STOP_SENT}, {{words}}", "sent": "nothing to stop"},
-    "stop": _STOP,
-    "estop": _ESTOP,
-    "estop_fleet": _ESTOP,
-    "resume": {"sent": "{words}", "estopped": "{words}", "held": "{words}"},
-    "pause": _STOP,
+    RELEASE: {Basis.SHOWN: STOPPED, UNCONFIRMED: f"{STOP_SENT}, {{words}}", Phase.SENT: "nothing to stop"},
+    Verb.STOP: _STOP,
+    Verb.ESTOP: _ESTOP,
+    ESTOP_FLEET: _ESTOP,
+    Verb.RESUME: {Phase.SENT: "{words}", Reason.ESTOPPED: "{words}", Reason.HELD: "{words}"},
+    Verb.PAUSE: _STOP,
     _ANY: {
-        "complete": "done",
-        "sent": "sent",
-        "rejected": "refused: {words}",
-        "superseded": "ended early: {words}",
-        "expired": "not done: {words}",
-        "failed": "failed: {words}",
+        Phase.COMPLETE: "done",
+        Phase.SENT: "sent",
+        Phase.REJECTED: "refused: {words}",
+        Phase.SUPERSEDED: "ended early: {words}",
+        Phase.EXPIRED: "not done: {words}",
+        Phase.FAILED: "failed: {words}",
     },
 }
-"""Effect of a command, by verb and result. `release` is a drive with motion stop, `estop_fleet` an e-stop of all."""
+"""Effect of a command, by verb and result."""
 NEXT_STEPS: Final = {
-    "estop": "Release it with `fleet resume {car} --estops`",
-    "estop_fleet": "One release frees all cars: `fleet resume --estops`",
-    "pause": "Paused until `fleet unpause`",
+    Verb.ESTOP: "Release it with `fleet resume {car} --estops`",
+    ESTOP_FLEET: "One release frees all cars: `fleet resume --estops`",
+    Verb.PAUSE: "Paused until `fleet unpause`",
 }
 """End of the text of a command that was carried out, by verb."""
 
-_STOP_FAILURES: Final = {"not_shown": f"{STOP_SENT}, {{words}}", "rejected": "{words}", "failed": "{words}"}
+_STOP_FAILURES: Final = {
+    Reason.NOT_SHOWN: f"{STOP_SENT}, {{words}}",
+    Phase.REJECTED: "{words}",
+    Phase.FAILED: "{words}",
+}
 """The gateway's words of a stop that failed begin with the fact for the car."""
-STOP_VERBS: Final = frozenset({"stop", "estop", "estop_fleet", "pause", "release"})
+STOP_VERBS: Final = frozenset({*STOPS, Verb.PAUSE, RELEASE, ESTOP_FLEET})
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:
@@ -60,7 +70,7 @@ def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, word
     tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
     template = next((table[result] for result in results for table in tables if result in table), "{words}")
     shown = f" {detail}" if detail else ""
-    if "not_shown" in results and not words.startswith("NOT "):
+    if Reason.NOT_SHOWN in results and not words.startswith("NOT "):
         words = f"{NOT_CONFIRMED}: {car} {words}"
     text = template.format(car=car, detail=shown, words=words, took_s=took_s).removesuffix(": ").removesuffix(", ")
     return f"{text} ({words})" if words and "{words}" not in template else text

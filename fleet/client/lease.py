@@ -12,6 +12,7 @@ from fleet.client.commands import drive_request, lease_request
 from fleet.client.outcome import OUTCOME_MARGIN_S, LeaseLost, NotCarriedOut, Outcome
 from schemas import keys, messages
 from schemas.bus import BusError, Sample
+from schemas.words import Motion, Phase, Reason
 
 if TYPE_CHECKING:
     from fleet.client.client import Fleet, LeasedCar
@@ -20,7 +21,7 @@ LEASE_RENEWAL_INTERVAL_S: Final = 0.8
 """Interval of renewals. A lease expires after 2 s, so one renewal may be lost."""
 SAFETY_RETRY_DELAY_S: Final = 0.2
 """Delay before a gateway that did not answer is queried again."""
-_STOP_NOT_NEEDED: Final = frozenset({"leased", "lent", "paused", "estopped", "superseded"})
+_STOP_NOT_NEEDED: Final = frozenset({Reason.LEASED, Reason.LENT, Reason.PAUSED, Reason.ESTOPPED, Reason.SUPERSEDED})
 """Reasons that make the final stop unnecessary: another sender has the car, or has stopped it."""
 
 
@@ -62,7 +63,7 @@ class LeaseMonitor:
 
     def on_outcome(self, outcome: Outcome) -> None:
         """Handle the outcome of a command of ours."""
-        if outcome.reason in ("leased", "lent", "paused"):
+        if outcome.reason in (Reason.LEASED, Reason.LENT, Reason.PAUSED):
             self.lost = self.lost or outcome.words
 
 
@@ -113,7 +114,7 @@ class Lease:
         if outcome.ok:
             return outcome
         self._monitor.on_outcome(outcome)
-        if outcome.reason == "superseded":  # the message with the new holder may not have arrived
+        if outcome.reason == Reason.SUPERSEDED:  # the message with the new holder may not have arrived
             self._query()
         if self._monitor.lost:
             raise LeaseLost(outcome, self._monitor.lost)
@@ -123,12 +124,14 @@ class Lease:
         """Raise LeaseLost if the lease is lost: leave the car to its new holder."""
         if self._monitor.lost:
             lost = self._monitor.lost
-            raise LeaseLost(Outcome(self._name, ok=False, phase="rejected", reason="leased", words=lost), lost)
+            raise LeaseLost(
+                Outcome(self._name, ok=False, phase=str(Phase.REJECTED), reason=str(Reason.LEASED), words=lost), lost
+            )
 
     def _release(self, error: BaseException | None) -> None:
         if self._monitor.lost:
             return
-        (stopped,) = self._fleet.ask(drive_request("stop"), [self._name])
+        (stopped,) = self._fleet.ask(drive_request(Motion.STOP), [self._name])
         self._fleet.ask(lease_request(release=True), [self._name])
         if stopped.ok or stopped.reason in _STOP_NOT_NEEDED:
             return

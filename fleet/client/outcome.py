@@ -5,20 +5,18 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Self
 
-from fleet.client.effects import NEXT_STEPS, STOP_VERBS, describe, with_code
+from fleet.client.effects import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
 from schemas.suggestion import did_you_mean
+from schemas.words import Basis, Phase, Reason
 
-QUEUED: Final = "queued"
-SENT: Final = "sent"
-COMPLETE: Final = "complete"
 NO_ANSWER: Final = "no_answer"
 NO_RESULT: Final = "no_result"
 """The code of a command whose last event is missing."""
-_STAYS: Final = ("estopped", "held")
+_STAYS: Final = (Reason.ESTOPPED, Reason.HELD)
 """Reasons of a resume after which the car is still stopped."""
 _SENT_FOR: Final = "sent for "
 """First words of the gateway about a drive that went as requested; its time follows."""
-_FAILED_PHASES: Final = frozenset({"superseded", "expired", "failed", "rejected"})
+_FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 OUTCOME_MARGIN_S: Final = 5.0
 """Margin of the timeouts for a command's last event."""
@@ -88,7 +86,7 @@ class Outcome:
 
     def __str__(self) -> str:
         text = self.effect or self.words or self.phase
-        if self.ok and self.basis == "sent" and self.worst_case_s is not None:
+        if self.ok and self.basis == Basis.SENT and self.worst_case_s is not None:
             text += f"; motors off within {self.worst_case_s:.1f} s if the frames arrived"
         if self.next_step:
             text += f". {self.next_step}"
@@ -173,19 +171,19 @@ class Progress:
             self.outcome = replace(self.outcome, worst_case_s=self._worst_case_s or None)
         self._note(status, reason, words, at)
         # If no motors had to be stopped, `sent` without a worst case is final: there will be no `complete`.
-        if status == SENT and self._until is Until.STOPPED and worst_case_s == 0:
-            self._end(SENT, reason, words, at, ok=True)
+        if status == Phase.SENT and self._until is Until.STOPPED and worst_case_s == 0:
+            self._end(Phase.SENT, reason, words, at, ok=True)
 
     def on_event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float, basis: str = "") -> None:
         """Handle one `event/command`. Only the last event of a stop or a drive has a basis."""
-        if phase == SENT and self._queued and not self._sent_event and self._until is Until.OVER:
+        if phase == Phase.SENT and self._queued and not self._sent_event and self._until is Until.OVER:
             self._timeout_from = at
-        self._sent_event = self._sent_event or phase == SENT
+        self._sent_event = self._sent_event or phase == Phase.SENT
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
         self._basis = basis
-        if basis and phase == SENT:
+        if basis and phase == Phase.SENT:
             self._last_event_at = at
-            self._end(SENT, reason, words, at, ok=True)
+            self._end(Phase.SENT, reason, words, at, ok=True)
         self._note(phase, reason, words, at)
 
     def on_missing(self, present: Sequence[str], at: float) -> None:
@@ -247,8 +245,8 @@ class Progress:
             self._end(self._phase, "", words, at, ok=False)
             return
         if self._joined:
-            self._basis = "sent"
-            self._end(SENT, "", "the running drive was extended", at, ok=True)
+            self._basis = Basis.SENT
+            self._end(Phase.SENT, "", "the running drive was extended", at, ok=True)
             return
         words = (
             f"It is unknown what {self.car} does: no result after {at - self._asked_at:.1f} s "
@@ -260,22 +258,22 @@ class Progress:
         if not self.answered and at - self._asked_at > LATE_ANSWER_S:
             self._timeout_from = at
         self._last_event_at = at
-        self._queued = self._queued or phase == QUEUED
-        if phase == QUEUED and not self._sent_event:
+        self._queued = self._queued or phase == Phase.QUEUED
+        if phase == Phase.QUEUED and not self._sent_event:
             self.waits = words or self.waits
-        elif phase != "asked":
+        elif phase != Phase.ASKED:
             self.waits = ""
-        if self._phase not in (SENT, COMPLETE) or phase not in ("asked", QUEUED):
+        if self._phase not in (Phase.SENT, Phase.COMPLETE) or phase not in (Phase.ASKED, Phase.QUEUED):
             self._phase = phase
         if phase in _FAILED_PHASES:
             self._end(phase, reason, words, at, ok=False)
-        elif phase == COMPLETE or (phase == SENT and self._until is Until.SENT):
+        elif phase == Phase.COMPLETE or (phase == Phase.SENT and self._until is Until.SENT):
             self._end(phase, reason, words, at, ok=reason not in _STAYS)
 
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
             took_s = at - self._asked_at
-            done = {"shown": "shown", "sent": "unconfirmed"}.get(self._basis, phase)
+            done = UNCONFIRMED if self._basis == Basis.SENT else self._basis or phase
             has_time = self._until is Until.OVER and words.startswith(_SENT_FOR)
             effect = describe(
                 self._verb,
@@ -285,11 +283,13 @@ class Progress:
                 words=words,
                 took_s=took_s,
             )
-            if has_time and done == "shown":
+            if has_time and done == Basis.SHOWN:
                 effect = f"drove {words.removeprefix(_SENT_FOR)}"
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
             # Of what was done, the gateway says only what is odd about it, often nothing. The effect has that, too.
             told = (effect or words) if ok else (words or effect)
             told = told or f"{self._verb or 'command'} {phase}"
-            self.outcome = Outcome(self.car, ok, phase, reason, told, worst_case_s, took_s, self._basis, effect, after)
+            self.outcome = Outcome(
+                self.car, ok, str(phase), str(reason), told, worst_case_s, took_s, str(self._basis), effect, after
+            )

@@ -8,6 +8,7 @@ from fleet.client.client import Fleet
 from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure
+from schemas.words import RecorderState
 
 RECORDER_TIMEOUT_S: Final = 15.0
 """Timeout for the recorder's answer. It may have to wait for the disk."""
@@ -32,7 +33,7 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
 
 def why_unrecorded(status: Any) -> str:
     """Return why the recorder of this fleet.v1.Recording writes nothing now. Empty if it records, or was stopped."""
-    if status.state not in ("full", "failed"):
+    if status.state not in (RecorderState.FULL, RecorderState.FAILED):
         return ""
     return status.error or status.warning or f"the recorder is {status.state}"
 

@@ -23,11 +23,10 @@ from fleet.commands.options import carry_out, json_option, take_option, with_cli
 from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, missing_words
 from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled
-from schemas.words import Light, SpeedStep
+from schemas.words import FanState, Light, Servo, SpeedStep
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings with which -1 is a wrong value and not an unknown option."""
-_FAN_STATES: Final = ("on", "off")
 _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
@@ -45,14 +44,14 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Comman
     """Return the request for an action of the servo. Reject a wrong action before any query."""
     servo = ctx.params["servo"]
     if action is None or not re.fullmatch("[0-9]+", action):
-        allowed = ("up", "down", "reset") if servo == "vertical" else ("left", "right", "reset")
-        words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo == 'front' else ''}"
+        allowed = ("up", "down", "reset") if servo == Servo.VERTICAL else ("left", "right", "reset")
+        words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo == Servo.FRONT else ''}"
         if action is None:
             raise click.BadParameter(f"name what to do with {words}, as: fleet servo red {servo} {allowed[0]}")
         if action not in allowed:
             raise click.BadParameter(f"{action!r} is not allowed for {words}")
         return servo_request(servo, action)
-    if servo != "front":
+    if servo != Servo.FRONT:
         raise click.BadParameter(f"{action!r} is not allowed: servo {servo} takes no degrees, only front does")
     try:
         return servo_request(servo, deg=int(action))
@@ -78,7 +77,7 @@ def _arm(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tupl
 
 def _fan(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[tuple[str, ...], CommandRequest]:
     """Split the words into cars and the state, if there is one. Return the cars and the request."""
-    state = words[-1] if len(words) > 1 and words[-1] in _FAN_STATES else None
+    state = words[-1] if len(words) > 1 and words[-1] in tuple(FanState) else None
     cars = words[:-1] if state else words
     if not cars:
         raise click.UsageError(missing_words(ctx), ctx)
@@ -114,7 +113,7 @@ def light(client: Fleet, cars: tuple[str, ...], request: CommandRequest, *, as_j
     context_settings=_NEGATIVE_NUMBERS,
 )
 @cars_argument
-@click.argument("servo", type=Choice("servo", ("front", "vertical", "horizontal")))
+@click.argument("servo", type=Choice("servo", Servo))
 @click.argument("request", metavar="ACTION", callback=_servo)
 @take_option
 @json_option
@@ -165,7 +164,7 @@ def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_jso
 def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
     """Switch the fan. Cars only know "toggle", so `on` and `off` work only if its state is known."""
     cars, request = cars_and_request
-    if cars[1:] and (near := misspelled(cars[-1], _FAN_STATES)) and cars[-1] not in client.cars():
+    if cars[1:] and (near := misspelled(cars[-1], FanState)) and cars[-1] not in client.cars():
         raise click.UsageError(f'"{cars[-1]}" is neither a connected car nor on or off. Did you mean {near[0]}?')
     carry_out(client, request, cars, take=take, as_json=as_json)
 

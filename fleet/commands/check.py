@@ -28,7 +28,7 @@ from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
 from schemas import bus
-from schemas.words import Platform
+from schemas.words import Platform, Rank
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text
 
@@ -212,7 +212,7 @@ def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
     with cli_errors():
         if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
             return {}
-        with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
+        with Fleet(fleet.endpoint, fleet.name, kind=Rank.PERSON) as client:
             urls = {each.value.car: each.value.link for each in client.get("*/state/health")}
             links = [each.value for each in client.get("*/state/link")]
             return {link.car: (link.state, link.reason, urls.get(link.car, "")) for link in links}

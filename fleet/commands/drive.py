@@ -29,7 +29,7 @@ from fleet.commands.options import (
 )
 from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
 from schemas.process import signals, startup
-from schemas.words import Mode, Motion
+from schemas.words import Mode, Motion, Scope
 
 _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 
@@ -43,7 +43,7 @@ examples:
   fleet drive red forward --take   # another person drives it: take it over"""
 )
 @cars_argument
-@click.argument("motion", type=Choice("motion", _MOTIONS, {"stop": "To stop cars, write: fleet stop red"}))
+@click.argument("motion", type=Choice("motion", _MOTIONS, {Motion.STOP: "To stop cars, write: fleet stop red"}))
 @click.option(
     "--for",
     "duration_s",
@@ -62,7 +62,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
         try:
             outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), named)
         except KeyboardInterrupt:
-            print_outcomes(client.ask(drive_request("stop"), named), as_json=as_json)
+            print_outcomes(client.ask(drive_request(Motion.STOP), named), as_json=as_json)
             raise SystemExit(startup.INTERRUPTED) from None
     end_with(client, outcomes, as_json=as_json)
 
@@ -105,7 +105,13 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
     Of several fleets on one bus, every one that could be meant. `fleet resume --estops` releases them. `fleet stop` is
     for every day: cars obey again at once.
     """
-    _stop(connect, fleet, cars, lambda named: estop_request(why, "fleet" if named is None else "car"), as_json=as_json)
+    _stop(
+        connect,
+        fleet,
+        cars,
+        lambda named: estop_request(why, Scope.FLEET if named is None else Scope.CAR),
+        as_json=as_json,
+    )
 
 
 def _stop(

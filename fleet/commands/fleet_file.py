@@ -20,6 +20,7 @@ from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas import keys
 from schemas.atomic_file import write_atomically
+from schemas.words import Platform
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, Entry, schema_of
 from schemas.yaml_document.messages import list_words
@@ -130,7 +131,7 @@ def init(
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")
     if simulated:
-        cars = [_new_car(index, LINK_SIM, "arduino") for index in range(simulated)]
+        cars = [_new_car(index, LINK_SIM, Platform.ARDUINO) for index in range(simulated)]
         write(plan, format_new_plan(simulated))
     else:
         found = look_for(links, seconds)

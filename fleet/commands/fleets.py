@@ -13,6 +13,7 @@ from fleet.client.supervision import fleets_on
 from fleet.commands.group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
 from fleet.commands.params import ALL_CARS
 from schemas.bus import Bus
+from schemas.words import Rank
 
 
 def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
@@ -42,7 +43,7 @@ def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
 
 def client_in(connect: str | None, fleet: str) -> Fleet:
     """Open the client of the person whom --as or FLEET_AS names, in exactly this fleet."""
-    return Fleet(connect, fleet, kind="person", person=chosen_person())
+    return Fleet(connect, fleet, kind=Rank.PERSON, person=chosen_person())
 
 
 def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fleet:

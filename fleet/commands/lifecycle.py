@@ -24,6 +24,7 @@ from schemas import keys, messages
 from schemas.bus import Bus, BusError, messages_of, resolve_endpoint
 from schemas.process import signals, startup
 from schemas.suggestion import did_you_mean
+from schemas.words import Phase, RunState
 
 FLEET_DOWN_TIMEOUT_S: Final = 120.0
 """Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
@@ -93,11 +94,11 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         sender = default_sender(chosen_person())
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
             raise not_running(fleet)
-        if answer.status == "rejected":
+        if answer.status == Phase.REJECTED:
             raise click.ClickException(answer.words)
         last, gone = _until_ended(bus, fleet, received)
     results = dict(last.became) if last is not None else {}
-    ended = last is not None and last.state == "ended"
+    ended = last is not None and last.state == RunState.ENDED
     bad = sorted(car for car, words in results.items() if is_bad_rest(words))
     unrecorded = last.unrecorded if last is not None else ""
     if as_json:
@@ -122,7 +123,7 @@ def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:
     while time.monotonic() < deadline and not gone:
         if len(received) != count:
             count, seen = len(received), time.monotonic()
-            if received[-1].state == "ended":
+            if received[-1].state == RunState.ENDED:
                 break
         elif bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
             seen = time.monotonic()
@@ -151,8 +152,8 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     if as_json:
         click.echo(messages.to_json(answer))
     else:
-        say(answer.words, err=answer.status != "sent")
-    raise SystemExit({"rejected": 2, "failed": 1}.get(answer.status, 0))
+        say(answer.words, err=answer.status != Phase.SENT)
+    raise SystemExit({Phase.REJECTED: 2, Phase.FAILED: 1}.get(answer.status, 0))
 
 
 def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:

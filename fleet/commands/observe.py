@@ -38,6 +38,7 @@ from schemas import keys, topics
 from schemas.bus import Sample, intersects
 from schemas.colors import car_color, hex_color
 from schemas.suggestion import did_you_mean
+from schemas.words import LinkState, Motors, Shows
 
 CAR_COLUMNS: Final = (
     "car",
@@ -55,7 +56,7 @@ CAR_COLUMNS: Final = (
 )
 OPTIONAL_CAR_COLUMNS: Final = ("platform", "shows stops", "verdict", "driver", "motion", "motors", "ready")
 """Columns that a narrow terminal leaves out, in this order."""
-_SHOWS: Final = {"yes": "yes", "no": "no", "not_known_yet": "not known"}
+_SHOWS: Final = {Shows.YES: "yes", Shows.NO: "no", Shows.UNKNOWN: "not known"}
 _KEY_COLUMNS: Final = ("key", "type", "unit", "rate", "age")
 _DAY_S: Final = 86_400.0
 _UNHEARD_S: Final = 3.0
@@ -164,9 +165,9 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
 
 def _unheard(link: str, last_rx_s: float | None, motors: str) -> bool:
     """Return True if the link is open and the car is silent: stale, without any byte, or unknown for too long."""
-    if link == "lost":
+    if link == LinkState.LOST:
         return False
-    return link == "stale" or last_rx_s is None or (motors == "unknown" and last_rx_s > _UNHEARD_S)
+    return link == LinkState.STALE or last_rx_s is None or (motors == Motors.UNKNOWN and last_rx_s > _UNHEARD_S)
 
 
 def shown(name: str, row: Mapping[str, Any]) -> str:

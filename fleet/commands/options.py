@@ -18,6 +18,7 @@ from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_
 from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
+from schemas.words import Reason
 
 _Function = Callable[..., Any]
 
@@ -109,7 +110,7 @@ def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Ne
     failed = [outcome for outcome in outcomes if not outcome.ok]
     if all(outcome.phase == NO_ANSWER for outcome in outcomes) and (words := describe_other_fleets(client)):
         click.echo(words, err=True)  # --fleet may be wrong
-    wrong = bool(failed) and all(outcome.reason == "bad_value" for outcome in failed)
+    wrong = bool(failed) and all(outcome.reason == Reason.BAD_VALUE for outcome in failed)
     raise SystemExit(2 if wrong else 1 if failed else 0)
 
 

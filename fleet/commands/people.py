@@ -6,6 +6,7 @@ from fleet.client.client import Fleet
 from fleet.commands.options import end_with, json_option, with_client
 from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
 from schemas.commands import COMMANDS
+from schemas.words import Verb
 
 
 @click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")
@@ -39,7 +40,7 @@ examples:
 @click.option(
     "--for",
     "duration_s",
-    type=Duration(COMMANDS["lend"].max_duration_s),
+    type=Duration(COMMANDS[Verb.LEND].max_duration_s),
     help="For how long, such as 10m; at most 24h.",
 )
 @click.option("--end", is_flag=True, help="End the loan now. A car that the borrower drives is stopped.")

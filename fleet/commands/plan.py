@@ -25,6 +25,7 @@ from schemas import keys
 from schemas.bus import Failure
 from schemas.local_time import clock
 from schemas.suggestion import did_you_mean
+from schemas.words import Phase, Reason, RunState
 
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
 """Subcommands whose imports would slow down all others."""
@@ -197,7 +198,11 @@ def show(client: Fleet, *, as_json: bool) -> None:
         click.echo(json.dumps(whole))
         return
     by = f", set by {keys.name_of(in_force.set_by)}" if in_force.set_by else ""
-    state = f"stopped by {keys.name_of(stopped_by)}. `fleet plan restart` starts it again" if stopped_by else "running"
+    state = (
+        f"stopped by {keys.name_of(stopped_by)}. `fleet plan restart` starts it again"
+        if stopped_by
+        else RunState.RUNNING
+    )
     say(f"Plan {in_force.version}{by}: {state}.")
     if plan.phases:
         click.echo(f"phase: {phase or '-'} (of {', '.join(plan.phases)})")
@@ -245,7 +250,7 @@ def _request(client: Fleet, verb: str, plan_text: str = "", *, as_json: bool, so
         raise click.ClickException(_no_plan(client))
     if isinstance(result, Failure):
         raise click.ClickException(result.words)
-    ok, wrong = result.status == "sent", result.reason == "bad_value"
+    ok, wrong = result.status == Phase.SENT, result.reason == Reason.BAD_VALUE
     words = re.sub("^plan:", f"{source}:", result.words, flags=re.MULTILINE)
     if as_json:
         click.echo(json.dumps({"status": result.status, "reason": result.reason, "words": words}))

@@ -17,6 +17,7 @@ from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
+from schemas.words import Rank
 from schemas.yaml_document.document import read_text
 
 
@@ -79,7 +80,7 @@ def run(
     def on_decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else line(decision))
 
-    with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
+    with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind=Rank.COORDINATOR, start_hub=True) as client:
         try:
             Coordinator(
                 client,

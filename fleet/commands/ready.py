@@ -14,6 +14,7 @@ from schemas import keys
 from schemas.bus import Bus, BusError, messages_of
 from schemas.suggestion import nearest
 from schemas.topics import Qos
+from schemas.words import RunState
 
 READY_WAIT_S: Final = 30.0
 """Default timeout of `fleet wait --ready`."""
@@ -63,7 +64,7 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
         cars = [process.name for process in status.processes if not process.name.startswith("@")]
         missing = dict(status.missing)
         cars += [name for name in missing if name not in cars and not name.startswith("@")]
-        if status.state != "running":
+        if status.state != RunState.RUNNING:
             return cars, dict.fromkeys(cars, f"the fleet is {status.state}")
         return cars, missing
     rows = {key.rpartition("/")[2]: CarStatus(key.rpartition("/")[2]) for key in bus.tokens(keys.car_token(fleet, "*"))}

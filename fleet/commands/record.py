@@ -20,6 +20,7 @@ from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
+from schemas.words import RecorderVerb
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -260,7 +261,7 @@ def _show_status(found: Any, *, as_json: bool) -> None:
 @bus_options
 def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Start a new session after `fleet record stop`."""
-    _show_status(_query("start", connect, fleet), as_json=as_json)
+    _show_status(_query(RecorderVerb.START, connect, fleet), as_json=as_json)
 
 
 @record.command(epilog="\b\nexample:\n  fleet record stop")
@@ -268,7 +269,7 @@ def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Close the session. The recorder keeps running and waits for `fleet record start`."""
-    _show_status(_query("stop", connect, fleet), as_json=as_json)
+    _show_status(_query(RecorderVerb.STOP, connect, fleet), as_json=as_json)
 
 
 @record.command(epilog="\b\nexample:\n  fleet record status")
@@ -276,7 +277,7 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Show what is being recorded, where to, how much was lost, and whether there is room."""
-    _show_status(_query("status", connect, fleet), as_json=as_json)
+    _show_status(_query(RecorderVerb.STATUS, connect, fleet), as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")
@@ -289,7 +290,7 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
-    found = _query("mark", connect, fleet, text=text, by=by or default_sender(chosen_person()))
+    found = _query(RecorderVerb.MARK, connect, fleet, text=text, by=by or default_sender(chosen_person()))
     if why := why_unrecorded(found):
         raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` says whether it is.")
     click.echo(f"marked in {found.session}")

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from fleet.client.claims import UNKNOWN, CarClaims, GatewayStarts, claims_of
+from fleet.client.claims import CarClaims, GatewayStarts, claims_of
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
@@ -13,6 +13,7 @@ from fleet.console.frame_log import describe_gateway
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import messages, topics
 from schemas.authority import Authority, People
+from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0
 """Time over which the trend of a battery is measured."""
@@ -90,7 +91,7 @@ class CarView:
                 self._events.append((now, value))
             case "event/log":
                 words = value.message.removeprefix(f"{self.name} ")
-                level = "error" if value.level >= 4 else "warning" if value.level == 3 else "info"
+                level = Level.ERROR if value.level >= 4 else Level.WARNING if value.level == 3 else Level.INFO
                 self._note(value.timestamp, words, level)
             case _:
                 if not self._counts(topic, value):
@@ -183,22 +184,22 @@ class CarView:
     def _link(self, now: float) -> dict[str, Any]:
         found = self._newest.get("state/link")
         if found is None:
-            return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
+            return {"link": {"state": UNKNOWN, "reason": "", "since_s": 0}}
         link, at = found
         claim = self.claims(now).link
         if claim.is_stale:
-            return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
+            return {"link": {"state": UNKNOWN, "reason": "", "since_s": 0}}
         if claim.past is not None:
             return {"link": {"state": claim.what, "reason": "", "since_s": 0}}
         shown = {"state": claim.what, "reason": claim.why, "since_s": int(link.since_s + now - at)}
-        if claim.what == "online":
+        if claim.what == LinkState.ONLINE:
             shown["since_s"] = 0  # a growing number that nobody needs would draw the card each second
         return {"link": shown}
 
     def _mode(self, now: float) -> dict[str, Any]:
         mode, claim = self._get("state/mode"), self.claims(now).mode
         if mode is None or claim.past is not None or claim.is_stale:
-            return {"mode": {"asked": "unknown", "inferred": "unknown", "verdict": "assumed", "evidence": ""}}
+            return {"mode": {"asked": UNKNOWN, "inferred": UNKNOWN, "verdict": Verdict.ASSUMED, "evidence": ""}}
         return {
             "mode": {
                 "asked": claim.what,
@@ -211,7 +212,7 @@ class CarView:
     def _motion(self, now: float) -> dict[str, Any]:
         motion = self._fresh("state/motion", now)
         if motion is None or self._gone_at is not None:
-            return {"motion": {"motion": "unknown", "owner": "", "speed": None, "fan": False, "servo_deg": None}}
+            return {"motion": {"motion": UNKNOWN, "owner": "", "speed": None, "fan": False, "servo_deg": None}}
         shown = {
             "motion": motion.motion,
             "source": motion.source,
@@ -286,7 +287,7 @@ class CarView:
         words = f"{event.verb} {event.phase}"
         if event.reason or event.words:
             words += f": {event.words or event.reason}"
-        level = "warning" if event.phase in FAILED_PHASES else "info"
+        level = Level.WARNING if event.phase in FAILED_PHASES else Level.INFO
         self._note(event.stamp, f"{words} ({event.sender})", level)
 
     def _note(self, stamp: Any, words: str, level: str) -> None:

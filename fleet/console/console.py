@@ -44,6 +44,7 @@ from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
 from schemas.keys import person_of
 from schemas.process.suspend import SleepWatch, clock_pair
+from schemas.words import Rank, Scope, Verb
 
 MAX_PAGES: Final = 96
 """Maximum number of connected pages."""
@@ -295,7 +296,7 @@ class Console:
         """Raise TooManyPages if no other page of this device may connect."""
         most = MAX_PAGES
         if person is not None:
-            most -= KEPT_FOR_THIS_COMPUTER + (0 if person.rank == "lead" else KEPT_FOR_LEADS)
+            most -= KEPT_FOR_THIS_COMPUTER + (0 if person.rank == Rank.LEAD else KEPT_FOR_LEADS)
         if len(self._pages) >= most:
             raise TooManyPages("too many pages are open")
         if device and sum(page.device == device for page in self._pages.values()) >= MAX_PAGES_OF_DEVICE:
@@ -389,7 +390,7 @@ class Console:
     def _stop_all(self, operator: ConsoleOperator, request: CommandRequest) -> None:
         now = time.monotonic()
         for press in self._presses.on_stop(now):
-            self._end(press, "All cars were paused." if request.verb == "pause" else "All cars were stopped.")
+            self._end(press, "All cars were paused." if request.verb == Verb.PAUSE else "All cars were stopped.")
         self._stops += 1
         present = {*self._fleet.sync.cars(), *self._view.names}
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
@@ -411,7 +412,7 @@ class Console:
         now = time.monotonic()
         self._end_presses_of_sleep()
         if message.is_command:
-            cars = () if message.kind == "unpause" else message.cars()
+            cars = () if message.kind == Verb.UNPAUSE else message.cars()
             if words := self._command_refusal(page, cars, now):
                 raise BadPageMessage(words)
         match message.kind:
@@ -425,18 +426,18 @@ class Console:
                 released = self._presses.release(page.number, message.number("press"))
                 if released is not None:
                     page.operator.end_press(released)
-            case "stop":
+            case Verb.STOP:
                 self.stop_all(message.text("id"), page.operator)
-            case "estop":
+            case Verb.ESTOP:
                 why = message.text("why", MAX_REASON_LENGTH)
-                self.stop_all(message.text("id"), page.operator, estop_request(why, "fleet"))
-            case "pause":
+                self.stop_all(message.text("id"), page.operator, estop_request(why, Scope.FLEET))
+            case Verb.PAUSE:
                 why = message.text("why", MAX_REASON_LENGTH)
                 if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
                     raise BadPageMessage(refused)  # it stops no car, so it ends no press
                 self.stop_all(message.text("id"), page.operator, pause_request(why))
-            case "unpause":
-                page.operator.command(plain_request("unpause"), None, self._answer_to(page, message))
+            case Verb.UNPAUSE:
+                page.operator.command(plain_request(Verb.UNPAUSE), None, self._answer_to(page, message))
             case "take":
                 page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
             case "give_back":
@@ -465,7 +466,7 @@ class Console:
                     self._waiting_stops.setdefault(who, []).append((cars, answer))
                     self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
                 else:
-                    if request.verb == "mode":
+                    if request.verb == Verb.MODE:
                         theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
                         self._end_all(theirs, "The car is in a mode.")
                     page.operator.command(request, cars, answer)

@@ -18,6 +18,7 @@ from fleet.console.stop_report import StopReport
 from schemas import keys, messages
 from schemas.bus import Failure
 from schemas.commands import COMMANDS
+from schemas.words import Motion, Phase, Reason, Verb
 
 # The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
 DRIVE_TTL_S: Final = 0.5
@@ -73,7 +74,7 @@ class ConsoleOperator:
         stopped = tuple(press.cars if cars is None else cars)
         _, count, _ = self._streams.pop((press.client, press.id), (0.0, 0, ()))
         if stopped:
-            self._stream(stopped, drive_request("stop"), None, count + 1)
+            self._stream(stopped, drive_request(Motion.STOP), None, count + 1)
             self.spawn(self._ask_to_end(stopped))
 
     def _stream(self, cars: Sequence[str], request: CommandRequest, ttl_s: float | None, sequence: int) -> None:
@@ -83,10 +84,10 @@ class ConsoleOperator:
         if ttl_s is not None:
             message.ttl_s = ttl_s
         payload = message.SerializeToString()
-        encoding = messages.encoding_of(COMMANDS["drive"].message)
+        encoding = messages.encoding_of(COMMANDS[Verb.DRIVE].message)
         for car in cars:
             self._fleet.sync.bus.put_command(
-                keys.command_key(self._fleet.sync.name, car, "drive"), payload, encoding, sequence
+                keys.command_key(self._fleet.sync.name, car, Verb.DRIVE), payload, encoding, sequence
             )
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
@@ -96,7 +97,7 @@ class ConsoleOperator:
         finally:
             self._commands -= 1
         for outcome in outcomes:
-            if not outcome.ok and outcome.reason != "superseded":
+            if not outcome.ok and outcome.reason != Reason.SUPERSEDED:
                 on_refusal(outcome)
         if (press.client, press.id) not in self._streams:  # this query may have overtaken the end of the press
             driven = {car for _, _, cars in self._streams.values() for car in cars}  # by a press that has replaced it
@@ -104,7 +105,7 @@ class ConsoleOperator:
 
     async def _ask_to_end(self, cars: Sequence[str]) -> None:
         if cars:
-            await self._fleet.ask(drive_request("stop"), cars)
+            await self._fleet.ask(drive_request(Motion.STOP), cars)
 
     # ------------------------------------------------------------------ STOP
 
@@ -198,7 +199,7 @@ class ConsoleOperator:
         answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text, sender)
         if answer is None:
             return None
-        return not isinstance(answer, Failure) and answer.status == "sent", answer.words
+        return not isinstance(answer, Failure) and answer.status == Phase.SENT, answer.words
 
     def spawn(self, work: Any) -> None:
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""

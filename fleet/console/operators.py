@@ -9,6 +9,7 @@ from fleet.aio import Fleet
 from fleet.client.client import default_sender
 from fleet.console.operator import ConsoleOperator
 from schemas.keys import person_of
+from schemas.words import Rank
 
 IDLE_CLIENT_S: Final = 5.0
 """Time for which the client of a person without a page stays open: a page that is loaded again needs it."""
@@ -79,7 +80,7 @@ class Operators:
         self._clients += 1
         client = self._fleet.sync
         sender = f"{default_sender(person)}.{self._clients}"
-        fleet = Fleet(client.bus.endpoint, client.name, sender=sender, kind="person")
+        fleet = Fleet(client.bus.endpoint, client.name, sender=sender, kind=Rank.PERSON)
         await fleet.__aenter__()
         return fleet, ConsoleOperator(fleet)
 

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, Self
 from schemas import keys
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
+from schemas.words import Rank
 
 CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """Letters and digits that nobody confuses."""
@@ -34,7 +35,7 @@ GUESS_MEMORY_S: Final = 3600.0
 MAX_GUESSERS: Final = 1024
 """Maximum number of remembered addresses. More are forgotten, the oldest first."""
 MAX_DEVICE_NAME_LENGTH: Final = 60
-RANKS: Final = ("person", "lead")
+RANKS: Final = (str(Rank.PERSON), str(Rank.LEAD))  # text: click takes an enum by the names of its members
 
 CookieState = Literal["unknown", "expired", "valid"]
 
@@ -52,7 +53,7 @@ class PagePerson:
     """The person at a page. Pages of this computer have the console's own name."""
 
     name: str
-    rank: str = "person"
+    rank: str = Rank.PERSON
     """`person` or `lead`."""
 
 

@@ -12,6 +12,7 @@ from fleet.console.guard import PAIR_PATH, PERSON, Scope
 from fleet.console.pairing import PagePerson
 from fleet.console.request_body import read_text
 from fleet.console.requests import BadPageMessage, PageMessage
+from schemas.words import Rank
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
     from fleet.console.lan import Lan
@@ -73,7 +74,7 @@ def people_routes(lan: "Lan | None") -> list[Route]:
 
 
 def _may_pair(scope: Scope) -> bool:
-    return PERSON not in scope or scope[PERSON].rank == "lead"
+    return PERSON not in scope or scope[PERSON].rank == Rank.LEAD
 
 
 def _failure(words: str, status: int, headers: dict[str, Any] | None = None) -> Response:

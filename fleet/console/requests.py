@@ -12,13 +12,13 @@ from fleet.client import commands
 from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
 from schemas import keys
 from schemas.commands import STOPS
-from schemas.words import Light, Mode, Motion
+from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep, Verb
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum length of the reason of an e-stop."""
-_STOP_KINDS: Final = ("stop", "estop", "pause")
+_STOP_KINDS: Final = (*STOPS, Verb.PAUSE)
 _MAX_NUMBER: Final = 2**53
 MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
 
@@ -48,7 +48,7 @@ class PageMessage:
     def is_command(self) -> bool:
         """True if the message asks gateways and has a budget. Stops have none; a press is answered in its own way."""
         is_done = self.kind == "do" and self.fields.get("verb") not in STOPS
-        return is_done or self.kind in ("take", "give_back", "unpause")
+        return is_done or self.kind in ("take", "give_back", Verb.UNPAUSE)
 
     @property
     def kind(self) -> str:
@@ -144,8 +144,8 @@ def _light(message: PageMessage) -> commands.CommandRequest:
 
 def _servo(message: PageMessage) -> commands.CommandRequest:
     if message.fields.get("deg") is not None:
-        return commands.servo_request("front", deg=message.number("deg"))
-    servo = message.one_of("servo", frozenset({"front", "vertical", "horizontal"}))
+        return commands.servo_request(Servo.FRONT, deg=message.number("deg"))
+    servo = message.one_of("servo", frozenset(map(str, Servo)))
     return commands.servo_request(servo, message.one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
 
 
@@ -174,18 +174,18 @@ def is_stop(text: str) -> bool:
 
 
 _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]] = {
-    "mode": _mode,
-    "led": _led,
-    "light": _light,
-    "servo": _servo,
-    "arm": _arm,
-    "resume": _resume,
-    "lend": _lend,
+    Verb.MODE: _mode,
+    Verb.LED: _led,
+    Verb.LIGHT: _light,
+    Verb.SERVO: _servo,
+    Verb.ARM: _arm,
+    Verb.RESUME: _resume,
+    Verb.LEND: _lend,
     "end_loan": lambda _: commands.end_loan_request(),
-    "whistle": lambda _: commands.plain_request("whistle"),
-    "speed": lambda message: commands.speed_request(message.one_of("step", frozenset({"up", "down"}))),
-    "fan": lambda _: commands.fan_request(),
-    "find": lambda _: commands.plain_request("find"),
-    "stop": lambda _: commands.stop_request(),
-    "estop": lambda message: commands.estop_request(message.text("why", MAX_REASON_LENGTH), "car"),
+    Verb.WHISTLE: lambda _: commands.plain_request(Verb.WHISTLE),
+    Verb.SPEED: lambda message: commands.speed_request(message.one_of("step", frozenset(map(str, SpeedStep)))),
+    Verb.FAN: lambda _: commands.fan_request(),
+    Verb.FIND: lambda _: commands.plain_request(Verb.FIND),
+    Verb.STOP: lambda _: commands.stop_request(),
+    Verb.ESTOP: lambda message: commands.estop_request(message.text("why", MAX_REASON_LENGTH), Scope.CAR),
 }

@@ -26,11 +26,11 @@ from fleet.console.session_jobs import SessionJobs
 from fleet.replay.rerun.viewer import VIEWER_HOST, NoViewer, Viewer, free_port
 from schemas.bus import Failure
 from schemas.suggestion import how_to_install
+from schemas.words import RecorderVerb
 
 MAX_EXPORTS: Final = 4
 """Maximum number of exports that wait for their download."""
 FORMATS: Final = ("csv", "parquet")
-_RECORDER_VERBS: Final = ("start", "stop", "mark", "status")
 _MAX_REQUEST_BYTES: Final = 8192
 
 
@@ -77,13 +77,13 @@ class SessionsApi:
 
     async def _record(self, request: Request) -> Response:
         verb = request.path_params["verb"]
-        if verb not in _RECORDER_VERBS:
+        if verb not in tuple(RecorderVerb):
             return refuse(f"the recorder has no command {verb!r}", 404)
         fields: dict[str, str] = {}
         person = request.scope.get(PERSON)
-        if verb in ("start", "stop") and (words := self._refusal(person)):
+        if verb in (RecorderVerb.START, RecorderVerb.STOP) and (words := self._refusal(person)):
             return refuse(words, 403)
-        if verb == "mark":
+        if verb == RecorderVerb.MARK:
             text = await read_body(request)
             if not text.strip():
                 return refuse("A mark needs a text.")
@@ -93,7 +93,7 @@ class SessionsApi:
             return refuse("No recorder is on the bus. `fleet record` starts one; `fleet up` records by itself.")
         if isinstance(answer, Failure):
             return refuse(answer.words)
-        if verb == "mark" and (why := why_unrecorded(answer)):
+        if verb == RecorderVerb.MARK and (why := why_unrecorded(answer)):
             return refuse(f"The mark is not in a file yet: {why}.")
         return JSONResponse(
             {

@@ -6,13 +6,15 @@
 from collections.abc import Iterable
 from typing import Any, Final
 
-from fleet.client.claims import SENT, SHOWN
 from fleet.client.outcome import NO_ANSWER, Outcome
 from schemas import messages
 from schemas.commands import STOPS
+from schemas.words import Basis, Motors, Phase, Verb
 
 MOVED: Final = "moved"
 """State of a car that stood, and moves again."""
+_UNDER_WAY: Final = (Phase.ASKED, Motors.STOPPING)
+"""The states of a car until its result is known."""
 
 
 class StopReport:
@@ -26,30 +28,30 @@ class StopReport:
         self._at_ms = at_ms
         self._result_ns: dict[str, int] = {}
         """Stamp of the event or state that the result of a car rests on, by its gateway's clock, ns."""
-        self._cars: dict[str, dict[str, Any]] = {name: _entry("asked") for name in cars}
+        self._cars: dict[str, dict[str, Any]] = {name: _entry(Phase.ASKED) for name in cars}
 
     @property
     def over(self) -> bool:
         """True if the result of every car is known."""
-        return all(entry["state"] not in ("asked", "stopping") for entry in self._cars.values())
+        return all(entry["state"] not in _UNDER_WAY for entry in self._cars.values())
 
     def on_event(self, car: str, event: Any, now: float) -> None:
         """Handle a command event of the sender of this STOP."""
-        if event.verb not in (*STOPS, "pause"):
+        if event.verb not in (*STOPS, Verb.PAUSE):
             return
-        if event.phase in ("complete", "sent"):
+        if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
         if self._is_over(car):
             return
         match event.phase:
-            case "complete":
-                self._set(car, event.basis or SENT, now)
-            case "sent" if event.basis:
+            case Phase.COMPLETE:
+                self._set(car, event.basis or Basis.SENT, now)
+            case Phase.SENT if event.basis:
                 self._set(car, event.basis, now, event.words)
-            case "failed" | "rejected" | "expired":
-                self._set(car, "failed", now, event.words or event.reason)
+            case Phase.FAILED | Phase.REJECTED | Phase.EXPIRED:
+                self._set(car, Phase.FAILED, now, event.words or event.reason)
             case _:
-                self._cars[car] = _entry("stopping")
+                self._cars[car] = _entry(Motors.STOPPING)
 
     def on_safety(self, car: str, safety: Any, now: float) -> None:
         """Handle a new state/safety.
@@ -58,12 +60,12 @@ class StopReport:
         """
         state = self._cars[car]["state"] if car in self._cars else ""
         stamp_ns = messages.stamp_ns(safety.stamp)
-        if state == "failed" and safety.motors == "off" and safety.motors_basis:
+        if state == Phase.FAILED and safety.motors == Motors.OFF and safety.motors_basis:
             self._set(car, safety.motors_basis, now)
             self._result_ns[car] = stamp_ns
-        elif state in (SHOWN, SENT) and safety.motors == "on" and stamp_ns > self._result_ns.get(car, 0):
+        elif state in tuple(Basis) and safety.motors == Motors.ON and stamp_ns > self._result_ns.get(car, 0):
             self._cars[car]["state"] = MOVED
-        if state in ("asked", "stopping"):  # a state that is older than the result must not contradict it later
+        if state in _UNDER_WAY:  # a state that is older than the result must not contradict it later
             self._result_ns[car] = max(stamp_ns, self._result_ns.get(car, 0))
 
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float) -> None:
@@ -74,11 +76,11 @@ class StopReport:
             if self._is_over(car):
                 continue
             if outcome is None:
-                self._set(car, "failed", now, "its gateway is not on the bus: look at the car")
+                self._set(car, Phase.FAILED, now, "its gateway is not on the bus: look at the car")
             elif outcome.ok:
-                self._set(car, outcome.basis or SENT, now, outcome.words)
+                self._set(car, outcome.basis or Basis.SENT, now, outcome.words)
             else:
-                self._set(car, "failed", now, outcome.words or outcome.reason or NO_ANSWER)
+                self._set(car, Phase.FAILED, now, outcome.words or outcome.reason or NO_ANSWER)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -86,7 +88,7 @@ class StopReport:
         return {"number": self.number, "verb": self._verb, "at_ms": self._at_ms, "over": self.over, "cars": cars}
 
     def _is_over(self, car: str) -> bool:
-        return car in self._cars and self._cars[car]["state"] not in ("asked", "stopping")
+        return car in self._cars and self._cars[car]["state"] not in _UNDER_WAY
 
     def _set(self, car: str, state: str, now: float, words: str = "") -> None:
         took_s = now - self._asked_at

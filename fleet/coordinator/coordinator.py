@@ -36,7 +36,7 @@ from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, rep
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.topics import Qos
-from schemas.words import Level
+from schemas.words import Level, Phase, Reason
 
 SENDER: Final = "coordinator-"
 """Prefix of every coordinator's sender name, so that a second coordinator can name the first."""
@@ -270,7 +270,9 @@ class Coordinator:
             self._reply_result(query, _rejected(refused))
             return
         except messages.BadPayload as error:
-            self._reply_result(query, pb.Result(status="rejected", reason="bad_value", words=f"{error} [bad_value]"))
+            self._reply_result(
+                query, pb.Result(status=Phase.REJECTED, reason=Reason.BAD_VALUE, words=f"{error} [bad_value]")
+            )
             return
         if request is not PlanRequest.NEXT and memory is not self._memory:
             self._drop_decisions()
@@ -278,7 +280,7 @@ class Coordinator:
         saved = self._save(memory)
         code, did = EVENTS[request]
         self._log(Level.INFO, code, f"{keys.name_of(by)} {did} ({words})")
-        self._reply_result(query, pb.Result(status="sent", words=words if saved else f"{words}. {_UNSAVED}"))
+        self._reply_result(query, pb.Result(status=Phase.SENT, words=words if saved else f"{words}. {_UNSAVED}"))
 
     def _drop_decisions(self) -> None:
         for name, subject in [*self._published]:
@@ -295,7 +297,7 @@ class Coordinator:
 
     def _on_plan(self, query: zenoh.Query, observer: FleetObserver) -> None:
         """Put the plan of a query in force, or refuse it with all its faults."""
-        result = pb.Result(status="sent")
+        result = pb.Result(status=Phase.SENT)
         try:
             text, by = _plan_command(query)
             self._check_sender(observer, by)
@@ -303,11 +305,11 @@ class Coordinator:
         except RequestRefused as refused:
             result = _rejected(refused)
         except (ValueError, messages.BadPayload) as error:  # BadPlan and UnicodeDecodeError are ValueErrors
-            result = pb.Result(status="rejected", reason="bad_value", words=str(error))
+            result = pb.Result(status=Phase.REJECTED, reason=Reason.BAD_VALUE, words=str(error))
         else:
             plan_faults = find_faults(plan, self.listed or None, observer.present)
             if plan_faults.errors:
-                result = pb.Result(status="rejected", reason="bad_value", words=plan_faults.refusal())
+                result = pb.Result(status=Phase.REJECTED, reason=Reason.BAD_VALUE, words=plan_faults.refusal())
             else:
                 warnings = [f"warning: {each}" for each in plan_faults.warnings]
                 result.words = "\n".join((f"plan {plan.version} is in force", *warnings))
@@ -489,7 +491,7 @@ class Coordinator:
 
 
 def _rejected(refused: RequestRefused) -> pb.Result:
-    return pb.Result(status="rejected", reason=refused.reason, words=str(refused))
+    return pb.Result(status=Phase.REJECTED, reason=refused.reason, words=str(refused))
 
 
 def _payload(query: zenoh.Query) -> tuple[bytes, str]:

@@ -12,6 +12,8 @@ from schemas import keys, messages, topics
 from schemas.authority import NO_PEOPLE, People, PersonRole
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.platform_name import AUTO
+from schemas.words import Rank
 
 REQUIRED_TOPICS: Final = ("state/link", "state/mode", "state/motion", "state/safety")
 """The states that could forbid a command. A car is confirmed when all of them are known."""
@@ -153,7 +155,7 @@ class FleetObserver:
         pauses: Any = safety.get("pauses") or ()
         loan = safety.get("loan")
         driver = motion["owner"]
-        if not driver and isinstance(lease, pb.Lease) and lease.kind != "coordinator":
+        if not driver and isinstance(lease, pb.Lease) and lease.kind != Rank.COORDINATOR:
             driver = lease.holder
         self.cars[car] = replace(
             before,
@@ -188,7 +190,7 @@ def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:
     """Return the cars of a fleet file as the policy knows them before their gateways are up."""
     return {
         name: CarSnapshot(
-            platform="" if car.platform.startswith("auto") else car.platform,
+            platform="" if car.platform.startswith(AUTO) else car.platform,
             capabilities=car.capabilities,
             roles=None if car.roles is None else frozenset(car.roles),
             listed=True,

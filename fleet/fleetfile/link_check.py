@@ -21,7 +21,7 @@ from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.suggestion import how_to_install
-from schemas.words import Platform
+from schemas.words import LinkState, Platform
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -51,7 +51,7 @@ def check_link(car: FleetCar, served: Mapping[str, tuple[str, str, str]]) -> Lin
         if url and not _is_same(url, car.link):
             words = f"a running gateway of this name has another link: {url}"
             return LinkCheck(car.name, car.link, ok=False, words=words)
-        ok = state in ("online", "quiet")
+        ok = state in (LinkState.ONLINE, LinkState.QUIET)
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
         return LinkCheck(car.name, car.link, ok, words)
     ok, words = _check(parse_fleet_link(car.link), car.platform)

@@ -12,11 +12,12 @@ from fleet.conditions import Expression
 from fleet.policy.assignment import assign
 from fleet.policy.debounce import Settled, settle
 from fleet.policy.plan.plan import Plan, Role
-from fleet.policy.snapshot import CONTRADICTED, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
+from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
+from schemas.words import LinkState, Reason, Verdict
 
 REFUSED_MODE_RETRY_S: Final = 10.0
 """Delay before the next request of a mode that a car refused."""
-_REFUSALS: Final = frozenset({"battery_low", "unsupported", "link_down", "write_failed"})
+_REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
 """Reasons that lie with the car. Holds and leases are known from its states."""
 _STAND_IN: Final = "/"
 """Suffix of a role's name for a place in it that stands in for another role."""
@@ -245,14 +246,14 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             elif candidates.barrier(car, role) is not None:
                 continue
             cost = order - worth[_rank(role)]
-            if car in candidates.unresponsive and known.verdict == CONTRADICTED and role.count is not None:
+            if car in candidates.unresponsive and known.verdict == Verdict.CONTRADICTED and role.count is not None:
                 cost += _ROLE_LOSS_COST
             elif candidates.roles_before.get(car) == role.name:
                 # A role for all counts half, so that its holder may take over a counted place.
                 cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
-            if known.mode != role.mode or known.verdict == CONTRADICTED:
+            if known.mode != role.mode or known.verdict == Verdict.CONTRADICTED:
                 cost += _MODE_CHANGE_COST
-            if known.link != "online" and known.link != "quiet":
+            if known.link not in (LinkState.ONLINE, LinkState.QUIET):
                 cost += _LINK_DOUBT_COST
             if role.cars is not None and car in role.cars:
                 cost += role.cars.index(car) * 10

@@ -29,11 +29,11 @@ from fleet.policy.explain import (
 )
 from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
-from fleet.policy.snapshot import CONTRADICTED, LOST, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
+from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HUB_RETURN_GRACE_S, BlinkState, HeldRole, LedRequest, ModeAttempts, PolicyState
 from schemas.colors import COLORS, Rgb
 from schemas.keys import name_of
-from schemas.words import Mode
+from schemas.words import UNKNOWN, LinkState, Mode, Motors, Verdict
 
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
@@ -41,7 +41,6 @@ FIRST_STATE_TIMEOUT_S: Final = 1.5
 """Timeout for the first states of the cars on the bus; the first roles wait for them."""
 ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
 """Number of failed mode commands after which another car may take over the role."""
-_UNKNOWN: Final = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +169,12 @@ def _step_stopped(
         tried = memory.mode_attempts.get(car, ModeAttempts(Mode.MANUAL))
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         # A mode command may have been on its way when the plan was stopped: only a later one shows that it is over.
-        rests = tried.count and known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and known.refused is None
+        rests = (
+            tried.count
+            and known.mode == Mode.MANUAL
+            and known.verdict != Verdict.CONTRADICTED
+            and known.refused is None
+        )
         taken = known.taken_by is not None or known.driven_by is not None
         waits = car in memory.to_rest and not taken and (barrier is not None or known.busy or not rests)
         if waits:
@@ -211,7 +215,7 @@ def _has_no_state(known: CarSnapshot) -> bool:
 
 
 def _is_recovering(known: CarSnapshot) -> bool:
-    return known.motors == _UNKNOWN and known.verdict != CONTRADICTED
+    return known.motors == Motors.UNKNOWN and known.verdict != Verdict.CONTRADICTED
 
 
 def _is_ready(
@@ -225,14 +229,20 @@ def _is_ready(
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         if barrier is not None:
             if _has_no_state(known) or (
-                not barrier[1] and known.present and known.link != LOST and not known.doubted and _is_recovering(known)
+                not barrier[1]
+                and known.present
+                and known.link != LinkState.LOST
+                and not known.doubted
+                and _is_recovering(known)
             ):
                 return False
             continue
         decision = memory.decisions.get(car)
         if decision is None or decision.kind is DecisionKind.ALONE:  # this car can be commanded since this step
             return False
-        if decision.mode is not None and (known.mode != decision.mode or known.verdict == CONTRADICTED or known.busy):
+        if decision.mode is not None and (
+            known.mode != decision.mode or known.verdict == Verdict.CONTRADICTED or known.busy
+        ):
             return False
     return any(snapshot.cars.get(car, UNKNOWN_CAR).present for car in barrier_of)
 
@@ -261,7 +271,7 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
         ), True
     if known.driven_by is not None:
         return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends"), False
-    if known.link == LOST:
+    if known.link == LinkState.LOST:
         return Barrier(f"the link of {car} is lost", "its link is back"), False
     if known.doubted:  # people may command it, and see what it does
         ends = (
@@ -351,7 +361,10 @@ def _explain_loss(
     barrier = barriers.get(car) or candidates.barrier(car, role)
     if barrier is not None:
         return barrier.why
-    if car in candidates.unresponsive and candidates.snapshot.cars.get(car, UNKNOWN_CAR).verdict == CONTRADICTED:
+    if (
+        car in candidates.unresponsive
+        and candidates.snapshot.cars.get(car, UNKNOWN_CAR).verdict == Verdict.CONTRADICTED
+    ):
         return f"{car} was asked for mode {role.mode} again and again, and is not in it"
     other = allocation.roles.get(car)
     return f"{car} has role {other} now" if other is not None else f"{car} fits it less"
@@ -381,7 +394,7 @@ def _decide_places(
 
 def _note_contradiction(decision: Decision, snapshot: FleetSnapshot) -> Decision:
     known = snapshot.cars.get(decision.subject, UNKNOWN_CAR)
-    if decision.mode is None or known.mode != decision.mode or known.verdict != CONTRADICTED:
+    if decision.mode is None or known.mode != decision.mode or known.verdict != Verdict.CONTRADICTED:
         return decision
     return explain_contradiction(decision, known.evidence)
 
@@ -400,13 +413,13 @@ def _command_modes(
         attempts = before.get(car, ModeAttempts(mode))
         if attempts.mode != mode:
             attempts = ModeAttempts(mode)
-        if known.mode == mode and known.verdict != CONTRADICTED:
+        if known.mode == mode and known.verdict != Verdict.CONTRADICTED:
             fine_since = now if attempts.fine_since is None else attempts.fine_since
             result[car] = (
                 ModeAttempts(mode) if now - fine_since >= MODE_RETRY_MAX_S else replace(attempts, fine_since=fine_since)
             )
             continue
-        if decision.kind is DecisionKind.IDLE and known.mode == _UNKNOWN:
+        if decision.kind is DecisionKind.IDLE and known.mode == UNKNOWN:
             result[car] = attempts  # its gateway brings it to rest
         elif known.busy or now < attempts.again_at:
             result[car] = replace(attempts, fine_since=None)
@@ -475,4 +488,4 @@ def _command_blinks(
 
 
 def _obeys_led(known: CarSnapshot) -> bool:
-    return known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and not known.busy
+    return known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED and not known.busy

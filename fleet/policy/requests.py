@@ -10,6 +10,7 @@ from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState
 from schemas import keys
 from schemas.authority import People
+from schemas.words import Reason
 
 GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"
 
@@ -33,7 +34,7 @@ EVENTS: Final = {
 class RequestRefused(Exception):
     """The request cannot be carried out. The text says why and, in brackets, gives the reason's code."""
 
-    def __init__(self, words: str, reason: str = "unsupported") -> None:
+    def __init__(self, words: str, reason: Reason = Reason.UNSUPPORTED) -> None:
         super().__init__(f"{words} [{reason}]")
         self.reason: Final = reason
 
@@ -45,7 +46,7 @@ def check_sender(people: People, by: str) -> None:
     """
     words = "" if by == keys.SUPERVISOR else fleet_refusal(people, keys.person_of(by))
     if words:
-        raise RequestRefused(f"{words} Say who you are with `--as NAME` or FLEET_AS.", "not_allowed")
+        raise RequestRefused(f"{words} Say who you are with `--as NAME` or FLEET_AS.", Reason.NOT_ALLOWED)
 
 
 def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, now: float) -> tuple[PolicyState, str]:

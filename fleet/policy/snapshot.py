@@ -16,8 +16,6 @@ from fleet.conditions import Expression, aliases_of
 from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 
-CONTRADICTED: Final = "contradicted"
-LOST: Final = "lost"
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 

@@ -5,6 +5,18 @@ from typing import Final
 
 from schemas.colors import Rgb
 from schemas.commands import COMMANDS
+from schemas.words import (
+    UNKNOWN,
+    BatteryLevel,
+    LinkState,
+    Mode,
+    Motion,
+    Motors,
+    Phase,
+    RecorderState,
+    RunState,
+    Verdict,
+)
 
 OFF: Final[Rgb] = (70, 74, 82)
 """Color of a lamp or LED that is off."""
@@ -12,22 +24,26 @@ OFF: Final[Rgb] = (70, 74, 82)
 
 STATE_COLORS: Final[Mapping[str, int]] = {
     "true": 0x4FB477FF, "false": 0x30343BFF,
-    "online": 0x4FB477FF, "quiet": 0x5C7FA3FF, "stale": 0xE0A030FF, "lost": 0xD9534FFF,
-    "confirmed": 0x4FB477FF, "assumed": 0x8A8F98FF, "contradicted": 0xD9534FFF, "unknown": 0x555A63FF,
-    "manual": 0x5C7FA3FF, "tracking": 0x8E6BBFFF, "obstacle_avoidance": 0xD08A3CFF, "light_seeking": 0xC9B037FF,
-    "following": 0x3C9D9BFF, "color_led": 0xC0689FFF, "remote_control": 0xA0522DFF,
-    "stop": 0x30343BFF, "forward": 0x4FB477FF, "back": 0xD08A3CFF, "left": 0x5C7FA3FF, "right": 0x8E6BBFFF,
-    "spin_left": 0x3C9D9BFF, "spin_right": 0xC0689FFF,
-    "off": 0x30343BFF, "on": 0x4FB477FF,
-    "ok": 0x4FB477FF, "low": 0xE0A030FF, "critical": 0xD9534FFF,
-    "recording": 0x4FB477FF, "running": 0x4FB477FF, "starting": 0x5C7FA3FF, "ending": 0x8A8F98FF,
-    "closed": 0x8A8F98FF, "ended": 0x8A8F98FF, "full": 0xD9534FFF, "failed": 0xD9534FFF,
+    LinkState.ONLINE: 0x4FB477FF, LinkState.QUIET: 0x5C7FA3FF, LinkState.STALE: 0xE0A030FF, LinkState.LOST: 0xD9534FFF,
+    Verdict.CONFIRMED: 0x4FB477FF, Verdict.ASSUMED: 0x8A8F98FF, Verdict.CONTRADICTED: 0xD9534FFF, UNKNOWN: 0x555A63FF,
+    Mode.MANUAL: 0x5C7FA3FF, Mode.TRACKING: 0x8E6BBFFF, Mode.OBSTACLE_AVOIDANCE: 0xD08A3CFF,
+    Mode.LIGHT_SEEKING: 0xC9B037FF, Mode.FOLLOWING: 0x3C9D9BFF, Mode.COLOR_LED: 0xC0689FFF,
+    Mode.REMOTE_CONTROL: 0xA0522DFF,
+    Motion.STOP: 0x30343BFF, Motion.FORWARD: 0x4FB477FF, Motion.BACK: 0xD08A3CFF, Motion.LEFT: 0x5C7FA3FF,
+    Motion.RIGHT: 0x8E6BBFFF, Motion.SPIN_LEFT: 0x3C9D9BFF, Motion.SPIN_RIGHT: 0xC0689FFF,
+    Motors.OFF: 0x30343BFF, Motors.ON: 0x4FB477FF,
+    BatteryLevel.OK: 0x4FB477FF, BatteryLevel.LOW: 0xE0A030FF, BatteryLevel.CRITICAL: 0xD9534FFF,
+    RecorderState.RECORDING: 0x4FB477FF,
+    RunState.RUNNING: 0x4FB477FF, RunState.STARTING: 0x5C7FA3FF, RunState.ENDING: 0x8A8F98FF,
+    RecorderState.CLOSED: 0x8A8F98FF, RunState.ENDED: 0x8A8F98FF,
+    RecorderState.FULL: 0xD9534FFF, RecorderState.FAILED: 0xD9534FFF,
 }  # fmt: skip
 """Colors of states, 0xRRGGBBAA. The viewer picks the color of other states."""
 
 _PHASE_COLORS: Final[Mapping[str, int]] = {
-    "asked": 0x8A8F98FF, "queued": 0xC9B037FF, "sent": 0x5C7FA3FF, "effect_seen": 0x3C9D9BFF, "complete": 0x4FB477FF,
-    "superseded": 0x8E6BBFFF, "expired": 0xE0A030FF, "failed": 0xD9534FFF, "rejected": 0xD9534FFF,
+    Phase.ASKED: 0x8A8F98FF, Phase.QUEUED: 0xC9B037FF, Phase.SENT: 0x5C7FA3FF, Phase.EFFECT_SEEN: 0x3C9D9BFF,
+    Phase.COMPLETE: 0x4FB477FF, Phase.SUPERSEDED: 0x8E6BBFFF, Phase.EXPIRED: 0xE0A030FF, Phase.FAILED: 0xD9534FFF,
+    Phase.REJECTED: 0xD9534FFF,
 }  # fmt: skip
 
 MARK_COLORS: Final[Mapping[str, int]] = {

@@ -13,6 +13,7 @@ from typing import Final
 from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from schemas import keys
 from schemas.topics import CAR_TOPICS, TOPICS, Topic
+from schemas.words import FrameVerdict, Phase
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +244,7 @@ TEXT_LINES: Final = (
         ("car", "verb", "phase", "reason", "words", "sender"),
         "phase",
         {"sender": "by "},
-        frozenset({"asked", "queued", "sent", "effect_seen", "complete"}),
+        frozenset({Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.EFFECT_SEEN, Phase.COMPLETE}),
     ),
     TextTopic(
         "@coordinator/decision",
@@ -251,7 +252,7 @@ TEXT_LINES: Final = (
         before={"would_change": "- changes with: "},
     ),
     TextTopic(ASSIGNMENT, ("roles", "phase")),
-    TextTopic("frame/rx", ("data", "verdict"), "verdict", calm=frozenset({"sensors", "arm", "imu", "echo", "text"})),
+    TextTopic("frame/rx", ("data", "verdict"), "verdict", calm=frozenset(FrameVerdict)),
     TextTopic("frame/tx", ("data", "why", "command_id")),
 )
 """`event/log` needs no row: Rerun reads foxglove.Log as text."""

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-from fleet.client.claims import UNKNOWN, CarClaim, GatewayStarts, motors_claim, why_not_ready
+from fleet.client.claims import CarClaim, GatewayStarts, motors_claim, why_not_ready
 from schemas import messages
 from schemas.keys import name_of
 from schemas.local_time import date_and_clock
+from schemas.words import UNKNOWN, BatteryLevel, LinkState, Motors
 
 MIN_COLUMN_WIDTH: Final = 4
 """Minimum width of a column that is shortened."""
@@ -82,7 +83,7 @@ class CarStatus:
             case "state/safety":
                 return self._safety(value)
             case "sensor/battery":
-                level = "" if value.level == "ok" else f" {value.level}"
+                level = "" if value.level == BatteryLevel.OK else f" {value.level}"
                 self.battery = f"{value.voltage_v:.2f} V{level}"
                 return self._change("battery", f"battery {value.level}")
             case "event/log":
@@ -174,7 +175,7 @@ def describe_missing(row: CarStatus) -> str:
         return "its gateway is starting"
     if why := why_not_ready(row.link, row.reason, row.waits_for):
         return why
-    heard = row.motors in ("off", "on") or (row.heard and row.motors)
+    heard = row.motors in (Motors.OFF, Motors.ON) or (row.heard and row.motors)
     return "" if heard else "nothing was heard from it yet"
 
 
@@ -223,5 +224,5 @@ def _date(stamp: Any) -> str:
 
 
 _SECONDS: Final = re.compile(r"[\d.]+ s\b")
-_OPEN: Final = frozenset({"online", "quiet", "stale"})
+_OPEN: Final = frozenset(LinkState) - {LinkState.LOST}
 _AT_FIRST: Final = frozenset({"not on hold", "battery ok", "motion stop", "motion unknown"})

@@ -8,6 +8,8 @@ from enum import StrEnum
 from math import inf
 from typing import Final
 
+from schemas.words import RunState
+
 FIRST_RESTART_DELAY_S: Final = 0.25
 MAX_RESTART_DELAY_S: Final = 10.0
 RESTART_JITTER: Final = 0.2
@@ -24,18 +26,6 @@ GATEWAY_GRACE_S: Final = 19.0
 """Timeout for a gateway's exit after SIGTERM. Then the supervisor kills it."""
 HUNG: Final = "hung"
 """First word of the reason if a process was killed because it hung."""
-
-
-class RunState(StrEnum):
-    """The state of one process. ELSEWHERE: another program does its work."""
-
-    WAITING = "waiting"
-    STARTING = "starting"
-    RUNNING = "running"
-    ENDING = "ending"
-    ENDED = "ended"
-    REFUSED = "refused"
-    ELSEWHERE = "elsewhere"
 
 
 class RestartAction(StrEnum):

@@ -26,6 +26,7 @@ from schemas.bus import (
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
+from schemas.words import Phase, Rank, Reason, Verb
 
 SECOND_CHECK_DELAY_S: Final = 0.3
 """Time after which two supervisors that start at the same moment have both declared."""
@@ -135,13 +136,13 @@ class SupervisorService:
         """Send the coordinator another plan. Return True if it accepted. Call it on a thread."""
         plan = pb.Plan(text=text, set_by=keys.SUPERVISOR)
         answers = send_command(self.bus, self.fleet, keys.COORDINATOR, "plan", plan, SERVICE_QUERY_TIMEOUT_S)
-        return next((answer.status == "sent" for answer in answers if not isinstance(answer, Failure)), False)
+        return next((answer.status == Phase.SENT for answer in answers if not isinstance(answer, Failure)), False)
 
     def stop_all(self) -> None:
         """Stop every car with one query. Call it on a thread."""
         # As a coordinator: the stop of a person or a script would put the cars on hold, also after the next start.
-        command = pb.StopCommand(sender="supervisor", kind="coordinator", id=uuid.uuid4().hex)
-        key, encoding = keys.command_key(self.fleet, "*", "stop"), messages.encoding_of(COMMANDS["stop"].message)
+        command = pb.StopCommand(sender="supervisor", kind=Rank.COORDINATOR, id=uuid.uuid4().hex)
+        key, encoding = keys.command_key(self.fleet, "*", Verb.STOP), messages.encoding_of(COMMANDS[Verb.STOP].message)
         for _ in self.bus.query(key, payload=command.SerializeToString(), encoding=encoding):
             pass
 
@@ -149,17 +150,17 @@ class SupervisorService:
         """Carry out a command and reply in the encoding of the query."""
         verb = str(query.key_expr).rpartition("/")[2]
         encoding = str(query.encoding) if query.encoding is not None else ""
-        result = pb.Result(car=keys.SUPERVISOR, status="sent")
+        result = pb.Result(car=keys.SUPERVISOR, status=Phase.SENT)
         try:
             command = self._command(query, verb, encoding)
             result.id = command.id
             result.words = await services[verb](command.sender or "anonymous")
         except (ReloadRefused, messages.BadPayload) as error:
-            result.status, result.reason, result.words = "rejected", "bad_value", str(error)
+            result.status, result.reason, result.words = Phase.REJECTED, Reason.BAD_VALUE, str(error)
         except RestartNeeded as error:
-            result.status, result.words = "failed", str(error)
+            result.status, result.words = Phase.FAILED, str(error)
         except Exception as error:  # noqa: BLE001 - reply to every query, whatever the error
-            result.status, result.words = "rejected", f"internal error: {type(error).__name__}: {error}"
+            result.status, result.words = Phase.REJECTED, f"internal error: {type(error).__name__}: {error}"
             _log.exception("%s went wrong", verb)
         with query:
             reply_message(query, self._key(f"@cmd/{verb}"), result, as_json=is_json_wanted(query))
@@ -181,6 +182,6 @@ class SupervisorService:
 def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float = 30.0) -> Any:
     """Send a command to the supervisor. Return its fleet.v1.Result, None if no supervisor answers."""
     command = messages.message_class(SUPERVISOR_COMMANDS[verb])()
-    command.sender, command.kind, command.id = sender, "person", uuid.uuid4().hex  # type: ignore[attr-defined]  # ours
+    command.sender, command.kind, command.id = sender, Rank.PERSON, uuid.uuid4().hex  # type: ignore[attr-defined]  # ours
     answers = send_command(bus, fleet, keys.SUPERVISOR, verb, command, timeout_s)
     return next((answer for answer in answers if not isinstance(answer, Failure)), None)

@@ -10,8 +10,6 @@ from typing import Final
 from fleet.client.claims import (
     NOT_CONFIRMED,
     NOT_STOPPED,
-    OFF,
-    SHOWN,
     STOP_SENT,
     STOPPED,
     is_bad_rest,
@@ -19,7 +17,8 @@ from fleet.client.claims import (
 )
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, RunState, delay_s
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, delay_s
+from schemas.words import Basis, LinkState, Motors, RunState
 
 LAST_CLAIM_TIMEOUT_S: Final = 1.0
 """Timeout for the last state of a gateway that has ended in order: it may arrive after its end."""
@@ -139,7 +138,7 @@ class GatewayShutdown:
     def _finish_claimed(self, process: ManagedProcess) -> None:
         """Finish a gateway that ended in order: its last claim says whether the car has shown its stop."""
         row = self._rows.get(process.name)
-        if row is not None and row.rest.what == OFF:
+        if row is not None and row.rest.what == Motors.OFF:
             self._finish(process, rest_words(row.rest, process.name))
         elif self._processes.now >= self._unclaimed[process.name]:
             self._finish(process, STOP_SENT)
@@ -150,9 +149,9 @@ class GatewayShutdown:
         if row is None or not row.reached:
             reason = row.reason if row is not None and row.reason not in ("", NOT_TRIED) else why
             return f"{NEVER_REACHED}, so it got no command ({reason.rstrip('.')})"
-        if row.rest.what == OFF and row.rest.basis == SHOWN:
+        if row.rest.what == Motors.OFF and row.rest.basis == Basis.SHOWN:
             return f"{STOPPED}, as it showed before its gateway ended ({why.rstrip('.')})"
-        could_not_reach = process.code is None or process.code < 0 or row.link in ("", "lost")
+        could_not_reach = process.code is None or process.code < 0 or row.link in ("", LinkState.LOST)
         return f"{NOT_STOPPED if could_not_reach else NOT_CONFIRMED}: {why}"
 
     def turn(self, now: float) -> None:
@@ -181,7 +180,7 @@ class GatewayShutdown:
     def _reached(self, process: ManagedProcess) -> bool:
         row = self._rows.get(process.name)
         if process.name in self._tries:
-            return row is not None and row.link not in ("", "lost")
+            return row is not None and row.link not in ("", LinkState.LOST)
         return not self._undecided(process)
 
     def _undecided(self, process: ManagedProcess) -> bool:

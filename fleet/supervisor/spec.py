@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
@@ -16,12 +15,14 @@ from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, default
 from fleet.fleetfile.models import PersonRank
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
+from schemas.platform_name import AUTO
 from schemas.process.parent import parent_option
+from schemas.words import Platform, ProcessKind
 
 SIMULATED: Final = "sim"
 """The link of a car that the supervisor's simulator simulates."""
 SIMULATED_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
-PLATFORMS: Final = ("arduino", "stm32", "arduino", "raspberry_pi")
+PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32, Platform.ARDUINO, Platform.RASPBERRY_PI)
 """Platforms of simulated cars without a fleet file, in turn."""
 MAX_SIMULATED_CARS: Final = 200
 RECORDINGS: Final = Path("sessions")
@@ -33,17 +34,6 @@ COORDINATOR: Final = "@coordinator"
 CONSOLE: Final = "@console"
 SELF: Final = "@supervisor"
 """Names of processes. All other processes are gateways, and no car's name begins with @."""
-
-
-class ProcessKind(StrEnum):
-    """The kind of a process."""
-
-    HUB = "hub"
-    SIMULATOR = "simulator"
-    GATEWAY = "gateway"
-    COORDINATOR = "coordinator"
-    RECORDER = "recorder"
-    CONSOLE = "console"
 
 
 PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
@@ -63,7 +53,7 @@ class CarProcessSpec:
 
     name: str
     link: str
-    platform: str = "auto"
+    platform: str = AUTO
     arguments: tuple[str, ...] = ()
 
 
@@ -146,7 +136,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car needs a platform. The platform of a real car can be detected.
         kind, *words = car.platform.split("+")
-        platform = "+".join(("arduino" if kind in ("auto", "unknown") else kind, *words))
+        platform = "+".join((Platform.ARDUINO if kind in (AUTO, Platform.UNKNOWN) else kind, *words))
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
     people = file.people if file else None
     if people is not None:

@@ -11,8 +11,8 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from fleet.supervisor.car_status import CarStatus, fit
-from fleet.supervisor.restart_policy import RunState
 from schemas.local_time import clock
+from schemas.words import BatteryLevel, LinkState, RunState, Verdict
 
 if TYPE_CHECKING:
     from fleet.supervisor.supervisor import Supervisor, SupervisorEvent
@@ -20,8 +20,13 @@ if TYPE_CHECKING:
 DRAW_INTERVAL_S: Final = 0.25
 DRAW_IDLE_FACTOR: Final = 10.0
 """Minimum pause, as a multiple of the time to draw. A hundred rows take 50 ms."""
-_LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": "red"}
-_VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
+_LINK: Final[dict[str, str]] = {
+    LinkState.ONLINE: "green",
+    LinkState.QUIET: "green",
+    LinkState.STALE: "yellow",
+    LinkState.LOST: "red",
+}
+_VERDICT: Final[dict[str, str]] = {Verdict.CONFIRMED: "green", Verdict.CONTRADICTED: "red"}
 _EVENT: Final = "last event"
 """The column that gets the remaining width."""
 _TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "motors", "held, driven by", "battery", "Hz", _EVENT)
@@ -69,7 +74,7 @@ class Table:
         for name, status in self._supervisor.rows.items():
             process = self._supervisor.processes.get(name)
             running = process is not None and process.status.state is RunState.RUNNING
-            state = "" if running else "starting" if process is None else str(process.status.state)
+            state = "" if running else RunState.STARTING if process is None else str(process.status.state)
             rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state, colors.get(name, "")), strict=True)))
         widths = {each: max([len(each), *(row[each].cell_len for row in rows)]) for each in _TABLE_COLUMNS}
         widths[_EVENT] = _MIN_EVENT_WIDTH
@@ -110,7 +115,7 @@ def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
         Text(row.motion),
         Text(row.rest.basic if row.motors else ""),
         Text(held or row.lease, "red" if held else ""),
-        Text(row.battery, "red" if row.battery.endswith(("low", "critical")) else ""),
+        Text(row.battery, "red" if row.battery.endswith((BatteryLevel.LOW, BatteryLevel.CRITICAL)) else ""),
         Text(rate, justify="right"),
         Text(row.event, overflow="ellipsis", no_wrap=True),
     ]

@@ -23,7 +23,7 @@ from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missi
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from fleet.supervisor.service import ReloadRefused, RestartNeeded, SupervisorService
 from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown, describe_end
 from fleet.supervisor.spec import (
@@ -35,11 +35,11 @@ from fleet.supervisor.spec import (
     SIMULATOR_PROCESS,
     CarProcessSpec,
     FleetSpec,
-    ProcessKind,
 )
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import name_of
+from schemas.words import LinkState, Motors, ProcessKind, RecorderState, RunState
 from schemas.yaml_document.document import BadFile
 
 STATUS_INTERVAL_S: Final = 1.0
@@ -95,7 +95,7 @@ class Supervisor:
         self._source = source
         self._read = read
         self._on_event = on_event
-        self._state = "starting"
+        self._state = RunState.STARTING
         self._shutdown = GatewayShutdown(
             self.processes, self.rows, lambda car, words: self._say("end", car, words), self._exists
         )
@@ -159,7 +159,7 @@ class Supervisor:
             await service.open(self._on_message, {"down": self._down, "reload": self._reload}, self.status)
             if not self._shutdown_requested.is_set():
                 self._populate()
-            self._state = "running"
+            self._state = RunState.RUNNING
             heartbeats = asyncio.ensure_future(self._heartbeats(service))
             try:
                 while not self._shutdown_requested.is_set():
@@ -171,7 +171,7 @@ class Supervisor:
             finally:
                 heartbeats.cancel()
                 await asyncio.gather(heartbeats, return_exceptions=True)
-            self._state = "ended"
+            self._state = RunState.ENDED
             service.publish(self.status())
             await asyncio.sleep(SUPERVISOR_POLL_INTERVAL_S)  # `fleet down` waits for this status
         finally:
@@ -209,7 +209,7 @@ class Supervisor:
             return
         missing = self.missing()
         rows = [self.rows.get(name) for name in missing]
-        unreachable = all(row is not None and row.link == "lost" and row.reason != NOT_TRIED for row in rows)
+        unreachable = all(row is not None and row.link == LinkState.LOST and row.reason != NOT_TRIED for row in rows)
         if not self._progress.has_ended(len(missing), now, unreachable=unreachable):
             return
         words = describe_start(list(self._spec.cars), missing, self._session, self._console)
@@ -383,7 +383,7 @@ class Supervisor:
     def _may_move(self, process: ManagedProcess) -> bool:
         """Return True if a gateway's car may be moving. Only a message of its gateway can exclude that."""
         row = self.rows.get(process.name)
-        return process.kind is ProcessKind.GATEWAY and (row is None or row.motors != "off")
+        return process.kind is ProcessKind.GATEWAY and (row is None or row.motors != Motors.OFF)
 
     def _exists(self, car: str) -> bool:
         """Return True unless the car is simulated and its simulator has ended."""
@@ -504,7 +504,7 @@ class Supervisor:
 
     async def _end_all(self, service: SupervisorService) -> None:
         """Shut down in order: coordinator and pages (they would start cars again), cars, recorder, simulator."""
-        self._state = "ending"
+        self._state = RunState.ENDING
         service.publish(self.status())
         gateways = self.processes.of(ProcessKind.GATEWAY)
         movers = self.processes.of(ProcessKind.COORDINATOR, ProcessKind.CONSOLE)
@@ -626,7 +626,7 @@ class Supervisor:
 
 
 def _describe_recording(status: Mapping[str, Any]) -> str:
-    if status["state"] != "closed":
+    if status["state"] != RecorderState.CLOSED:
         return f"recording to {status['session']}"
     lost = sum(status["drops"].values()) + sum(status["missed"].values())
     return f"recording closed: {status['session']}, {status['messages']} messages, {lost} lost"

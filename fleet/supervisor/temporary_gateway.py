@@ -12,6 +12,7 @@ from typing import Final
 from fleet.client.client import Fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from schemas.process.parent import parent_option
+from schemas.words import Motors
 
 TEMPORARY_PREFIX: Final = "temporary-"
 """How the names of cars begin that exist for a moment only."""
@@ -52,7 +53,7 @@ def _is_ready(
             return False
         states = client.get(f"{name}/state/safety")
         served = served or bool(states)
-        if any(each.value.motors == "off" for each in states):
+        if any(each.value.motors == Motors.OFF for each in states):
             return True
         time.sleep(_READY_POLL_S)
     if not served:

@@ -20,7 +20,7 @@ from gateway.control.events import LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Level, Phase, Reason
+from schemas.words import Level, Phase, Reason, Verb
 
 _LOGGING_LEVELS: Final = {
     Level.DEBUG: logging.DEBUG,
@@ -112,7 +112,7 @@ class CommandHandler:
         """Pass a drive of a stream to control."""
         if not sample.deleted:
             request = requests.ParsedRequest(
-                "drive",
+                Verb.DRIVE,
                 sample.payload,
                 sample.encoding,
                 time.time_ns(),

@@ -34,7 +34,7 @@ from schemas.commands import COMMANDS, STOPS
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
-from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep
+from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep, Verb
 
 W = TypeVar("W", bound=str)
 
@@ -113,13 +113,13 @@ def parse(request: ParsedRequest) -> Command:
 
 def _stop_anyway(command: Command, words: str, request: ParsedRequest) -> Command:
     """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
-    what = Stop() if request.verb == "stop" else _readable_estop(request)
+    what = Stop() if request.verb == Verb.STOP else _readable_estop(request)
     return replace(command, what=what, note=f"the gateway stops the car in spite of an error: {words}")
 
 
 def _id(request: ParsedRequest) -> str:
     """Return an id for a request without one. For an e-stop to all cars every gateway makes the same id."""
-    if request.verb != "estop" or not request.by_wildcard:
+    if request.verb != Verb.ESTOP or not request.by_wildcard:
         return uuid.uuid4().hex
     query = (request.payload or b"") + str(request.now_ns // _SAME_QUERY_NS).encode()
     return hashlib.sha256(query).hexdigest()[:32]
@@ -133,7 +133,7 @@ def _readable_estop(request: ParsedRequest) -> EmergencyStop:
         fields = None
     if not isinstance(fields, dict):
         try:
-            message: Any = messages.parse(COMMANDS["estop"].message, request.payload or b"", _encoding(request))
+            message: Any = messages.parse(COMMANDS[Verb.ESTOP].message, request.payload or b"", _encoding(request))
         except messages.BadPayload:
             return EmergencyStop()
         fields = {"why": message.why, "scope": message.scope}
@@ -167,7 +167,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
 
 def _action(verb: str, message: Any, request: ParsedRequest) -> Action:
     """Return the action of a message. Raises ValueError or EncodeError for a wrong field."""
-    if verb == "drive":
+    if verb == Verb.DRIVE:
         return _drive(message, request.longest_drive_s, request.car)
     if verb in _WHAT:
         return _WHAT[verb](message)
@@ -224,7 +224,7 @@ def _lend(message: Any) -> Action:
     to = _text("to", message.to, "/*$#?@")
     if not to:
         raise ValueError("to is missing: the person who gets the car")
-    return Lend(to, _seconds("duration_s", message.duration_s, COMMANDS["lend"].max_duration_s))
+    return Lend(to, _seconds("duration_s", message.duration_s, COMMANDS[Verb.LEND].max_duration_s))
 
 
 def _resume(message: Any) -> Action:
@@ -301,17 +301,17 @@ def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:
 
 
 _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
-    "mode": lambda message: SetMode(_word("mode", message.mode, Mode)),
-    "led": _led,
-    "light": lambda message: OneShot(General(Motion.STOP, light=_word("light", message.light, Light))),
-    "servo": _servo,
-    "arm": lambda message: _checked(ArmSet(tuple(message.joint_deg))),
-    "whistle": lambda _: OneShot(General(Motion.STOP, whistle=True)),
-    "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
-    "fan": _fan,
-    "estop": _estop,
-    "resume": _resume,
-    "pause": lambda message: Pause(_why(message.why)),
-    "lend": _lend,
+    Verb.MODE: lambda message: SetMode(_word("mode", message.mode, Mode)),
+    Verb.LED: _led,
+    Verb.LIGHT: lambda message: OneShot(General(Motion.STOP, light=_word("light", message.light, Light))),
+    Verb.SERVO: _servo,
+    Verb.ARM: lambda message: _checked(ArmSet(tuple(message.joint_deg))),
+    Verb.WHISTLE: lambda _: OneShot(General(Motion.STOP, whistle=True)),
+    Verb.SPEED: lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
+    Verb.FAN: _fan,
+    Verb.ESTOP: _estop,
+    Verb.RESUME: _resume,
+    Verb.PAUSE: lambda message: Pause(_why(message.why)),
+    Verb.LEND: _lend,
 }
 """Actions of the verbs whose fields need rules. `drive` also needs the limit of its gateway."""

@@ -14,6 +14,7 @@ import zenoh
 
 from schemas import bus, keys
 from schemas.commands import STOPS
+from schemas.words import Verb
 
 if TYPE_CHECKING:
     import asyncio
@@ -64,7 +65,7 @@ class CarService:
             # A query on `fleet/**` reaches both: each answers for its own family only.
             opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._on_query, family))
         opened.queryable(keys.command_key(fleet, car, "*"), self._on_command, too_large=self._on_oversized)
-        opened.subscribe(keys.command_key(fleet, car, "drive"), self._stream, largest=bus.LARGEST_PAYLOAD)
+        opened.subscribe(keys.command_key(fleet, car, Verb.DRIVE), self._stream, largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
         opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)

@@ -7,7 +7,7 @@ from typing import Final
 
 from gateway.protocol.frames import ArmSet, Frame, General, Ptz
 from schemas.authority import Sender
-from schemas.words import Mode, Motion, Phase, Reason, SpeedStep
+from schemas.words import Mode, Motion, Phase, Reason, SpeedStep, Verb
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +159,10 @@ Action = (
 )
 
 PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
-    "stop": Stop,
-    "unpause": Unpause,
-    "lease": TakeLease,
-    "find": Find,
+    Verb.STOP: Stop,
+    Verb.UNPAUSE: Unpause,
+    Verb.LEASE: TakeLease,
+    Verb.FIND: Find,
 }
 """Actions by verb whose fields are those of the message, flags or `duration_s`, and need no rule of their own."""
 

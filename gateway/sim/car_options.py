@@ -8,7 +8,7 @@ from typing import Any, Final
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
 from schemas.platform_name import HEAD, OPTION_WORDS, OPTIONS, VARIANTS, check_head
-from schemas.words import Mode
+from schemas.words import Mode, Platform
 
 FLAGS: Final[Mapping[str, Mapping[str, Any]]] = {
     "text": {"text": True},
@@ -48,7 +48,7 @@ class BadOption(ValueError):
 
 def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
     """Return the traits of a car with these options, None if they are those of its platform; raise BadOption."""
-    base = STM32_TRAITS if platform == "stm32" else CarTraits()
+    base = STM32_TRAITS if platform == Platform.STM32 else CarTraits()
     traits = base
     for option in options:
         traits = _with_option(traits, platform, option)

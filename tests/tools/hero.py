@@ -30,9 +30,9 @@ import fleet.examples
 from fleet import Reading, Session
 from fleet.replay.colors import rgb
 from fleet.supervisor.car_status import CarStatus
-from fleet.supervisor.restart_policy import RunState
 from fleet.supervisor.status_table import Table
 from schemas.colors import car_color, hex_color
+from schemas.words import RunState
 from tests.support.ports import free_endpoint
 
 WIDTH: Final = 960

@@ -19,8 +19,9 @@ from fleet.recording.tools.stop_findings import (
 from fleet.recording.tools.verify import SessionVerdict
 from schemas import keys
 from schemas.local_time import clock
+from schemas.words import Basis, Phase
 
-_REFUSED_PHASES: Final = ("rejected", "failed")
+_REFUSED_PHASES: Final = (Phase.REJECTED, Phase.FAILED)
 
 
 @dataclass(slots=True)
@@ -61,8 +62,8 @@ class SessionCheckup:
             self.broken[car] += log_code(message) == "link_lost"
         elif topic == "event/command":
             is_stop = message.verb in STOP_VERBS
-            if is_stop and (message.basis or message.phase == "failed"):
-                self.stops[message.basis or "failed"] += 1
+            if is_stop and (message.basis or message.phase == Phase.FAILED):
+                self.stops[message.basis or Phase.FAILED] += 1
             if message.phase in _REFUSED_PHASES and not is_stop:
                 self.refused[message.reason or message.phase] += 1
 
@@ -98,7 +99,7 @@ class SessionCheckup:
         yield "state", f"{'whole' if verdict.whole else 'not whole'}, {verdict.messages} messages"
         lost = sum(verdict.dropped.values()) + sum(verdict.missed.values())
         yield "lost", f"{verdict.missing_count} missing by number, {lost} by the recorder's count"
-        yield "stops", ", ".join(f"{self.stops[basis]} {basis}" for basis in ("shown", "sent", "failed"))
+        yield "stops", ", ".join(f"{self.stops[basis]} {basis}" for basis in (*Basis, Phase.FAILED))
         yield "refused", _most(self.refused) or "none"
         yield "links lost", _most(self.broken) or "none"
         steps = len(verdict.backwards) + sum(clock.backwards for clock in verdict.clocks.values())

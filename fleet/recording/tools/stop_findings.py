@@ -14,16 +14,17 @@ from schemas import messages
 from schemas.commands import STOPS
 from schemas.keys import name_of
 from schemas.local_time import clock
+from schemas.words import UNKNOWN, LinkState, Phase, Reason, Shows, Verb
 
 NOT_STOPPED_CODE: Final = "not_stopped"
-NOT_SHOWN_CODE: Final = "not_shown"
+NOT_SHOWN_CODE: Final = str(Reason.NOT_SHOWN)
 WATCHED_TOPICS: Final = ("event/command", "event/log", "state/link", "state/health")
 _SAME_STOP_NS: Final = 3_000_000_000
 """Maximum time between the records of one stop."""
-STOP_VERBS: Final = frozenset({*STOPS, "pause"})
+STOP_VERBS: Final = frozenset({*STOPS, Verb.PAUSE})
 """Verbs of commands that stop a car."""
-_FAILED: Final = frozenset({"failed", "rejected", "expired"})
-_OPEN: Final = frozenset({"online", "quiet"})
+_FAILED: Final = frozenset({Phase.FAILED, Phase.REJECTED, Phase.EXPIRED})
+_OPEN: Final = frozenset({LinkState.ONLINE, LinkState.QUIET})
 
 
 @dataclass(slots=True)
@@ -102,10 +103,10 @@ class StopFindings:
     def _causes(self, car: str, words: str) -> Iterator[str]:
         states = self._states.get(car, {})
         link, health = claims_of(states).link, states.get("state/health")
-        if link.what not in (*_OPEN, "unknown"):
+        if link.what not in (*_OPEN, UNKNOWN):
             reason = f" ({link.why})" if link.why and link.why not in words else ""
             yield f"its link was {link.what}{reason}"
-        if health is not None and (health.doubted or health.shows_stops in ("no", "not_known_yet")):
+        if health is not None and (health.doubted or health.shows_stops in (Shows.NO, Shows.UNKNOWN)):
             yield health.shows_stops_words or f"whether it shows stops: {health.shows_stops}"
 
 

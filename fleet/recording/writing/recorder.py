@@ -25,7 +25,7 @@ from schemas import keys, messages
 from schemas.bus import Bus, messages_of, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
-from schemas.words import Level
+from schemas.words import Level, RecorderState, RecorderVerb
 
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
@@ -54,8 +54,6 @@ MAX_MARK_CHARACTERS: Final = 1000
 
 STATUS_TOPIC: Final = TOPICS["@recorder/status"]
 MARK_TOPIC: Final = TOPICS["@recorder/mark"]
-VERBS: Final = ("start", "stop", "status", "mark")
-"""Commands under `<fleet>/@recorder/@cmd/`. The payload of `mark` is JSON with `text` and `by`."""
 
 
 class AnotherRecorder(Exception):
@@ -278,7 +276,7 @@ class Recorder:
                 return
             if self._recording:
                 self._end_session(self._session)
-            self._publish("closed")
+            self._publish(RecorderState.CLOSED)
         except OSError as error:
             self._fail(f"{error.filename or self._session.path}: {error.strerror or error}")
         except Exception as error:  # noqa: BLE001 - a recorder must never stop silently, whatever the cause
@@ -353,7 +351,11 @@ class Recorder:
             self._session.drop(item[0])
         self._error = self._session.abandon(f"recording to {self._session.path} failed: {words}", self._now())
         # Reuse the last status: reading the disk may fail again.
-        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._session.messages
+        self._last.state, self._last.error, self._last.messages = (
+            RecorderState.FAILED,
+            self._error,
+            self._session.messages,
+        )
         self._last.drops.update(self._session.drops)
         with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report it
             self._publisher.put(self._last, self._now())
@@ -362,7 +364,14 @@ class Recorder:
         session = self._session
         return fleet_v1_pb2.Recording(
             session=str(session.path),
-            state=state or ("stopped" if not self._recording else "full" if session.full else "recording"),
+            state=state
+            or (
+                RecorderState.STOPPED
+                if not self._recording
+                else RecorderState.FULL
+                if session.full
+                else RecorderState.RECORDING
+            ),
             bytes=session.bytes,
             messages=session.messages,
             drops=dict(session.drops),
@@ -388,7 +397,7 @@ class Recorder:
         for query in queries:
             with query:
                 key = str(query.key_expr)
-                verb = key.rpartition("/")[2] if "/@cmd/" in key else "status"
+                verb = key.rpartition("/")[2] if "/@cmd/" in key else RecorderVerb.STATUS
                 try:
                     self._handle(verb, query)
                 except _CommandRefused as refused:
@@ -397,20 +406,20 @@ class Recorder:
                     reply_value(query, key, self._last.SerializeToString(), STATUS_TOPIC)
 
     def _handle(self, verb: str, query: zenoh.Query) -> None:
-        if self.ended.is_set() and verb != "status":
+        if self.ended.is_set() and verb != RecorderVerb.STATUS:
             raise _CommandRefused("the recorder is ending")
         match verb:
-            case "start":
+            case RecorderVerb.START:
                 self._start_session()
-            case "stop":
+            case RecorderVerb.STOP:
                 self._stop_session()
-            case "mark":
+            case RecorderVerb.MARK:
                 self._mark(query)
-            case "status":
+            case RecorderVerb.STATUS:
                 if not self.ended.is_set():
                     self._last = self._status()
             case _:
-                raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(VERBS)}.")
+                raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(RecorderVerb)}.")
 
     def _start_session(self) -> None:
         if self._recording:

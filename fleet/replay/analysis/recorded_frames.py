@@ -12,7 +12,7 @@ from typing import Any, Final
 from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
 from schemas.topics import TOPICS
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 
 FRAME_KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
 MAX_MESSAGE_DELAY_NS: Final = 10_000_000_000
@@ -90,7 +90,7 @@ def of_session(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterat
                             del waiting[key.car, topic, at_ns]
                 yield key.car, Rx(at_ns, value.data, value.verdict, published, readings)
             case "state/mode":
-                sure = value.verdict == "confirmed" and value.asked in _MODE_NAMES
+                sure = value.verdict == Verdict.CONFIRMED and value.asked in _MODE_NAMES
                 yield key.car, KnownMode(at_ns, Mode(value.asked) if sure else None)
             case "state/health":
                 yield key.car, KnownPlatform(at_ns, value.platform)

@@ -17,7 +17,7 @@ from gateway.protocol.events import Event
 from gateway.protocol.frames import STANDARD_HEAD
 from gateway.protocol.measurements import measured, verdict_of
 from gateway.protocol.platforms import Profile, parse_platform
-from schemas.words import Mode
+from schemas.words import FrameVerdict, Mode
 
 MAX_MODE_DELAY_NS: Final = 500_000_000
 """Maximum delay from a mode change to its publication: the loop of a gateway processes input in batches."""
@@ -125,8 +125,12 @@ class Redecoding:
             outcome = _outcome(events, profile, mode)
             if outcome not in found:
                 found.append(outcome)
-        if frame.verdict == "echo" and at < ECHO_S and all(verdict != "echo" for verdict, _ in found):
-            found.append(("echo", {}))  # the echo of a frame sent before the recording
+        if (
+            frame.verdict == FrameVerdict.ECHO
+            and at < ECHO_S
+            and all(verdict != FrameVerdict.ECHO for verdict, _ in found)
+        ):
+            found.append((str(FrameVerdict.ECHO), {}))  # the echo of a frame sent before the recording
         return found
 
     def _profiles(self, at_ns: int) -> list[Profile]:

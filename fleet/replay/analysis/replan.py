@@ -31,14 +31,15 @@ from fleet.replay.analysis.recorded_decisions import (
 from schemas import keys, messages
 from schemas.bus import Sample
 from schemas.topics import PROTOBUF
+from schemas.words import Phase, Rank, Verb
 
 STEP_INTERVAL_NS: Final = 100_000_000
 MAX_BATCH_NS: Final = 10_000_000
 """Maximum time between messages that one step processes together."""
 COORDINATOR_HISTORY_NS: Final = 60_000_000_000
 """Time before the start of a coordinator whose readings stand for its first queries."""
-_FINAL_PHASES: Final = frozenset({"sent", "complete", "effect_seen", "rejected", "failed", "expired", "superseded"})
-_SUCCESS_PHASES: Final = frozenset({"sent", "complete", "effect_seen"})
+_FINAL_PHASES: Final = frozenset(Phase) - {Phase.ASKED, Phase.QUEUED}
+_SUCCESS_PHASES: Final = frozenset({Phase.SENT, Phase.COMPLETE, Phase.EFFECT_SEEN})
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +128,9 @@ class Replanning:
     def _outcome(self, item: Recorded) -> None:
         """Apply the outcome of a mode command of the recorded coordinator."""
         event, key = decode_message(item), keys.parse(item.key)
-        if event is None or key is None or event.kind != "coordinator" or event.verb != "mode":
+        if event is None or key is None or event.kind != Rank.COORDINATOR or event.verb != Verb.MODE:
             return
-        if event.phase == "asked":
+        if event.phase == Phase.ASKED:
             try:
                 request: Any = messages.parse("fleet.v1.ModeCommand", event.request, event.request_encoding)
             except messages.BadPayload:

@@ -20,6 +20,7 @@ from schemas.bus import Bus, HubKeeper, is_json_wanted, reply_message, reply_val
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos, Topic
+from schemas.words import Phase, Reason
 
 LOOP_PAUSE_NS: Final = 1_000_000_000
 """Pause between two rounds of a loop."""
@@ -199,7 +200,9 @@ class Player:
             key = keys.command_key(self.name, car, verb)
             if "*" in verb or not query.key_expr.intersects(key):
                 continue
-            result = pb.Result(id=identity, car=car, status="rejected", reason="unsupported", words=self.refuse)
+            result = pb.Result(
+                id=identity, car=car, status=Phase.REJECTED, reason=Reason.UNSUPPORTED, words=self.refuse
+            )
             reply_message(query, key, result, as_json=is_json_wanted(query))
 
 

@@ -22,15 +22,14 @@ from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleSt
 from schemas import keys, messages
 from schemas.colors import Rgb, car_color
 from schemas.commands import COMMANDS
+from schemas.words import Phase, Verb
 
 TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
 MAX_MARK_S: Final = 0.4
 """Maximum length of the mark of a command."""
-_ASKED: Final = "asked"
-_QUEUED: Final = "queued"
-_CARRIED_OUT: Final = frozenset({"sent", "complete"})
+_CARRIED_OUT: Final = frozenset({Phase.SENT, Phase.COMPLETE})
 _LED: Final = "led"
-LED_MESSAGE: Final = COMMANDS["led"].message
+LED_MESSAGE: Final = COMMANDS[Verb.LED].message
 _THING_M: Final = 0.2
 """Drawn height of things: the world is flat."""
 _LAMP_COLOR: Final = (255, 225, 90)
@@ -210,7 +209,7 @@ class Drawing:
         rows = events.to_pylist()
         marks = [f"{row['verb']} {row['phase']}" for row in rows]
         yield self._track(path, panels.COMMAND_TRACK.name, *_with_ends(times, marks))
-        done = [(place, led) for place, row in enumerate(rows) if row["verb"] == _LED and (led := self._led(row))]
+        done = [(place, led) for place, row in enumerate(rows) if row["verb"] == Verb.LED and (led := self._led(row))]
         if done:
             places, leds = [place for place, _ in done], [led for _, led in done]
             self._add_leds(leds)
@@ -218,11 +217,11 @@ class Drawing:
 
     def _led(self, event: dict[str, Any]) -> str:
         """Return the color if this event reports an LED command as sent; the color itself is in its first event."""
-        if event["phase"] == _ASKED:
+        if event["phase"] == Phase.ASKED:
             if len(self._requested) < _MAX_LEDS:
                 self._requested[event["id"]] = _led_color(event)
             return ""
-        if event["phase"] == _QUEUED:
+        if event["phase"] == Phase.QUEUED:
             return ""
         requested = self._requested.pop(event["id"], "")
         return requested if event["phase"] in _CARRIED_OUT else ""

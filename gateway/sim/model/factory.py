@@ -8,6 +8,7 @@ from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.stm32 import Stm32Car
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
+from schemas.words import Platform
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "course")
 
@@ -33,11 +34,11 @@ def build(
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware
     match platform:
-        case "raspberry_pi":
+        case Platform.RASPBERRY_PI:
             car = RaspberryPiCar(body, rng, transport=transport, options=options, traits=traits, now=now)
         case "course":
             car = CourseCar(body, rng, transport=transport, now=now)
-        case "stm32":
+        case Platform.STM32:
             car = Stm32Car(body, rng, options=options, traits=traits, now=now)
         case _:
             car = ArduinoCar(body, rng, options=options, traits=traits, now=now)

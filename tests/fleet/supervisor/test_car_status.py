@@ -19,13 +19,13 @@ from fleet.supervisor.car_status import (
     fit,
 )
 from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
-from fleet.supervisor.restart_policy import RunState
-from fleet.supervisor.spec import FleetSpec, ProcessKind
+from fleet.supervisor.spec import FleetSpec
 from fleet.supervisor.status_table import Table
 from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.local_time import date_and_clock
+from schemas.words import ProcessKind, RunState
 
 
 def test_a_row_says_what_is_new_once() -> None:

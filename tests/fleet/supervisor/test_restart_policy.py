@@ -17,10 +17,10 @@ from fleet.supervisor.restart_policy import (
     Patience,
     ProcessState,
     RestartAction,
-    RunState,
     delay_s,
 )
 from gateway.control.stop_executor import SHUTDOWN_S
+from schemas.words import RunState
 
 LEAVES_BUS_S = 2.0
 """Time that a gateway on a busy machine needs to end after its wait."""

@@ -11,8 +11,9 @@ from fleet.supervisor.child import Log
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
 from fleet.supervisor.restart_policy import ProcessState
 from fleet.supervisor.shutdown import LAST_CLAIM_TIMEOUT_S, NEVER_REACHED, GatewayShutdown, describe_end
-from fleet.supervisor.spec import PATIENCE, ProcessKind
+from fleet.supervisor.spec import PATIENCE
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import ProcessKind
 
 SHOWN = pb.Safety(motors="off", motors_basis="shown", boot_id="a")
 SENT = pb.Safety(motors="off", motors_basis="sent", trust_evidence="red sends no readings", boot_id="a")
