@@ -6,6 +6,7 @@ It has the docstrings of the code, so a wrong docstring is corrected in one plac
 import inspect
 import re
 from collections.abc import Callable
+from enum import StrEnum
 
 from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, Session, aio, conditions
 from fleet.client import client, reading, wait
@@ -116,7 +117,8 @@ def _signature(function: Callable[..., object]) -> str:
 
 
 def _parameter(each: inspect.Parameter) -> str:
-    default = "" if each.default is inspect.Parameter.empty else f" = {each.default!r}"
+    given = str(each.default) if isinstance(each.default, StrEnum) else each.default
+    default = "" if given is inspect.Parameter.empty else f" = {given!r}"
     star = "*" if each.kind is inspect.Parameter.VAR_POSITIONAL else ""
     return f"{star}{each.name}: {_type(each.annotation)}{default}"
 
