@@ -30,7 +30,7 @@ from gateway.control.events import OutgoingFrame
 from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.learned_file import LearnedFile
-from gateway.link import BaudWatch, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected, TextLine
 from gateway.protocol.platforms import Profile
@@ -254,12 +254,15 @@ class CarGateway:
     async def _connect(self) -> None:
         """Keep the link open, and read from it."""
         may_fail = self._settings.retry
+        looked_again = False
         while True:
             try:
                 link = await open_link(self._settings.url, first=self._may_move)
             except LinkError as error:
                 if not may_fail and not await self._is_port_in_use():
-                    raise
+                    if looked_again or not isinstance(error, Busy):
+                        raise
+                    looked_again = True  # another gateway had the port, and has ended since
                 self._on_link_lost(str(error))
                 await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
                 continue

@@ -317,7 +317,9 @@ def test_a_second_gateway_refuses_and_names_the_first(fleet: FleetProcesses, tcp
 def remaining(fleet: FleetProcesses, both: list[GatewayProcess]) -> GatewayProcess:
     """Wait until one of two has yielded and the other has looked again."""
     wait_for(lambda: any(one.popen.poll() is not None for one in both), "one yields")
-    (yields,) = [one for one in both if one.popen.poll() is not None]
+    ended = [one for one in both if one.popen.poll() is not None]
+    assert len(ended) == 1, [(one.wait(), one.stderr) for one in ended]
+    (yields,) = ended
     (stays,) = [one for one in both if one is not yields]
     assert yields.wait() == 1
     assert "is served already" in yields.stderr or "in use" in yields.stderr
