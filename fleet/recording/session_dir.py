@@ -100,7 +100,7 @@ class SessionInfo:
             if not is_full(error) or not spare.is_file():
                 raise
             with spare.open("r+b", buffering=0) as file:
-                file.truncate(_write_all(file, (json.dumps(values) + "\n").encode()))
+                file.truncate(write_all(file, (json.dumps(values) + "\n").encode()))
             spare.replace(directory / SESSION_FILE)
             with contextlib.suppress(OSError):  # from the space that the old description has freed
                 reserve(directory)
@@ -114,7 +114,7 @@ def is_full(error: OSError) -> bool:
 def reserve(directory: Path) -> None:
     """Reserve space for one more description; raises OSError, and then keeps the space reserved so far."""
     with (directory / SPARE_FILE).open("ab", buffering=0) as file:
-        _write_all(file, bytes(max(0, SPARE_BYTES - file.tell())))
+        write_all(file, bytes(max(0, SPARE_BYTES - file.tell())))
 
 
 def release(directory: Path) -> None:
@@ -122,8 +122,8 @@ def release(directory: Path) -> None:
     (directory / SPARE_FILE).unlink(missing_ok=True)
 
 
-def _write_all(file: FileIO, data: bytes) -> int:
-    """Write all data unbuffered: a buffer would be written again, and fail again, when the file is closed."""
+def write_all(file: FileIO, data: bytes) -> int:
+    """Write all data, and return its size. Unbuffered: a buffer would fail again when the file is closed."""
     rest = memoryview(data)
     while rest:
         rest = rest[file.write(rest) :]

@@ -430,7 +430,7 @@ class Supervisor:
             if self.processes.on_heartbeat(RECORDER):
                 self._gateways_from = self.processes.now
             self._recorder_heard_at = self.processes.now
-            self._set_unrecorded(why_unrecorded(value))
+            self._set_unrecorded(why_unrecorded(value), "what waited is written" if value.state == "closed" else "")
         elif car == COORDINATOR:
             self._on_plan(value)
         elif row is not None and topic == "state/health":
@@ -447,10 +447,13 @@ class Supervisor:
             if topic == "event/log":
                 self._say("log", car, row.event)
 
-    def _set_unrecorded(self, why: str) -> None:
-        """Say once that nothing is recorded any more, and that everything is again. The cars drive on."""
+    def _set_unrecorded(self, why: str, over: str = "") -> None:
+        """Say once that nothing is recorded any more, and that everything is again. The cars drive on.
+
+        over: what to say if it is over. Empty: that recording goes on.
+        """
         if bool(why) is not bool(self._unrecorded):
-            self._say("process", RECORDER, f"NOT RECORDED: {why}" if why else "records again")
+            self._say("process", RECORDER, f"NOT RECORDED: {why}" if why else over or "records again")
         self._unrecorded = why
 
     def _on_line(self, process: ManagedProcess, line: str) -> bool:

@@ -1,5 +1,6 @@
 """`fleet up` with real processes: it restarts crashed and hanging processes, not absent cars, and ends in order."""
 
+import contextlib
 import json
 import os
 import pty
@@ -18,9 +19,12 @@ from pathlib import Path
 import pytest
 
 from fleet.client.supervision import ask_status
+from fleet.recording.reading.session import Session
+from fleet.recording.tools.verify import verify
 from schemas import bus, keys
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
+from tests.support.disk import MAY_MOUNT, Disk, disk
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, freeze, wait_for
 from tests.support.up import Up, fleet_command
@@ -618,6 +622,48 @@ def test_a_recording_that_pauses_is_said_by_up_status_doctor_and_down(tmp_path: 
         assert "red: stopped" in down.stdout
         assert "it was unplugged" in down.stderr
         assert up.process.wait() == 1
+
+
+@contextlib.contextmanager
+def small_disk(place: Path) -> Iterator[Disk]:
+    """Yield a disk that takes the sessions of a `fleet up` in this directory."""
+    with disk("full for a while", place) as there:
+        there.root.mkdir()
+        (place / "sessions").symlink_to(there.root)
+        yield there
+
+
+@pytest.mark.xdist_group("disk")
+@pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
+def test_a_disk_that_is_full_for_a_while_costs_nothing_and_all_say_the_same(tmp_path: Path) -> None:
+    with small_disk(tmp_path) as there, Up(tmp_path, free_endpoint(), "--sim", "1") as up:
+        up.until("ready", "@supervisor", "red is ready")
+        session = Path(up.status().session)
+
+        def says() -> list[bool]:
+            """Return for each place that tells it whether it says that the car is recorded."""
+            wait_for(lambda: bool(up.status().unrecorded) is (up.get("@recorder/status").state == "full"), "the same")
+            return [
+                "not recorded" not in up.fleet("status").stdout,
+                up.fleet("record", "status").stdout.startswith("recording: "),
+                json.loads(up.fleet("doctor", "red", "--json").stdout)["findings"] == [],
+                up.fleet("mark", "here").returncode == 0,
+            ]
+
+        assert says() == [True] * 4
+        there.fill()
+        up.until("process", "@recorder", "NOT RECORDED")
+        assert says() == [False] * 4
+        waited = up.get("@recorder/status")
+        assert waited.warning == "", "one state: what it was before is no second one"
+        there.free()
+        up.until("process", "@recorder", "records again")
+        assert says() == [True] * 4
+        assert up.fleet("down").returncode == 0
+        up.process.wait()
+        verdict = verify(Session(session))
+        assert verdict.whole, list(verdict.words())
+        assert [mark["text"] for mark in json.loads((session / "session.json").read_text())["marks"]] == ["here"] * 3
 
 
 def _file(directory: Path, **links: str) -> Path:

@@ -112,7 +112,7 @@ class Recorder:
         self._max_bytes = max_bytes
         self._now = ReceiveClock(wall_ns).ns
         self._notify = notify
-        self._reported: set[str] = set()
+        self._reported: dict[str, str] = {}
         self._lock = threading.Lock()
         self._queue: list[_Item] = []
         self._writing: Iterator[_Item] = iter(())
@@ -335,11 +335,14 @@ class Recorder:
             self._notify(words)
         session.removed.clear()
         session.uncopied.clear()
-        states = {"full": session.full, "warning": "" if session.full else session.warning.partition(",")[0]}
-        now = {f"{kind}: {text}" for kind, text in states.items() if text}
-        for text in sorted(now - self._reported):
-            self._notify(text)
-        if any(text.startswith("full") for text in self._reported) and not session.full and self._recording:
+        # Numbers in the words change all the time: a pause is news once, a warning once for each text before its comma.
+        now = {"full": session.full} if session.full else {}
+        if session.warning:
+            now["warning"] = session.warning.partition(",")[0]
+        for kind, text in now.items():
+            if kind not in self._reported or (kind == "warning" and text != self._reported[kind]):
+                self._notify(f"{kind}: {text}")
+        if "full" in self._reported and not session.full and self._recording:
             self._notify(f"there is room again: recording continues to {session.path}")
         self._reported = now
 

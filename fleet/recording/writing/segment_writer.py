@@ -1,40 +1,80 @@
-"""Writes one MCAP file: channels, schemas and messages. session_writer.py assigns messages to files. No threads."""
+"""Writes one MCAP file: channels, schemas and messages. session_writer.py assigns messages to files. No threads.
+
+The writer of the mcap package is of no use after an error: its index has chunks that the file lacks. So it writes into
+memory, and only `flush` and `finish` write to the disk. What a full disk does not take waits for the next try.
+"""
 
 import contextlib
 import json
 import os
 from collections.abc import Mapping
+from io import FileIO
 from pathlib import Path
 from typing import Any, Final
 
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
+from fleet.recording.session_dir import write_all
 from fleet.recording.writing.mcap_copy import SESSION_METADATA
 from schemas import messages
 
 _LOSS_METADATA: Final = "recording"
 
 
+class _Tail:
+    """The end of a file that is not on the disk yet. The part of a file's interface that the mcap writer uses."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.start = 0
+        """Where in the file the data belongs."""
+
+    def write(self, data: bytes) -> int:
+        self.data += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.start + len(self.data)
+
+    def flush(self) -> None:
+        """Do nothing: `Segment.flush` writes to the disk."""
+
+    def drop(self) -> None:
+        """Forget data that is on the disk."""
+        self.start += len(self.data)
+        self.data = bytearray()
+
+
 class Segment:
-    """One MCAP file to write. Every method may raise OSError; after an error only call `cut`."""
+    """One MCAP file to write. `flush` and `finish` may raise OSError: call them again when there is room, or `cut`."""
 
     def __init__(self, path: Path, about: Mapping[str, str]) -> None:
-        self._file = path.open("xb")
+        self._file = FileIO(path, "xb")
+        self._tail = _Tail()
         # Any: half of the writer's methods have no types. Data CRCs cover the bytes between chunks, too.
-        self._writer: Any = Writer(self._file, enable_data_crcs=True)
+        self._writer: Any = Writer(self._tail, enable_data_crcs=True)  # type: ignore[arg-type]
         self._schemas: dict[str, int] = {}
+        self._finished = False
         self.path = path
-        self.bytes = 0
-        """Flushed size of the file."""
         self.add = self._writer.add_message
         """Adds (channel, log time, payload, publish time, sequence). A bound method: each call per message costs."""
+        self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
+        self._writer.add_metadata(SESSION_METADATA, dict(about))
         try:
-            self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
-            self._writer.add_metadata(SESSION_METADATA, dict(about))
             self.flush()
         except OSError:
             self.cut()
             raise
+
+    @property
+    def bytes(self) -> int:
+        """Return the size on the disk: that of the last flush."""
+        return self._tail.start
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Return the size of what the disk has not taken yet."""
+        return len(self._tail.data)
 
     def channel(self, key: str, encoding: str) -> int:
         """Register a channel for a key and a Zenoh encoding, and return its id."""
@@ -57,32 +97,33 @@ class Segment:
 
     def flush(self, *, sync: bool = False) -> None:
         """End the chunk and pass all data to the operating system; with `sync`, to the disk."""
-        self._writer.flush()
-        self._file.flush()
-        self.bytes = self._file.tell()
-        if sync:
-            os.fsync(self._file.fileno())
+        if not self._finished:
+            self._writer.flush()
+        self._write(sync=sync)
 
     def finish(self, lost: Mapping[str, object], *, sync: bool = False) -> None:
         """Write the counts of lost messages and the index, and close the file."""
-        self._writer.flush()
-        self._writer.add_metadata(_LOSS_METADATA, {name: json.dumps(value) for name, value in lost.items()})
-        self._writer.finish()
-        self._file.flush()
-        if sync:
-            os.fsync(self._file.fileno())
-        self.bytes = self._file.tell()
+        if not self._finished:
+            self._writer.flush()
+            self._writer.add_metadata(_LOSS_METADATA, {name: json.dumps(value) for name, value in lost.items()})
+            self._writer.finish()
+            self._finished = True
+        self._write(sync=sync)
         self._file.close()
 
     def cut(self) -> None:
-        """Close a file after a write error, truncated to its last flush: half a chunk is of no use."""
-        with contextlib.suppress(OSError):
-            os.truncate(self.path, self.bytes)
+        """Close a file that the disk takes no end of."""
+        self._file.close()
+
+    def _write(self, *, sync: bool) -> None:
+        start = self._tail.start
         try:
-            self._file.close()
+            self._file.seek(start)
+            write_all(self._file, bytes(self._tail.data))
+            if sync:
+                os.fsync(self._file.fileno())
         except OSError:
-            # The rest of the buffer cannot be written. Release the descriptor all the same.
-            with contextlib.suppress(OSError):
-                self._file.raw.close()
-        with contextlib.suppress(OSError):  # closing may have written part of the buffer
-            os.truncate(self.path, self.bytes)
+            with contextlib.suppress(OSError):  # half a chunk is of no use, and takes room
+                self._file.truncate(start)
+            raise
+        self._tail.drop()

@@ -34,8 +34,10 @@ MAX_SEGMENTS: Final = 9990
 """Maximum segments of a session: their names have four digits."""
 MIN_START_BYTES: Final = 500_000
 """Minimum free space above the reserve to begin a session."""
-MAX_RESUME_BYTES: Final = 50 * MB
-"""Maximum space above the reserve to wait for before resuming. With less, the disk fills again at once."""
+MAX_RESUME_BYTES: Final = 5 * MB
+"""Maximum space above the reserve to wait for before resuming. With less, files of a second follow each other.
+
+More would keep a small disk, on which a session can begin, from ever recording again."""
 PROBE_BYTES: Final = 4096
 """Size of the file that tries whether a directory takes files: a block of most disks."""
 MIN_CLOSE_BYTES: Final = 200_000
@@ -151,6 +153,8 @@ class SessionWriter:
         """Old sessions removed for the quota. The recorder reports and clears them."""
         self._index: list[dict[str, Any]] = []
         self._written = self._closed_bytes = self._buffered_bytes = 0
+        self._unended = 0
+        """Rows at the begin of the buffer that are in a segment whose end a full disk did not take."""
         self._unflushed: list[_BufferedRow] = []
         self._reset_segment(now_ns)
         self._open(now_ns, self._options.keep_free_bytes + MIN_START_BYTES)
@@ -187,13 +191,10 @@ class SessionWriter:
                 if state.tracker.has_gaps:
                     self.gaps.add(key)
         self._unflushed.append((state, received_ns, payload, published_ns, sequence))
-        if self._segment is None:
+        if self.full:
             self._limit_buffer()
-            return
-        try:
+        else:
             self._put(state.channel, received_ns, payload, published_ns, sequence)
-        except OSError as error:
-            self._on_write_error(error)
 
     def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> None:
         """Write a backfilled publication, unless it is recorded already or older than the session."""
@@ -221,25 +222,17 @@ class SessionWriter:
 
     def _write(self, row: _BufferedRow) -> None:
         self._unflushed.append(row)
-        if self._segment is None:
+        if self.full:
             self._limit_buffer()
-            return
-        try:
+        else:
             self._put(row[0].channel, *row[1:])
-        except OSError as error:
-            self._on_write_error(error)
 
     def _key_state(self, key: str, encoding: zenoh.Encoding) -> KeyState:
         """Return the state of a key and an encoding. A key has a second state only if its encoding changes."""
         words = str(encoding)
         state = self._states_by_encoding.get((key, words))
         if state is None:
-            channel = -1
-            if self._segment is not None:
-                try:
-                    channel = self._segment.channel(key, words)
-                except OSError as error:
-                    self._on_write_error(error)
+            channel = -1 if self.full or self._segment is None else self._segment.channel(key, words)
             state = KeyState(key, encoding, self._trackers.setdefault(key, SequenceTracker()), channel)
             self._states_by_encoding[key, words] = state
         self._states[key] = state
@@ -286,9 +279,10 @@ class SessionWriter:
 
     def tick(self, now_ns: int) -> None:
         """Flush, roll over to the next segment if it is due, and check the disk."""
-        if self._segment is None:
+        if self.full:
             self._resume(now_ns)
             return
+        assert self._segment is not None
         try:
             self._flush(sync=self._options.sync is Sync.SECOND)
             segment_s = self._options.segment_s
@@ -299,7 +293,8 @@ class SessionWriter:
                     self._begin_segment(now_ns)
         except OSError as error:
             self._on_write_error(error)
-        self._check_disk()
+        if not self.full:
+            self._check_disk()
 
     def mark(self, text: str, by: str, now_ns: int) -> None:
         """Add a mark and exempt the session from the quota; raises OSError."""
@@ -313,18 +308,17 @@ class SessionWriter:
 
         Count messages that still do not fit as dropped, and describe them in `cost`.
         """
-        try:
-            self._flush()
-        except OSError as error:
-            self._on_write_error(error)
+        self._try_to_finish()
         dropped = 0
         if self._segment is None and self._unflushed and self._open(now_ns, MIN_CLOSE_BYTES):
             dropped = self._drop_all(self._write_buffered(MIN_CLOSE_BYTES))
-        try:
-            if self._segment is not None:
-                self._finish_segment()
-        except OSError as error:
-            self._on_write_error(error)
+            self._try_to_finish()
+        if self._segment is not None:
+            self._segment.cut()
+            if self._index and not any(state.count for state in self._states_by_encoding.values()):
+                self._segment.path.unlink(missing_ok=True)  # an empty one
+            else:
+                self._add_to_index()
             self.cost = "The disk is full: the last file has no end, but all its messages"
         if dropped := dropped + self._drop_buffered():
             self.cost = f"The disk stayed full: {dropped} waiting messages are lost"
@@ -360,8 +354,7 @@ class SessionWriter:
         if self._unflushed:  # else a large first message would begin an empty file at each attempt
             room_bytes += len(self._unflushed[0][2])
         if free < room_bytes:
-            if not self.full:
-                self._pause(describe_shortage(free, room_bytes))
+            self._pause(describe_shortage(free, room_bytes))
             return False
         made = self._made
         try:
@@ -379,7 +372,7 @@ class SessionWriter:
             self._copy_files()
         with contextlib.suppress(OSError):
             session_dir.reserve(self.path)
-        self.full = ""
+        self._on_room()
         return True
 
     def _reset_segment(self, now_ns: int) -> None:
@@ -406,7 +399,9 @@ class SessionWriter:
 
     def _on_flushed(self) -> None:
         """Add the flushed messages to the counters of the index."""
-        rows = self._unflushed
+        in_segment = self._unended if self.full else len(self._unflushed)
+        rows, self._unflushed = self._unflushed[:in_segment], self._unflushed[in_segment:]
+        self._unended = 0
         if not rows:
             return
         first_ns, last_ns = rows[0][1], rows[-1][1]
@@ -420,7 +415,15 @@ class SessionWriter:
             state.count += 1
             state.final = sequence
         self._written += len(rows)
-        self._unflushed = []
+
+    def _try_to_finish(self) -> None:
+        """Flush and finish the segment, if there is one and the disk takes its end."""
+        try:
+            if self._segment is not None:
+                self._flush()
+                self._finish_segment()
+        except OSError as error:
+            self._on_write_error(error)
 
     def _finish_segment(self) -> None:
         assert self._segment is not None
@@ -449,25 +452,35 @@ class SessionWriter:
     # ------------------------------------------------------------------ full disk
 
     def _on_write_error(self, error: OSError) -> None:
-        """Pause if the disk is full, with the unflushed messages as buffer. Raise any other error."""
+        """Pause if the disk is full, with the unflushed messages as buffer. Raise any other error.
+
+        The segment stays as it was flushed last, and keeps its end until there is room for it.
+        """
         if not session_dir.is_full(error):
             raise error
-        if self._segment is not None:
-            self._segment.cut()
-            if self._index and not any(state.count for state in self._states_by_encoding.values()):
-                self._segment.path.unlink(missing_ok=True)  # an empty one
-                self._segment = None
-            else:
-                self._add_to_index()
+        if self._segment is not None and not self.full:
+            self._unended = len(self._unflushed)
         self._pause(f"{error.strerror or error}")
 
     def _pause(self, words: str) -> None:
-        self.full = f"{self._root}: {words}. Recording pauses until there is room."
-        self.description.error = self.full
+        """Pause, or say why it still pauses."""
+        began, self.full = not self.full, f"{self._root}: {words}. Recording pauses until there is room."
+        self.warning = ""
         self._buffered_bytes = sum(len(row[2]) for row in self._unflushed)
+        if not began:
+            return
+        self.description.error = self.full
         if self._made:
             with contextlib.suppress(OSError):  # the status names it, and session.json is written at the end
                 self._write_info(None, closed=False)
+
+    def _on_room(self) -> None:
+        """Record again. The pause stays in session.json, as one that is over."""
+        if self.full:
+            self.description.error = (
+                f"{self.description.error.partition('. Recording pauses')[0]}. Recording had paused."
+            )
+        self.full = ""
 
     def _limit_buffer(self) -> None:
         """Drop the newest message if the buffer is full."""
@@ -505,7 +518,7 @@ class SessionWriter:
         free = self.free_bytes
         if free < keep * FREE_WARNING_FACTOR:
             self.warning = f"{self._root}: the disk is nearly full, {free / MB:.0f} MB are left"
-        if free < keep and self._segment is not None:
+        if free < keep:
             try:
                 self._finish_segment()
             except OSError as error:
@@ -515,16 +528,21 @@ class SessionWriter:
 
     def _resume(self, now_ns: int) -> None:
         keep = self._options.keep_free_bytes
-        if self._open(now_ns, keep + max(min(keep, MAX_RESUME_BYTES), MIN_START_BYTES)):
-            rest = self._write_buffered(keep + MIN_CLOSE_BYTES)
-            try:
-                if rest and self._segment is not None:
-                    self._finish_segment()
-            except OSError as error:
-                self._on_write_error(error)
+        if self._segment is not None:
+            free, needed = self.free_bytes, keep + MIN_CLOSE_BYTES + self._segment.waiting_bytes
+            if free < needed:
+                self._pause(describe_shortage(free, needed))
+                return
+            self._try_to_finish()
+        if self._segment is not None or not self._open(
+            now_ns, keep + max(min(keep, MAX_RESUME_BYTES), MIN_START_BYTES)
+        ):
+            return
+        if rest := self._write_buffered(keep + MIN_CLOSE_BYTES):
+            if not self.full:
+                self._try_to_finish()
             self._unflushed += rest
-            if self._segment is None:
-                self._pause(f"{len(self._unflushed)} waiting messages need more space")
+            self._pause(f"{len(self._unflushed)} waiting messages need more space")
 
     def _write_buffered(self, keep_bytes: int) -> list[_BufferedRow]:
         """Write the buffer while this much stays free, and return the rest."""
@@ -532,7 +550,7 @@ class SessionWriter:
         done = size = 0
         most = self.free_bytes - keep_bytes
         try:
-            while done < len(rows) and self._segment is not None:
+            while done < len(rows):
                 state, received_ns, payload, published_ns, sequence = rows[done]
                 if size + len(payload) > most:
                     break
