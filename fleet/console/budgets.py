@@ -19,7 +19,7 @@ DEVICE_RATE: Final = 320.0
 """The same for all pages of one device."""
 REQUEST_BURST: Final = 1000.0
 REQUEST_RATE: Final = 50.0
-"""HTTP requests of one person other than STOP: a page loads some 25 files."""
+"""HTTP requests of one device other than STOP: a page loads some 25 files."""
 CHECK_BURST: Final = 20.0
 CHECK_RATE: Final = 1.0
 """Checks of plans of one person: a person who writes one asks for one in ten seconds."""
@@ -31,11 +31,11 @@ COOLDOWN_S: Final = 15.0
 # the burst three times: each command costs every gateway that is asked.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
-"""Commands of one person that ask gateways, at once and per second. A press is one, also if it changes direction."""
+"""Commands of one device that ask gateways, at once and per second. A press is one, also if it changes direction."""
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum commands of one person without an outcome. One command may be for many cars."""
-MAX_PERSONS: Final = 256
-"""Maximum number of remembered persons and devices. The one that was idle the longest is forgotten."""
+MAX_BUDGETS: Final = 1024
+"""Maximum number of remembered persons, devices and strangers. The one that was idle the longest is forgotten."""
 MERGE_S: Final = 0.1
 """Time for which further STOPs of one person are merged into one that follows."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
@@ -82,9 +82,9 @@ class _Budget:
 
 @dataclass(slots=True)
 class Budgets:
-    """The budgets of all persons by name, and of their devices by id (None: of this computer)."""
+    """The budgets of persons by name, of devices by id (None: this computer), and of strangers by address."""
 
-    _persons: dict[Hashable, _Budget] = field(default_factory=dict)
+    _all: dict[Hashable, _Budget] = field(default_factory=dict)
 
     def may_send(self, device: Hashable, page: Allowance, now: float) -> bool:
         """Count a message. Return False if the page has to be closed: it, or its device, has sent too many."""
@@ -98,20 +98,20 @@ class Budgets:
         """Return False if a page of this device was closed a moment ago."""
         return now >= self._of(device, now).closed_until
 
-    def may_ask(self, person: Hashable, now: float) -> bool:
+    def may_ask(self, device: Hashable, now: float) -> bool:
         """Count an HTTP request. Return False if there were too many."""
-        return self._of(person, now).requests.take(now)
+        return self._of(device, now).requests.take(now)
 
     def may_check(self, person: Hashable, now: float) -> bool:
         """Count a check of a plan. Return False if there were too many."""
         return self._of(person, now).checks.take(now)
 
-    def may_command(self, person: Hashable, now: float) -> bool:
+    def may_command(self, device: Hashable, now: float) -> bool:
         """Count a command that asks gateways. Return False if there were too many."""
-        return self._of(person, now).commands.take(now)
+        return self._of(device, now).commands.take(now)
 
-    def _of(self, person: Hashable, now: float) -> _Budget:
-        found = self._persons.pop(person, None)
+    def _of(self, whose: Hashable, now: float) -> _Budget:
+        found = self._all.pop(whose, None)
         if found is None:
             found = _Budget(
                 Allowance(DEVICE_BURST, DEVICE_RATE, at=now),
@@ -119,9 +119,9 @@ class Budgets:
                 Allowance(CHECK_BURST, CHECK_RATE, at=now),
                 Allowance(COMMAND_BURST, COMMAND_RATE, at=now),
             )
-        self._persons[person] = found
-        if len(self._persons) > MAX_PERSONS:
-            del self._persons[next(iter(self._persons))]
+        self._all[whose] = found
+        if len(self._all) > MAX_BUDGETS:
+            del self._all[next(iter(self._all))]
         return found
 
 

@@ -480,7 +480,7 @@ class Console:
             return f"There is no car {min(unknown)}."
         if page.operator.is_busy:
             return f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them."
-        if not self.budgets.may_command(page.person.name, now):
+        if not self.budgets.may_command(page.device or None, now):
             return "Too many commands. Wait a few seconds."
         return ""
 

@@ -246,8 +246,9 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
 
     async def limited(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and scope["path"] != STOP_PATH:
-            person = scope.get(PERSON)
-            if not console.budgets.may_ask(person and person.name, time.monotonic()):
+            # By device: another tablet of the same person does not pay for it, and this computer for no stranger.
+            stranger = ("stranger", scope["client"][0]) if more else None
+            if not console.budgets.may_ask(scope.get(DEVICE, stranger), time.monotonic()):
                 await _too_much("This device asks for far more than a page does. Wait a few seconds.")(
                     scope, receive, send
                 )
@@ -258,7 +259,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
 
 
 def _too_much(words: str) -> Response:
-    """Answer a request over its person's budget. The rest of it is not read."""
+    """Answer a request over its budget. The rest of it is not read."""
     return JSONResponse({"ok": False, "words": words}, 429, {"connection": "close"})
 
 

@@ -11,7 +11,7 @@ from fleet.console.budgets import (
     CHECK_BURST,
     CHECK_RATE,
     COOLDOWN_S,
-    MAX_PERSONS,
+    MAX_BUDGETS,
     MERGE_S,
     Budgets,
     StopMerge,
@@ -54,12 +54,12 @@ def test_a_new_page_brings_its_device_no_new_budget() -> None:
     assert taken < 20_000
 
 
-def test_requests_have_a_budget_and_few_persons_are_remembered() -> None:
+def test_requests_have_a_budget_and_few_are_remembered() -> None:
     budgets = Budgets()
     assert sum(budgets.may_ask("mia", 0.0) for _ in range(5000)) < 2000
     for number in range(5000):
         assert budgets.may_ask(number, 0.0)
-    assert len(budgets._persons) == MAX_PERSONS
+    assert len(budgets._all) == MAX_BUDGETS
 
 
 def test_checks_of_plans_have_a_budget_of_their_own() -> None:

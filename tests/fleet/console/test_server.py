@@ -25,7 +25,7 @@ from websockets.typing import Origin
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
-from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE
+from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE, REQUEST_BURST
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.log_rate import LOG_BURST
@@ -49,7 +49,7 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 GUESTS = (
     *("boss", "calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
-    *("giver", "presser", "plotter", "pinger", "lister", "twotab"),
+    *("giver", "presser", "plotter", "pinger", "lister", "twotab", "tworeq"),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
@@ -570,11 +570,11 @@ def allowed_commands(since: float) -> float:
 
 
 COMMANDS = 3 * int(COMMAND_BURST)
-"""Commands of a person that floods gateways."""
+"""Commands of a device that floods gateways."""
 
 
 @pytest.mark.parametrize("kind", ["take", "give_back", "unpause", "do"])
-def test_commands_in_a_flood_reach_gateways_at_a_persons_rate(stage: ServerStage, kind: str) -> None:
+def test_commands_in_a_flood_reach_gateways_at_a_devices_rate(stage: ServerStage, kind: str) -> None:
     begun: list[str] = []
 
     def note(sample: Sample) -> None:
@@ -604,7 +604,7 @@ def test_a_car_that_nobody_knows_is_refused_without_a_query(stage: ServerStage, 
         assert answers_so_far(page)["bad"] == 10
 
 
-def test_presses_begin_at_a_persons_rate(stage: ServerStage) -> None:
+def test_presses_begin_at_a_devices_rate(stage: ServerStage) -> None:
     since, sent, over = time.monotonic(), 0, 0
     with stage.device("presser").socket() as page:
         while sent < COMMANDS:
@@ -618,6 +618,14 @@ def test_presses_begin_at_a_persons_rate(stage: ServerStage) -> None:
             over += message["t"] == "over"
         over += answers_so_far(page)["over"]
     assert sent - over <= allowed_commands(since)
+
+
+def answers_until(page: ClientConnection, last: str) -> Counter[str]:
+    """Return how many messages of each kind come until the first one of this kind."""
+    found = Counter[str]()
+    while not found[last]:
+        found[json.loads(page.recv(30))["t"]] += 1
+    return found
 
 
 def answers_so_far(page: ClientConnection) -> Counter[str]:
@@ -669,6 +677,45 @@ def test_another_device_of_a_person_who_floods_stays_live(stage: ServerStage) ->
         assert answers_so_far(page)["tick"]
         with calm.socket() as again:
             assert json.loads(again.recv(30))["t"] == "hello"
+
+
+def test_commands_in_a_flood_cost_no_other_device_of_the_person(stage: ServerStage) -> None:
+    with stage.device("giver").socket() as flooding, stage.device("giver").socket() as page:
+        for number in range(COMMANDS):
+            flooding.send(json.dumps({"t": "do", "id": number, "verb": "whistle", "cars": ["red"]}))
+        assert answers_so_far(flooding)["bad"] > 0
+        page.send(json.dumps({"t": "do", "id": 1, "verb": "whistle", "cars": ["red"]}))
+        assert answers_until(page, "done")["bad"] == 0
+
+
+def test_requests_in_a_flood_cost_no_other_device_of_the_person_and_not_this_computer(stage: ServerStage) -> None:
+    flooder, calm = stage.device("tworeq"), stage.device("tworeq")
+    stranger = NetworkDevice(stage.lan_port, source="127.0.0.7")
+
+    def statuses(of: NetworkDevice, path: str, count: int) -> set[int]:
+        """Send requests one after the other, up to the first refusal; return the statuses."""
+        found: set[int] = set()
+        left = count
+        while left > 0 and 429 not in found:
+            connection = of.connection()
+            with contextlib.suppress(http.client.HTTPException, OSError):  # the console ends that of a stranger
+                while left > 0 and 429 not in found:
+                    connection.request("GET", path, headers={"Cookie": of.cookie} if of.cookie else {})
+                    response = connection.getresponse()
+                    response.read()
+                    found.add(response.status)
+                    left -= 1
+            connection.close()
+        return found
+
+    flood, calmly = 100 * int(REQUEST_BURST), 200
+    assert statuses(flooder, "/hello", flood) == {200, 429}
+    assert statuses(calm, "/hello", calmly) == {200}
+    assert flooder.ask("POST", "/stop")[0] == 204, "STOP has no budget"
+    assert statuses(stranger, "/pair", flood) == {200, 429}
+    assert statuses(NetworkDevice(stage.lan_port, source="127.0.0.8"), "/pair", calmly) == {200}
+    for _ in range(calmly):
+        assert answer(stage.console.port, "GET", "/hello")[0] == 200
 
 
 def test_a_flood_fills_no_log(stage: ServerStage) -> None:
