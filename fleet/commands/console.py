@@ -10,7 +10,6 @@ import socket
 import sys
 import time
 import webbrowser
-from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -37,6 +36,7 @@ from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
 from fleet.fleetfile.fleet_file import read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
+from schemas.authority import NO_PEOPLE, People, PersonRole
 from schemas.bus import resolve_endpoint
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import Rank
@@ -159,7 +159,7 @@ def serve_console(
 
     with listener:
         file = PeopleFile(people_path(resolve_endpoint(connect), fleet))
-        lan = _open_lan(lan_port, file, read_people(fleet_file)) if on_lan else None
+        lan = _open_lan(lan_port, file, _people_of(fleet_file)) if on_lan else None
 
         def on_ready() -> None:
             if parent is None:
@@ -204,7 +204,8 @@ examples:
 def pair(name: str | None, rank: str, connect: str | None, fleet: str) -> None:
     """Make a code that pairs one device with the console as the person NAME (default: you).
 
-    NAME is one of the people of the fleet file, if it lists any. A console must serve the network: fleet console --lan.
+    NAME is one of the people of the fleet file, if it lists any, and a lead only if the file says so. A console must
+    serve the network: fleet console --lan.
     """
     person = PagePerson(name or _own_name(), rank)
     with cli_errors():
@@ -268,7 +269,16 @@ def _network() -> Any:
     return lan
 
 
-def _open_lan(port: int, people: PeopleFile, names: Iterable[str] | None) -> "Lan":
+def _people_of(file: Path) -> People:
+    """Return the people of a fleet file, none if it cannot be read."""
+    people = read_people(file)
+    if people is None:
+        return NO_PEOPLE
+    leads = {name for name, each in people.items() if each.rank == Rank.LEAD}
+    return People({name: PersonRole.LEAD if name in leads else PersonRole.DRIVER for name in people})
+
+
+def _open_lan(port: int, people: PeopleFile, listed: People) -> "Lan":
     network = _network()
     try:
         listener = network.LimitedListener.on_port(port)
@@ -277,7 +287,7 @@ def _open_lan(port: int, people: PeopleFile, names: Iterable[str] | None) -> "La
             f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` takes a free one."
         ) from None
     try:
-        lan: Lan = network.Lan(listener, people, names)
+        lan: Lan = network.Lan(listener, people, listed)
     except OSError as error:
         listener.close()
         raise click.ClickException(

@@ -8,7 +8,7 @@ import socket
 import ssl
 import time
 from asyncio import sslproto
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Final
@@ -31,7 +31,7 @@ from fleet.console.pairing import (
     new_code,
 )
 from fleet.console.people_file import PeopleFile
-from schemas.authority import People
+from schemas.authority import NO_PEOPLE, People
 
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
@@ -113,8 +113,8 @@ class Lan:
 
     # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
 
-    def __init__(self, listener: LimitedListener, people: PeopleFile, names: Iterable[str] | None = None) -> None:
-        """Begin. names: the people of the fleet until its gateways say who they are. None: everybody."""
+    def __init__(self, listener: LimitedListener, people: PeopleFile, listed: People = NO_PEOPLE) -> None:
+        """Begin. listed: the people of the fleet until its gateways say who they are."""
         self.listener = listener
         self.people = people
         self.port: int = listener.getsockname()[1]
@@ -135,7 +135,7 @@ class Lan:
         """Device, address and the function that closes it, by number of the socket."""
         self._last_socket = 0
         self.people.serve()
-        self._write(_sorted(names))
+        self._write(listed)
 
     @property
     def address(self) -> str:
@@ -268,7 +268,7 @@ class Lan:
         renewed = ensure_certificate((*addresses, *own_names()))
         self.addresses = addresses
         if self.address != before:
-            self._write(self.people.read().people)
+            self.people.change(lambda book: (replace(book, address=self.address), None))
         if renewed.fingerprint != self.certificate.fingerprint:
             renewed.load_into(self.context)
             self.certificate = renewed
@@ -276,12 +276,14 @@ class Lan:
 
     def _update_people(self, people: People | None) -> None:
         self.people.serve()
-        if people is not None and self.people.read().people != (names := _sorted(people.roles)):
-            self._write(names)
+        book = self.people.read()
+        if people is not None and (book.people, book.leads) != _names_of(people):
+            self._write(people)
 
-    def _write(self, names: tuple[str, ...] | None) -> None:
+    def _write(self, listed: People) -> None:
         """Write address and people to the people file, where `fleet console pair` reads them."""
-        self.people.change(lambda book: (replace(book, address=self.address, people=names), None))
+        people, leads = _names_of(listed)
+        self.people.change(lambda book: (replace(book, address=self.address, people=people, leads=leads), None))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what the page of the paired devices shows, as JSON values."""
@@ -307,8 +309,9 @@ class Lan:
         }
 
 
-def _sorted(names: Iterable[str] | None) -> tuple[str, ...] | None:
-    return None if names is None else tuple(sorted(names))
+def _names_of(listed: People) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+    """Return the people and the leads for the people file. None: the fleet lists nobody."""
+    return (None, None) if listed.roles is None else (tuple(sorted(listed.roles)), listed.leads)
 
 
 def issue_code(people: PeopleFile, person: PagePerson) -> str:

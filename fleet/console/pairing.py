@@ -103,6 +103,8 @@ class PeopleBook:
     """Where the console last served the network."""
     people: tuple[str, ...] | None = None
     """The people of the fleet, as the console knows them. None: the fleet lists nobody, so everybody may come."""
+    leads: tuple[str, ...] | None = None
+    """The leads among them. None: the fleet lists nobody, so a code may make anybody a lead."""
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
         """Add a code for a person. Raises UnknownPerson, and ValueError for what is no name or no rank."""
@@ -113,6 +115,9 @@ class PeopleBook:
             raise UnknownPerson(f"{words} {hint}")
         if person.rank not in RANKS:
             raise ValueError(f"There is no rank {person.rank!r}.")
+        if self._ranked(person) != person:
+            leads = f"Leads are: {', '.join(self.leads)}." if self.leads else "It has no lead."
+            raise ValueError(f"`people:` in the fleet file makes {person.name} no lead. {leads}")
         open_codes = [each for each in self.codes if each.is_open(now)]
         codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
         return replace(self, codes=codes[-MAX_CODES:])
@@ -146,11 +151,20 @@ class PeopleBook:
             if hmac.compare_digest(each.digest, wanted):
                 found = each
         state = "unknown" if found is None else found.state(now)
-        return (None, "unknown") if state == "unknown" else (found, state)
+        return (None, "unknown") if found is None or state == "unknown" else (self._as_of_now(found), state)
 
     def open_devices(self, now: float) -> list[PairedDevice]:
         """Return the devices whose cookie opens the console."""
-        return [each for each in self.devices if each.state(now) == "valid"]
+        return [self._as_of_now(each) for each in self.devices if each.state(now) == "valid"]
+
+    def _as_of_now(self, device: PairedDevice) -> PairedDevice:
+        """Return a device with the rank that the fleet file gives its person now."""
+        return replace(device, person=self._ranked(device.person))
+
+    def _ranked(self, person: PagePerson) -> PagePerson:
+        """Return a person whose code said lead as a mere person if the fleet does not list them as one."""
+        is_lead = self.leads is None or person.name in self.leads
+        return person if is_lead or person.rank != Rank.LEAD else replace(person, rank=Rank.PERSON)
 
     def as_text(self) -> str:
         """Return the book as JSON."""
@@ -166,8 +180,9 @@ class PeopleBook:
             hashes = [each.digest for each in codes] + [each.digest for each in devices]
             if not all(isinstance(each, str) for each in hashes):
                 raise BadBook("a hash is not a text")
-            people = fields.get("people")  # a console of an earlier version wrote none
-            return cls(codes, devices, str(fields["address"]), None if people is None else tuple(map(str, people)))
+            # A console of an earlier version wrote no people, or no leads.
+            people, leads = (_names(fields.get(name)) for name in ("people", "leads"))
+            return cls(codes, devices, str(fields["address"]), people, leads)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise BadBook(str(error)) from None
 
@@ -222,6 +237,10 @@ def normal_code(text: str) -> str:
 def digest(secret: str) -> str:
     """Return the hash under which a code or a cookie is stored."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _names(found: Iterable[Any] | None) -> tuple[str, ...] | None:
+    return None if found is None else tuple(map(str, found))
 
 
 def _with_person(fields: dict[str, Any]) -> dict[str, Any]:

@@ -129,13 +129,12 @@ def read_colors(path: Path) -> Mapping[str, Rgb]:
     return {name: parse_color(car.color) for name, car in {**file.cars, **file.unlinked}.items()}
 
 
-def read_people(path: Path) -> tuple[str, ...] | None:
-    """Return the names of the people of a fleet file. None if it lists none, or cannot be read."""
+def read_people(path: Path) -> Mapping[str, FleetPerson] | None:
+    """Return the people of a fleet file by name. None if it lists none, or cannot be read."""
     try:
-        people = read_fleet(path, unbound=True, moved=True).people
+        return read_fleet(path, unbound=True, moved=True).people
     except BadFile:
         return None
-    return None if people is None else tuple(people)
 
 
 def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:

@@ -70,6 +70,26 @@ def test_a_code_is_for_the_people_of_the_fleet() -> None:
         replace(book, people=()).issue("K7QF3MXP", MIA, NOW)
 
 
+def test_a_lead_is_whom_the_fleet_makes_one_also_later() -> None:
+    lead, stranger = PagePerson("teacher", "lead"), PagePerson("mia", "lead")
+    assert PeopleBook().issue("K7QF3MXP", stranger, NOW).codes, "that fleet lists nobody"
+    book = replace(PeopleBook(), people=("mia", "teacher"), leads=("teacher",))
+    assert PeopleBook.of_text(book.as_text()) == book
+    refused: list[tuple[PagePerson, tuple[str, ...]]] = [(stranger, ("teacher",)), (stranger, ()), (lead, ())]
+    for one, listed in refused:
+        with pytest.raises(ValueError, match=r"no lead"):
+            replace(book, leads=listed).issue("K7QF3MXP", one, NOW)
+    assert book.issue("K7QF3MXP", MIA, NOW).codes
+    paired_lead = book.issue("K7QF3MXP", lead, NOW).redeem("K7QF3MXP", "cookie", "d", "", NOW)
+    assert paired_lead is not None
+    now: list[tuple[tuple[str, ...] | None, str]] = [(("teacher",), "lead"), ((), "person"), (None, "lead")]
+    for leads, rank in now:
+        device, _ = replace(paired_lead, leads=leads).device_of("cookie", NOW)
+        assert device is not None
+        assert device.person == PagePerson("teacher", rank)
+        assert replace(paired_lead, leads=leads).open_devices(NOW) == [device]
+
+
 def test_a_cookie_opens_for_a_month_then_only_stops_then_is_forgotten() -> None:
     book = paired()
     states = [book.device_of("cookie", NOW + days * 86_400)[1] for days in (0, 29.9, 30.1, 119.9, 120.1)]
