@@ -235,7 +235,10 @@ class Console:
                 self._view.car(key.car).on_message(key.topic, message, now)
                 if key.topic == "state/safety" and self._report is not None:
                     self._report.on_safety(key.car, message, now)
-        self._view.on_presence(self._fleet.sync.cars(), now)
+        present = self._fleet.sync.cars()
+        self._view.on_presence(present, now)
+        if self._report is not None:
+            self._report.on_presence(present)
         token = f"{self._fleet.sync.name}/{keys.COORDINATOR}"
         self._plan.on_presence(running=token in self._coordinators)
 

@@ -1,9 +1,12 @@
-"""The course of a STOP, car by car: stopping, shown, sent, not reached, or moved again. Pure: time is an argument.
+"""The course of a STOP, car by car: stopping, shown, sent, not reached, or moving again. Pure: time is an argument.
+
+Each car has a row of its own. The row of a car that moves again says so for as long as it moves, and is closed then:
+whatever ended that motion was not this STOP.
 
 `now` is monotonic, s. `at_ms` is the clock of the console, ms since the epoch: pages show it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, Final
 
 from fleet.client.outcome import NO_ANSWER, Outcome
@@ -12,7 +15,7 @@ from schemas.commands import STOPS
 from schemas.words import Basis, Motors, Phase, Verb
 
 MOVED: Final = "moved"
-"""State of a car that stood, and moves again."""
+"""State of a car that was stopped, and moves again."""
 _UNDER_WAY: Final = (Phase.ASKED, Motors.STOPPING)
 """The states of a car until its result is known."""
 
@@ -29,6 +32,8 @@ class StopReport:
         self._result_ns: dict[str, int] = {}
         """Stamp of the event or state that the result of a car rests on, by its gateway's clock, ns."""
         self._cars: dict[str, dict[str, Any]] = {name: _entry(Phase.ASKED) for name in cars}
+        self._closed: set[str] = set()
+        """The cars whose rows are closed, since they have moved."""
 
     @property
     def over(self) -> bool:
@@ -37,7 +42,7 @@ class StopReport:
 
     def on_event(self, car: str, event: Any, now: float) -> None:
         """Handle a command event of the sender of this STOP."""
-        if event.verb not in (*STOPS, Verb.PAUSE):
+        if event.verb not in (*STOPS, Verb.PAUSE) or car in self._closed:
             return
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
@@ -64,16 +69,24 @@ class StopReport:
             self._set(car, safety.motors_basis, now)
             self._result_ns[car] = stamp_ns
         elif state in tuple(Basis) and safety.motors == Motors.ON and stamp_ns > self._result_ns.get(car, 0):
-            self._cars[car]["state"] = MOVED
+            self._cars[car] |= {"state": MOVED, "moved_at_ms": self._wall_ms(now)}
+            self._result_ns[car] = stamp_ns
+        elif state == MOVED and safety.motors != Motors.ON and stamp_ns > self._result_ns.get(car, 0):
+            self._close(car)
         if state in _UNDER_WAY:  # a state that is older than the result must not contradict it later
             self._result_ns[car] = max(stamp_ns, self._result_ns.get(car, 0))
+
+    def on_presence(self, present: Collection[str]) -> None:
+        """Close the rows of cars that moved again and have no gateway any more: nobody knows whether they move."""
+        for car in [car for car, entry in self._cars.items() if entry["state"] == MOVED and car not in present]:
+            self._close(car)
 
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float) -> None:
         """Handle the final outcomes. A car without an outcome was not reached."""
         by_car = {outcome.car: outcome for outcome in outcomes}
         for car in {*self._cars, *by_car}:
             outcome = by_car.get(car)
-            if self._is_over(car):
+            if self._is_over(car) or car in self._closed:
                 continue
             if outcome is None:
                 self._set(car, Phase.FAILED, now, "its gateway is not on the bus: look at the car")
@@ -85,15 +98,28 @@ class StopReport:
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON values."""
         cars = [{"name": name, **self._cars[name]} for name in sorted(self._cars)]
-        return {"number": self.number, "verb": self._verb, "at_ms": self._at_ms, "over": self.over, "cars": cars}
+        return {
+            "number": self.number,
+            "verb": self._verb,
+            "at_ms": self._at_ms,
+            "over": self.over,
+            "cars": cars,
+            "closed": len(self._closed),
+        }
+
+    def _close(self, car: str) -> None:
+        del self._cars[car]
+        self._closed.add(car)
+
+    def _wall_ms(self, now: float) -> int:
+        return self._at_ms + round((now - self._asked_at) * 1000)
 
     def _is_over(self, car: str) -> bool:
         return car in self._cars and self._cars[car]["state"] not in _UNDER_WAY
 
     def _set(self, car: str, state: str, now: float, words: str = "") -> None:
-        took_s = now - self._asked_at
-        self._cars[car] = _entry(state, round(took_s, 2), words, self._at_ms + round(took_s * 1000))
+        self._cars[car] = _entry(state, round(now - self._asked_at, 2), words, self._wall_ms(now))
 
 
 def _entry(state: str, took_s: float | None = None, words: str = "", at_ms: int | None = None) -> dict[str, Any]:
-    return {"state": state, "took_s": took_s, "words": words, "at_ms": at_ms}
+    return {"state": state, "took_s": took_s, "words": words, "at_ms": at_ms, "moved_at_ms": None}

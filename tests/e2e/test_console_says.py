@@ -63,8 +63,18 @@ def test_a_stop_report_is_of_the_past_and_changes_when_the_car_moves_again(stage
     stage.person.resume(["red"])
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives again")
-    expect(report.locator("[data-stop=red].stop-moved")).to_contain_text("moves again")
+    expect(report.locator("[data-stop=red].stop-moved")).to_contain_text(
+        re.compile(r"moves again since \d\d:\d\d:\d\d")
+    )
     assert stage.judges["red"].driving
+    # The other cars keep their rows. That of red is closed with the drive, which no STOP ended.
+    blue = report.locator("[data-stop=blue]").inner_text()
+    assert re.search(r"at \d\d:\d\d:\d\d", blue), blue
+    stage.person.car("red").drive("stop", 1.0).check()
+    stage.stands()
+    expect(report.locator("[data-stop=red]")).to_have_count(0)
+    assert report.locator("[data-stop=blue]").inner_text() == blue
+    expect(report.get_by_role("status")).to_contain_text("1 moved since")
 
 
 def test_a_pause_is_named_a_pause(stage: ConsoleStage) -> None:

@@ -47,18 +47,21 @@ const onStopClick = () => {
   if (performance.now() - pointerAt > SAME_PRESS_MS) stopAll();
 };
 
+const stopDetail = (car) =>
+  car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s, clock(car.moved_at_ms ?? car.at_ms));
+
 let reportSeen = [0, 0];
 function Report({ report }) {
-  if (report === null) return null;
+  if (report === null || (report.cars.length === 0 && report.closed > 0)) return null;
   if (reportSeen[0] !== report.number) reportSeen = [report.number, performance.now()];
   const failed = report.cars.some((car) => car.state === "failed");
   if (report.over && !failed && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
   return html`<div class="report" data-report=${report.number}>
-    <p role="status"><strong>${t.stopVerbs[report.verb]}</strong>: ${t.stopSummary(report.cars)}</p>
+    <p role="status"><strong>${t.stopVerbs[report.verb]}</strong>: ${t.stopSummary(report.cars, report.closed)}</p>
     <ul class="plain chips">
       ${report.cars.map(
         (car) => html`<li key=${car.name} class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
-          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s)} />
+          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${stopDetail(car)} />
           ${car.state === "failed" ? ` ${car.words}` : ""}
         </li>`,
       )}

@@ -167,21 +167,21 @@ export const t = {
   results: "Results",
   done: (verb, outcome) => `${outcome.car}: ${verb} ${outcome.phase}${outcome.words ? `: ${outcome.words}` : ""}`,
   refused: (outcome) => `${outcome.car}: not carried out: ${outcome.words || outcome.reason || outcome.phase}`,
-  stopSummary: (cars) => {
+  stopSummary: (cars, closed) => {
     const of = (state) => cars.filter((car) => state.includes(car.state)).length;
     const waiting = of(["asked", "stopping"]);
-    const parts = [`${of(["shown"])} of ${cars.length} shown`];
+    const parts = [`${of(["shown"])} of ${cars.length + closed} shown`];
     if (of(["moved"])) parts.push(`${of(["moved"])} moving again`);
+    if (closed) parts.push(`${closed} moved since`);
     if (of(["sent"])) parts.push(`${of(["sent"])} sent`);
     if (waiting) parts.push(`${waiting} stopping`);
     if (of(["failed"])) parts.push(`${of(["failed"])} NOT stopped`);
     return parts.join(", ");
   },
-  stopDetail: (state, at, took_s) =>
+  stopDetail: (state, at, took_s, moved) =>
     ({
       shown: `at ${at}, shown after ${took_s.toFixed(1)} s`,
-      sent: `at ${at}`,
-      moved: `(stopped at ${at})`,
+      moved: `since ${moved} (stopped at ${at})`,
     })[state] ?? `at ${at}`,
   plots: "Plots",
   plotCars: "Cars to plot",

@@ -88,8 +88,43 @@ def test_a_car_that_moves_again_stands_no_more_and_keeps_its_time(basis: str) ->
     assert states(report)["red"][0] == basis
     report.on_safety("red", safety("on", 53), 30.0)
     (car,) = report.as_dict()["cars"]
-    assert (car["state"], car["at_ms"], car["took_s"]) == ("moved", 1_001_500, 1.5)
+    assert (car["state"], car["at_ms"], car["moved_at_ms"], car["took_s"]) == ("moved", 1_001_500, 1_020_000, 1.5)
     assert report.over
+
+
+def moved(*cars: str) -> StopReport:
+    """Return a report of cars of which the first one moves again since 53."""
+    report = StopReport(1, "stop", "us", cars, 10.0, 0)
+    for name in cars:
+        done = event("complete", basis="shown")
+        done.stamp.seconds = 50
+        report.on_event(name, done, 11.5)
+    report.on_safety(cars[0], safety("on", 53), 30.0)
+    return report
+
+
+@pytest.mark.parametrize("motors", ["off", "stopping", "unknown"])
+def test_the_row_of_a_car_that_has_moved_is_closed_when_it_moves_no_more(motors: str) -> None:
+    report = moved("red", "blue")
+    report.on_safety("red", safety(motors, 52), 30.1)
+    report.on_safety("red", safety("on", 54), 31.0)
+    assert states(report) == {"red": ("moved", ""), "blue": ("shown", "")}, "that state is older than the motion"
+    report.on_safety("red", safety(motors, 55), 32.0)
+    assert states(report) == {"blue": ("shown", "")}
+    assert report.as_dict()["closed"] == 1
+    again = event("complete", basis="shown")
+    again.stamp.seconds = 56
+    report.on_event("red", again, 33.0)  # another stop of the same person: of red alone
+    report.on_outcomes([Outcome("red", ok=True, phase="complete", basis="shown")], 34.0)
+    assert states(report) == {"blue": ("shown", "")}
+
+
+def test_a_car_that_has_moved_and_lost_its_gateway_does_not_move_for_ever() -> None:
+    report = moved("red", "blue")
+    report.on_presence(["red"])
+    assert states(report) == {"red": ("moved", ""), "blue": ("shown", "")}, "that blue stood stays true"
+    report.on_presence([])
+    assert states(report) == {"blue": ("shown", "")}
 
 
 def test_an_outcome_without_an_event_is_as_new_as_the_last_state() -> None:
