@@ -21,6 +21,7 @@ REASONS: Final[dict[str, str]] = {
     "write_failed": "The link broke while the gateway wrote the command.",
     "queue_full": "Too many commands wait for the car.",
     "expired": "The time of the command was over before the gateway could send it, or its sender disconnected.",
+    "lapsed": "A sample of a stream continues a drive that is over.",
     "superseded": "A later command ended this one.",
     "duplicate": "A command with this id was accepted before.",
     "stale": "The command arrived too late, or its time is in the future.",

@@ -168,6 +168,8 @@ class Reason(StrEnum):
     WRITE_FAILED = "write_failed"
     QUEUE_FULL = "queue_full"
     EXPIRED = "expired"
+    LAPSED = "lapsed"
+    """The drive that a sample of a stream continues is over."""
     SUPERSEDED = "superseded"
     DUPLICATE = "duplicate"
     STALE = "stale"

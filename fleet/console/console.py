@@ -262,8 +262,16 @@ class Console:
             return
         (key, event), now = found, time.monotonic()
         self._view.car(key.car).on_message(key.topic, event, now)
-        if key.topic == "event/command" and self._report is not None and event.sender == self._report.sender:
+        if key.topic != "event/command":
+            return
+        if self._report is not None and event.sender == self._report.sender:
             self._report.on_event(key.car, event, now)
+        if (event.verb, event.phase, event.reason) == ("drive", "rejected", "lapsed"):
+            for press in self._presses.alive:
+                page = self._pages[press.client]
+                if event.sender == page.operator.sender and key.car in press.cars:
+                    self._presses.release(press.client, press.id)
+                    self._end(press, event.words)
 
     # ------------------------------------------------------------------ the pages
 

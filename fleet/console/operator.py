@@ -67,7 +67,10 @@ class ConsoleOperator:
         if now - sent_at < STREAM_INTERVAL_S:
             return
         self._streams[(press.client, press.id)] = now, count + 1, press.cars
-        self._stream(press.cars, drive_request(press.motion, DRIVE_TTL_S), STREAM_MAX_AGE_S, count + 1)
+        request = drive_request(press.motion, DRIVE_TTL_S)
+        # Only the first one starts a car. If the bus stands still for longer than a drive lasts, the press is over.
+        request.message.continues = count > 0
+        self._stream(press.cars, request, STREAM_MAX_AGE_S, count + 1)
 
     def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
         """Stop the cars of a press, or some of them: at once in the stream, and by a query whose outcome is known."""

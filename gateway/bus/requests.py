@@ -246,7 +246,7 @@ def _drive(message: Any, longest_s: float, car: str) -> Action:
             limit = f"at most {longest_s:g} s (longest_drive_s in its fleet file)"
             raise ValueError(f"{message.duration_s:g} s is longer than {car} may drive: {limit}")
         duration_s = _seconds("duration_s", message.duration_s, longest_s)
-    return Drive(_word("motion", message.motion, Motion), duration_s)
+    return Drive(_word("motion", message.motion, Motion), duration_s, message.continues)
 
 
 def _led(message: Any) -> Action:

@@ -16,6 +16,8 @@ class Drive:
 
     motion: Motion
     duration_s: float = 0.5
+    continues: bool = False
+    """True to prolong this motion of the same sender while it lasts. False to begin it, too."""
 
 
 @dataclass(frozen=True, slots=True)

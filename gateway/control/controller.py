@@ -225,6 +225,8 @@ class Controller:
         if halted:
             words = f"{self.car} was just stopped. Send no drive command for {STREAM_PAUSE_S:g} s, then drive again."
             return self._reject(pending, Reason.HELD, words, now)
+        if lapsed := self._lapsed(command):
+            return self._reject(pending, Reason.LAPSED, lapsed, now)
         busy = self._too_busy(command, now)
         if busy:  # before the lease and the hold: a refused command changes neither
             return self._reject(pending, Reason.EXPIRED, busy, now)
@@ -518,6 +520,18 @@ class Controller:
         if what.duration_s > busy_s:
             return ""
         return f"{self.car} is busy for another {busy_s:.1f} s. The next samples of this stream drive it then."
+
+    def _lapsed(self, command: Command) -> str:
+        """Return that the drive which this one continues is over; empty if it lasts, or if this one may begin one.
+
+        A hub that stood still delivers the newest samples of a press when it goes on. The car has stopped meanwhile.
+        """
+        what, held = command.what, self._queue.held
+        if not isinstance(what, Drive) or not what.continues or what.motion is Motion.STOP:
+            return ""
+        if held is not None and held.motion is what.motion and held.sender == command.sender:
+            return ""
+        return f"{self.car} has stopped since: no drive came for too long. Press again."
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._queue.held

@@ -857,7 +857,7 @@ class PlanCommand(_message.Message):
     def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
 
 class DriveCommand(_message.Message):
-    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "motion", "duration_s")
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "motion", "duration_s", "continues")
     SENDER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
@@ -866,6 +866,7 @@ class DriveCommand(_message.Message):
     TTL_S_FIELD_NUMBER: _ClassVar[int]
     MOTION_FIELD_NUMBER: _ClassVar[int]
     DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    CONTINUES_FIELD_NUMBER: _ClassVar[int]
     sender: str
     kind: str
     id: str
@@ -874,7 +875,8 @@ class DriveCommand(_message.Message):
     ttl_s: float
     motion: str
     duration_s: float
-    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., motion: _Optional[str] = ..., duration_s: _Optional[float] = ...) -> None: ...
+    continues: bool
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., motion: _Optional[str] = ..., duration_s: _Optional[float] = ..., continues: _Optional[bool] = ...) -> None: ...
 
 class ModeCommand(_message.Message):
     __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "mode")

@@ -90,6 +90,30 @@ def test_a_pause_is_named_a_pause(stage: ConsoleStage) -> None:
     expect(page.locator("[data-paused]")).to_have_count(0)
 
 
+@pytest.mark.parametrize("frozen_s", [0.3, 0.7, 1.2, 1.7])
+def test_no_press_outlives_a_hub_that_stands_still_for_a_moment(stage: ConsoleStage, frozen_s: float) -> None:
+    """Shorter than the lease of the bus, which tells nobody. The drives of the gateway last for half a second."""
+    page = stage.driving_page("red")
+    hold_key(stage, page, "w")
+    hub, began = stage.fleet.hub, time.monotonic()
+    frozen_ns = time.time_ns()
+    freeze(hub.pid)
+    try:
+        wait_for(lambda: time.monotonic() - began >= frozen_s, "the hub stands still")
+    finally:
+        hub.popen.send_signal(signal.SIGCONT)
+    page.wait_for_timeout(1500)  # longer than any stream needs to begin again
+    assert stage.judges["red"].on_after(frozen_ns) == []
+    if stage.judges["red"].driving:  # shorter than a drive: the motors were never off
+        expect(page.locator(".pad.held")).to_have_count(1)
+    else:
+        expect(page.locator(".pad.held")).to_have_count(0)
+    page.keyboard.up("w")
+    hold_key(stage, page, "w")
+    page.keyboard.up("w")
+    stage.stands()
+
+
 @pytest.mark.parametrize("how", ["freezes", "dies"])
 def test_no_press_outlives_the_hub(stage: ConsoleStage, how: str) -> None:
     page = stage.driving_page("red")

@@ -68,6 +68,7 @@ def general(**fields: Any) -> OneShot:
     [
         *(("drive", {"motion": motion}, Drive(motion, 0.5)) for motion in Motion),
         ("drive", {"motion": "forward", "duration_s": 10}, Drive(Motion.FORWARD, 10.0)),
+        ("drive", {"motion": "forward", "continues": True}, Drive(Motion.FORWARD, 0.5, continues=True)),
         ("drive", {"motion": "forward", "duration_s": 1e-3}, Drive(Motion.FORWARD, 1e-3)),
         *(("mode", {"mode": mode}, SetMode(mode)) for mode in Mode),
         ("led", {"r": 0, "g": 0, "b": 0}, OneShot(ColorLed(0, 0, 0))),

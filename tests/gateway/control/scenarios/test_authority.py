@@ -256,6 +256,25 @@ def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: W
     assert desk.ask(stick, SCRIPT, streamed=True).status is QUEUED, "let go, and taken again"
 
 
+def test_what_only_continues_a_drive_begins_none(desk: Workbench) -> None:
+    held = Drive(Motion.FORWARD, 0.5, continues=True)
+    assert desk.ask(held, PERSON, streamed=True).reason is Reason.LAPSED, "nothing to continue"
+    desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True)
+    for _ in range(20):
+        desk.run(0.3)
+        assert desk.ask(held, PERSON, streamed=True).status is not REJECTED
+    assert set(desk.frames) == {RUN}, "prolonged by samples that come in time, and not stopped"
+    for other, sender in ((Drive(Motion.BACK, 0.5, continues=True), PERSON), (held, SCRIPT)):
+        assert desk.ask(other, sender, streamed=True).status is REJECTED, "another motion, or another sender"
+    desk.run(2.0)  # the bus stands still
+    written = list(desk.frames)
+    for _ in range(20):
+        assert desk.ask(held, PERSON, streamed=True).reason is Reason.LAPSED
+        desk.run(0.1)
+    assert RUN not in desk.frames[len(written) :]
+    assert desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True).status is QUEUED, "pressed again"
+
+
 def test_a_stick_that_a_lease_kept_out_does_not_drive_when_it_lapses_after_a_stop(desk: Workbench) -> None:
     stick = Drive(Motion.FORWARD, 0.5)
     for _ in range(10):
