@@ -18,6 +18,9 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
     topic, key = topics.of_key(sample.key), keys.parse(sample.key)
     if topic is None or key is None:
         return None
+    if not is_shown(key.car):
+        log.log(level, "%r: no car has such a name", sample.key)
+        return None
     try:
         message = messages.parse(topic.message, sample.payload, sample.encoding)
     except messages.BadPayload as error:
@@ -27,6 +30,11 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
         log.log(level, "%s: a number in it is infinite or none", sample.key)
         return None
     return key, message
+
+
+def is_shown(name: str) -> bool:
+    """Return True for the name of a service, and for one that a car may have. Others could look like that of a car."""
+    return name.startswith("@") or keys.is_name(name)
 
 
 def is_finite(message: Any) -> bool:

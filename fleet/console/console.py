@@ -17,7 +17,7 @@ from fleet.client.commands import CommandRequest, estop_request, pause_request, 
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
 from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
-from fleet.console.bus_message import message_in
+from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import FleetView
 from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
@@ -235,7 +235,7 @@ class Console:
                 self._view.car(key.car).on_message(key.topic, message, now)
                 if key.topic == "state/safety" and self._report is not None:
                     self._report.on_safety(key.car, message, now)
-        present = self._fleet.sync.cars()
+        present = self._present
         self._view.on_presence(present, now)
         if self._report is not None:
             self._report.on_presence(present)
@@ -274,6 +274,11 @@ class Console:
                     self._end(press, event.words)
 
     # ------------------------------------------------------------------ the pages
+
+    @property
+    def _present(self) -> list[str]:
+        """The cars whose gateways are on the bus."""
+        return [name for name in self._fleet.sync.cars() if is_shown(name)]
 
     @property
     def person(self) -> PagePerson:
@@ -403,7 +408,7 @@ class Console:
         for press in self._presses.on_stop(now):
             self._end(press, "All cars were paused." if request.verb == Verb.PAUSE else "All cars were stopped.")
         self._stops += 1
-        present = {*self._fleet.sync.cars(), *self._view.names}
+        present = {*self._present, *self._view.names}
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
         self._report = StopReport(self._stops, request.verb, sender, present, now, at_ms)
         operator.stop(request, self._report)
@@ -487,7 +492,7 @@ class Console:
     def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
         """Count a command to these cars. Return why it is not sent, empty if it is."""
         # A query for a car that nobody knows would wait for an answer in a thread.
-        if unknown := set(cars).difference(self._view.names, self._fleet.sync.cars()):
+        if unknown := set(cars).difference(self._view.names, self._present):
             return f"There is no car {min(unknown)}."
         if page.operator.is_busy:
             return f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them."

@@ -13,6 +13,7 @@ from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
 from fleet.console.budgets import MAX_OPEN_COMMANDS
+from fleet.console.bus_message import is_shown
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from schemas import keys, messages
@@ -129,7 +130,7 @@ class ConsoleOperator:
         finally:
             if self._stops.get(who) is command:
                 del self._stops[who]
-        report.on_outcomes(outcomes, time.monotonic())
+        report.on_outcomes([each for each in outcomes if is_shown(each.car)], time.monotonic())
 
     # ------------------------------------------------------------------ the rest
 

@@ -336,6 +336,25 @@ def test_times_are_those_of_the_console_whatever_the_clock_of_the_browser(stage:
     expect(page.locator("[data-plot='0'] .newest")).to_contain_text(re.compile(r"red [\d.]+"))
 
 
+def test_a_browser_with_a_wrong_clock_drives_and_stops(stage: ConsoleStage) -> None:
+    page = stage.page("#/drive")
+    page.add_init_script(WRONG_CLOCK)
+    page.reload()
+    page.locator("input[name=select-red]").check()
+    assert page.evaluate("Date.now()") > time.time() * 1000 + 5e9
+    hold_key(stage, page, "w")
+    began_ns = time.time_ns()
+    wait_for(lambda: time.time_ns() > began_ns + 1_000_000_000, "longer than a drive lasts")
+    assert stage.judges["red"].driving
+    page.keyboard.up("w")
+    stage.stands()
+    hold_key(stage, page, "w")
+    stopped_ns = time.time_ns()
+    page.keyboard.press("Escape")
+    stage.stands(since_ns=stopped_ns)
+    page.keyboard.up("w")
+
+
 MARKUP = "<img src=x onerror=alert(1)><b>bold</b>"
 TURNED = "\u202eevil\u200b\u2066\u0007"
 HEBREW = "\u05d0\u05d1\u05d2 1"

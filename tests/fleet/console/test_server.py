@@ -9,8 +9,9 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,15 @@ from websockets.typing import Origin
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
-from fleet.console.budgets import COMMAND_BURST, COMMAND_RATE, PAGE_BURST, PAGE_RATE, REQUEST_BURST
+from fleet.console.budgets import (
+    CHECK_BURST,
+    CHECK_RATE,
+    COMMAND_BURST,
+    COMMAND_RATE,
+    PAGE_BURST,
+    PAGE_RATE,
+    REQUEST_BURST,
+)
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.log_rate import LOG_BURST
@@ -40,7 +49,7 @@ from schemas.keys import person_of
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
-from tests.support.page_flood import HALF_REQUESTS, half_request, start_flood
+from tests.support.page_flood import HALF_REQUESTS, PLAN, half_request, start_flood
 from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, FleetProcesses, wait_for
 
@@ -49,7 +58,7 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 GUESTS = (
     *("calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
-    *("giver", "presser", "plotter", "pinger", "lister", "twotab", "tworeq"),
+    *("giver", "presser", "plotter", "pinger", "lister", "twotab", "tworeq", "viewer"),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
@@ -58,6 +67,10 @@ FLOOD = 40_000
 STOPS_AT_ONCE = 40
 INFLATED = 10_000_000
 """Size of a message that has some 10 kB when it is compressed: less than a page may send."""
+EACH = 20
+"""Bombs and plans of a viewer."""
+MAX_COST = 6.0
+"""Maximum CPU time that one of them costs, as a multiple of a page that opens."""
 MAX_BOMB_MB = 5.0
 """Half of an inflated message."""
 MAX_UNREAD_MB = 5.0
@@ -523,6 +536,46 @@ def test_a_message_that_inflates_a_thousandfold_is_refused_by_its_size(stage: Se
         read_to_the_end(page)
         assert page.close_code in (1009, 1006)  # what is still being sent may reset the connection first
     assert server.memory_info().rss / 1e6 < before_mb + MAX_BOMB_MB
+
+
+def cpu_s(process: psutil.Process) -> float:
+    """Return the CPU time of a process and of those that it has started, s."""
+    used = [process.cpu_times(), *(each.cpu_times() for each in process.children(recursive=True))]
+    return float(sum(each.user + each.system for each in used) + used[0].children_user + used[0].children_system)
+
+
+def test_bombs_and_large_plans_of_a_viewer_cost_what_any_request_does(stage: ServerStage) -> None:
+    """A viewer is a person of the lowest rank, who may only watch and stop."""
+    viewer, server = stage.device("viewer"), psutil.Process(stage.console.process.pid)
+    statuses = Counter[int]()
+
+    def page() -> None:
+        with viewer.socket() as opened:
+            opened.recv(30)
+
+    def bomb() -> None:
+        with viewer.socket() as opened:
+            with contextlib.suppress(ConnectionClosed):
+                opened.send("x" * INFLATED)
+            read_to_the_end(opened)
+
+    def plan(what: str) -> None:
+        statuses[viewer.ask("POST", f"/plan/{what}", PLAN)[0]] += 1
+
+    def cost_s(act: Callable[[], object]) -> float:
+        before_s = cpu_s(server)
+        for _ in range(EACH):
+            act()
+        return (cpu_s(server) - before_s) / EACH
+
+    costs = cost_s(page), cost_s(bomb), cost_s(partial(plan, "set"))
+    assert statuses == {403: EACH}, "only a lead sets plans"
+    assert max(costs) < MAX_COST * costs[0]
+    begun = time.monotonic()
+    while statuses[429] < EACH:
+        plan("check")
+    assert statuses[200] <= CHECK_BURST + CHECK_RATE * (time.monotonic() - begun) + 1
+    assert viewer.ask("POST", "/stop")[0] == 204
 
 
 def test_stops_of_some_cars_are_merged_and_each_is_answered(stage: ServerStage) -> None:
