@@ -34,6 +34,7 @@ from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
 from fleet.fleetfile.fleet_file import read_people
+from fleet.fleetfile.models import PersonRank
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.authority import NO_PEOPLE, People, PersonRole
@@ -274,7 +275,7 @@ def _people_of(file: Path) -> People:
     people = read_people(file)
     if people is None:
         return NO_PEOPLE
-    leads = {name for name, each in people.items() if each.rank == Rank.LEAD}
+    leads = {name for name, each in people.items() if each.rank is PersonRank.LEAD}
     return People({name: PersonRole.LEAD if name in leads else PersonRole.DRIVER for name in people})
 
 

@@ -44,7 +44,7 @@ from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
 from schemas.keys import person_of
 from schemas.process.suspend import SleepWatch, clock_pair
-from schemas.words import Rank, Scope, Verb
+from schemas.words import Phase, Rank, Reason, Scope, Verb
 
 MAX_PAGES: Final = 96
 """Maximum number of connected pages."""
@@ -266,7 +266,7 @@ class Console:
             return
         if self._report is not None and event.sender == self._report.sender:
             self._report.on_event(key.car, event, now)
-        if (event.verb, event.phase, event.reason) == ("drive", "rejected", "lapsed"):
+        if (event.verb, event.phase, event.reason) == (Verb.DRIVE, Phase.REJECTED, Reason.LAPSED):
             for press in self._presses.alive:
                 page = self._pages[press.client]
                 if event.sender == page.operator.sender and key.car in press.cars:

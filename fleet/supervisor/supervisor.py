@@ -430,7 +430,8 @@ class Supervisor:
             if self.processes.on_heartbeat(RECORDER):
                 self._gateways_from = self.processes.now
             self._recorder_heard_at = self.processes.now
-            self._set_unrecorded(why_unrecorded(value), "what waited is written" if value.state == "closed" else "")
+            over = "what waited is written" if value.state == RecorderState.CLOSED else ""
+            self._set_unrecorded(why_unrecorded(value), over)
         elif car == COORDINATOR:
             self._on_plan(value)
         elif row is not None and topic == "state/health":
