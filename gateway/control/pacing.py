@@ -85,7 +85,9 @@ class Pacing:
 
     @property
     def awake_until(self) -> float:
-        """Return until when the car reads a frame at once, as its last report shows; -inf if none has come."""
+        """Return until when the car reads a frame at once, as its last report shows; -inf if nothing shows it."""
+        if not (self.learned.echo.is_known or self.learned.no_echo.is_known):
+            return float("-inf")  # it may range again at once
         return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
 
     def named_at(self, frame: Frame) -> float:

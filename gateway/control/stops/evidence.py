@@ -437,8 +437,9 @@ class StopEvidence:
         before, self._before = self._before, at if event.range_cm else None
         before_no_echo, self._before_no_echo = self._before_no_echo, None if event.range_cm else at
         blocking = self._blocking
-        # A frame that was written just before this report may be read after it.
-        self._blocking = [each for each in blocking if at - each.at < READ_LATE_S]
+        # A frame that was written just before this report, or in the ranging before it, may be read after it.
+        read_late_s = READ_LATE_S + (0.0 if event.range_cm else self.profile.ranging_s)
+        self._blocking = [each for each in blocking if at - each.at < read_late_s]
         general, self._general = self._general, False
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         within_s = self._left_s if event.range_cm else self._left_s + self.profile.ranging_s
