@@ -21,6 +21,10 @@ class TokenBucket:
         self._at = max(self._at, now)
         return self._left >= 1.0
 
+    def take_one(self, now: float) -> bool:
+        """Return True if one may pass now, and count it."""
+        return self.take(1, now) == 1
+
     def take(self, requested: int, now: float) -> int:
         """Return how many of the requested may pass now, 0..requested."""
         granted = min(requested, int(self._left)) if self.has(now) else 0

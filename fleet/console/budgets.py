@@ -9,6 +9,8 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
 
+from schemas.token_bucket import TokenBucket
+
 # Our page sends 10 echoes a second while a finger is down, and a few messages for each press. After 30 s of slow Wi-Fi
 # it may send some 450 at once. The limits are ten times that.
 PAGE_BURST: Final = 5000.0
@@ -43,40 +45,17 @@ TOO_MUCH: Final = "This page has sent far more than a person can. STOP still wor
 TOO_MANY_PLANS: Final = "Too many plans of this person wait for a check. Try again in a few seconds."
 
 
-@dataclass(slots=True)
-class Allowance:
-    """A token bucket."""
-
-    burst: float
-    rate: float
-    left: float = -1.0
-    at: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.left < 0.0:
-            self.left = self.burst
-
-    def take(self, now: float) -> bool:
-        """Take one token. Return False if there is none."""
-        self.left = min(self.burst, self.left + max(0.0, now - self.at) * self.rate)
-        self.at = now
-        if self.left < 1.0:
-            return False
-        self.left -= 1.0
-        return True
-
-
-def page_budget(now: float) -> Allowance:
+def page_budget() -> TokenBucket:
     """Return the budget of messages of a new page."""
-    return Allowance(PAGE_BURST, PAGE_RATE, at=now)
+    return TokenBucket(PAGE_RATE, PAGE_BURST)
 
 
 @dataclass(slots=True)
 class _Budget:
-    messages: Allowance
-    requests: Allowance
-    checks: Allowance
-    commands: Allowance
+    messages: TokenBucket
+    requests: TokenBucket
+    checks: TokenBucket
+    commands: TokenBucket
     closed_until: float = float("-inf")
 
 
@@ -86,38 +65,38 @@ class Budgets:
 
     _all: dict[Hashable, _Budget] = field(default_factory=dict)
 
-    def may_send(self, device: Hashable, page: Allowance, now: float) -> bool:
+    def may_send(self, device: Hashable, page: TokenBucket, now: float) -> bool:
         """Count a message. Return False if the page has to be closed: it, or its device, has sent too many."""
-        one = self._of(device, now)
-        if page.take(now) and one.messages.take(now):
+        one = self._of(device)
+        if page.take_one(now) and one.messages.take_one(now):
             return True
         one.closed_until = now + COOLDOWN_S
         return False
 
     def may_open(self, device: Hashable, now: float) -> bool:
         """Return False if a page of this device was closed a moment ago."""
-        return now >= self._of(device, now).closed_until
+        return now >= self._of(device).closed_until
 
     def may_ask(self, device: Hashable, now: float) -> bool:
         """Count an HTTP request. Return False if there were too many."""
-        return self._of(device, now).requests.take(now)
+        return self._of(device).requests.take_one(now)
 
     def may_check(self, person: Hashable, now: float) -> bool:
         """Count a check of a plan. Return False if there were too many."""
-        return self._of(person, now).checks.take(now)
+        return self._of(person).checks.take_one(now)
 
     def may_command(self, device: Hashable, now: float) -> bool:
         """Count a command that asks gateways. Return False if there were too many."""
-        return self._of(device, now).commands.take(now)
+        return self._of(device).commands.take_one(now)
 
-    def _of(self, whose: Hashable, now: float) -> _Budget:
+    def _of(self, whose: Hashable) -> _Budget:
         found = self._all.pop(whose, None)
         if found is None:
             found = _Budget(
-                Allowance(DEVICE_BURST, DEVICE_RATE, at=now),
-                Allowance(REQUEST_BURST, REQUEST_RATE, at=now),
-                Allowance(CHECK_BURST, CHECK_RATE, at=now),
-                Allowance(COMMAND_BURST, COMMAND_RATE, at=now),
+                TokenBucket(DEVICE_RATE, DEVICE_BURST),
+                TokenBucket(REQUEST_RATE, REQUEST_BURST),
+                TokenBucket(CHECK_RATE, CHECK_BURST),
+                TokenBucket(COMMAND_RATE, COMMAND_BURST),
             )
         self._all[whose] = found
         if len(self._all) > MAX_BUDGETS:

@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
 
-from fleet.console.budgets import Allowance
+from schemas.token_bucket import TokenBucket
 
 MAX_CONNECTIONS: Final = 640
 """Maximum number of connections from the network: forty devices that take all they may."""
@@ -41,17 +41,17 @@ class ConnectionLimit:
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
-    _total: Allowance = field(default_factory=lambda: Allowance(TOTAL_BURST, TOTAL_RATE))
-    _addresses: dict[str, Allowance] = field(default_factory=dict)
+    _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
+    _addresses: dict[str, TokenBucket] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
         """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
-        budget = self._addresses.pop(address, None) or Allowance(ADDRESS_BURST, ADDRESS_RATE, at=now)
+        budget = self._addresses.pop(address, None) or TokenBucket(ADDRESS_RATE, ADDRESS_BURST)
         self._addresses[address] = budget
         if len(self._addresses) > MAX_ADDRESSES:
             del self._addresses[next(iter(self._addresses))]
         # One address in a flood uses up its own budget, not that of all.
-        if not budget.take(now) or not self._total.take(now):
+        if not budget.take_one(now) or not self._total.take_one(now):
             return False, None
         strangers = [other for other, each in self._open.items() if not each.device]
         neighbors = [other for other in strangers if self._open[other].address == address]

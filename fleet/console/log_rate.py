@@ -3,7 +3,7 @@
 import logging
 from typing import Final
 
-from fleet.console.budgets import Allowance
+from schemas.token_bucket import TokenBucket
 
 LOG_BURST: Final = 50.0
 """Lines of one cause at once: more than a person reads, and a class that joins is still seen whole."""
@@ -16,13 +16,13 @@ class LogRate(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
-        self._allowances: dict[tuple[str, int], Allowance] = {}
+        self._allowances: dict[tuple[str, int], TokenBucket] = {}
         self._left_out: dict[tuple[str, int], int] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if the line is logged. It says how many lines were left out before."""
         cause, now = (record.pathname, record.lineno), record.created
-        if not self._allowances.setdefault(cause, Allowance(LOG_BURST, LOG_RATE, at=now)).take(now):
+        if not self._allowances.setdefault(cause, TokenBucket(LOG_RATE, LOG_BURST)).take_one(now):
             self._left_out[cause] = self._left_out.get(cause, 0) + 1
             return False
         if left_out := self._left_out.pop(cause, 0):

@@ -204,7 +204,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         await socket_.accept()
         person = socket_.scope.get(PERSON)
         # By device: another tablet of the same person does not pay for this one.
-        name, budget = person and person.name, page_budget(time.monotonic())
+        name, budget = person and person.name, page_budget()
         device = socket_.scope.get(DEVICE)
         if not console.budgets.may_open(device, time.monotonic()):
             await socket_.close(SENT_TOO_MUCH, TOO_MUCH)

@@ -31,7 +31,7 @@ class Admission:
         """Return True if one more process may start now. starting_since: when the starting processes were started."""
         if sum(now - since < START_SLOT_TIMEOUT_S for since in starting_since) >= self._places:
             return False
-        return not restart or self._restarts.take(1, now) == 1
+        return not restart or self._restarts.take_one(now)
 
     def may_kill(self, now: float) -> bool:
         """Return True if one more hung process may be killed now."""
@@ -39,4 +39,4 @@ class Admission:
 
     def count_kill(self, now: float) -> None:
         """Count one killed hung process."""
-        self._kills.take(1, now)
+        self._kills.take_one(now)

@@ -25,7 +25,7 @@ OWN_RATE = 15.0
 @pytest.mark.parametrize("slow_s", [0.0, 30.0])
 def test_ten_times_what_our_page_sends_never_trips_it(slow_s: float) -> None:
     """Also if a slow Wi-Fi holds the messages of half a minute back, and delivers them at once."""
-    budgets, page, now = Budgets(), page_budget(0.0), 0.0
+    budgets, page, now = Budgets(), page_budget(), 0.0
     for _ in range(int(10 * OWN_RATE * slow_s)):
         assert budgets.may_send("mia", page, now)
     for _ in range(int(10 * OWN_RATE * 600)):
@@ -34,7 +34,7 @@ def test_ten_times_what_our_page_sends_never_trips_it(slow_s: float) -> None:
 
 
 def test_a_flood_closes_the_page_and_no_page_of_another_person() -> None:
-    budgets, page = Budgets(), page_budget(0.0)
+    budgets, page = Budgets(), page_budget()
     taken = 0
     while budgets.may_send("mia", page, 1.0):
         taken += 1
@@ -42,13 +42,13 @@ def test_a_flood_closes_the_page_and_no_page_of_another_person() -> None:
     assert not budgets.may_open("mia", 1.0 + COOLDOWN_S / 2)
     assert budgets.may_open("mia", 1.0 + COOLDOWN_S)
     assert budgets.may_open("bob", 1.0)
-    assert budgets.may_send("bob", page_budget(1.0), 1.0)
+    assert budgets.may_send("bob", page_budget(), 1.0)
 
 
 def test_a_new_page_brings_its_device_no_new_budget() -> None:
     budgets, taken = Budgets(), 0
     for _ in range(20):
-        page = page_budget(0.0)
+        page = page_budget()
         while budgets.may_send("mia", page, 0.0):
             taken += 1
     assert taken < 20_000
