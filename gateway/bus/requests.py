@@ -31,6 +31,7 @@ from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz,
 from schemas import messages
 from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS
+from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
@@ -38,12 +39,8 @@ from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Se
 
 W = TypeVar("W", bound=str)
 
-DEFAULT_MAX_DRIVE_S: Final = 10.0
-"""Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
-MAX_REASON_LENGTH: Final = 200
-"""Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
