@@ -145,7 +145,9 @@ def _servo(message: PageMessage) -> commands.CommandRequest:
     if message.fields.get("deg") is not None:
         return commands.servo_request(Servo.FRONT, deg=message.number("deg"))
     servo = message.one_of("servo", frozenset(map(str, Servo)))
-    return commands.servo_request(servo, message.one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
+    return commands.servo_request(
+        servo, message.one_of("action", frozenset(move for each in Servo for move in each.moves))
+    )
 
 
 def _arm(message: PageMessage) -> commands.CommandRequest:

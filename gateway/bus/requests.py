@@ -253,25 +253,18 @@ def _led(message: Any) -> Action:
     return _checked(ColorLed(message.r, message.g, message.b))
 
 
-_SERVO_ACTIONS: Final = {
-    Servo.FRONT: ("left", "right", "reset"),
-    Servo.VERTICAL: ("up", "down", "reset"),
-    Servo.HORIZONTAL: ("left", "right", "reset"),
-}
-
-
 def _servo(message: Any) -> Action:
-    servo = message.servo or Servo.FRONT
-    if servo not in _SERVO_ACTIONS:
-        raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
+    if message.servo not in ("", *Servo):
+        raise ValueError(f"servo {message.servo!r}: allowed are {', '.join(Servo)}")
+    servo = Servo(message.servo or Servo.FRONT)
     if message.HasField("deg"):
-        if servo != Servo.FRONT or message.action:
+        if servo is not Servo.FRONT or message.action:
             raise ValueError("deg: only the front servo takes degrees, and then no action")
         return _checked(Ptz(message.deg))
-    if message.action not in _SERVO_ACTIONS[servo]:
+    if message.action not in servo.moves:
         raise ValueError(
-            f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
-            + (", or deg 0..180" if servo == Servo.FRONT else "")
+            f"action {message.action!r} of servo {servo}: allowed are {', '.join(servo.moves)}"
+            + (", or deg 0..180" if servo is Servo.FRONT else "")
         )
     return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
 
