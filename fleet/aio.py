@@ -50,7 +50,7 @@ class Fleet:
         *,
         person: str | None = None,
         sender: str | None = None,
-        kind: str = Rank.SCRIPT,
+        kind: str = Rank.SCRIPT.value,
         start_hub: bool = False,
     ) -> None:
         self._open = lambda: client.Fleet(endpoint, name, person=person, sender=sender, kind=kind, start_hub=start_hub)

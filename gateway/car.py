@@ -17,7 +17,6 @@ from typing import Final
 
 import zenoh
 
-from gateway.bus import requests
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import BUS_LOSS_GAP_S, RAW_PER_S, CarPublisher
@@ -28,7 +27,6 @@ from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import OutgoingFrame
 from gateway.control.safety import PersistedSafety
-from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
@@ -37,6 +35,7 @@ from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
 from schemas.authority import People
+from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
 from schemas.platform_name import AUTO
 from schemas.process import signals
@@ -92,7 +91,7 @@ class Settings:
     battery: BatteryPolicy = field(default_factory=BatteryPolicy)
     speed_max: float = 1.0
     people: People = field(default_factory=People)
-    longest_drive_s: float = requests.DEFAULT_MAX_DRIVE_S
+    longest_drive_s: float = DEFAULT_MAX_DRIVE_S
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
     holds_of: str = ""

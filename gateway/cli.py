@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 from schemas.authority import NO_PEOPLE, People
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
+from schemas.limits import CRITICAL_V, LOW_V
 from schemas.process import startup, stdio
 from schemas.process.parent import watched_pid
 from schemas.suggestion import did_you_mean
@@ -156,8 +157,8 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         "--speed-max", metavar="SHARE", type=float, default=1.0, help="no step beyond this share of full speed, 0..1"
     )
     for level, default, volts in (
-        (BatteryLevel.LOW, BatteryAction.WARN, 7.0),
-        (BatteryLevel.CRITICAL, BatteryAction.REFUSE, 6.6),
+        (BatteryLevel.LOW, BatteryAction.WARN, LOW_V),
+        (BatteryLevel.CRITICAL, BatteryAction.REFUSE, CRITICAL_V),
     ):
         run.add_argument(
             f"--on-battery-{level}",

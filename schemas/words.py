@@ -71,6 +71,11 @@ class Servo(StrEnum):
     VERTICAL = "vertical"
     HORIZONTAL = "horizontal"
 
+    @property
+    def moves(self) -> tuple[str, ...]:
+        """What a command may say beside this servo: `left` for `ServoAction.FRONT_LEFT`."""
+        return tuple(each.removeprefix(f"{self}_") for each in ServoAction if each.startswith(f"{self}_"))
+
 
 class ServoAction(StrEnum):
     """One movement of one servo."""
@@ -369,3 +374,13 @@ class RunState(StrEnum):
     ENDED = "ended"
     REFUSED = "refused"
     ELSEWHERE = "elsewhere"
+
+
+class LinkVerdict(StrEnum):
+    """The kind of a link, by the bytes from it."""
+
+    CAR = "car"
+    OTHER = "other"
+    SILENT = "silent"
+    BUSY = "busy"
+    FAILED = "failed"

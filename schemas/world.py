@@ -1,4 +1,4 @@
-"""The fields of a world file. gateway/sim/world_file.py reads one and checks what no single field shows. Pure."""
+"""The fields of a world file. `world_check` checks what no single field shows. Pure."""
 
 from typing import Annotated, Final
 
@@ -56,8 +56,8 @@ class StartEntry(Entry):
 class ThingEntry(Entry):
     """A disc or a box that stands, moves along a path, or is carried by a car."""
 
-    # Default factories keep defaults that mean nothing out of the schema for editors. gateway/sim/world_file.py
-    # finds out what is missing or too much.
+    # Default factories keep defaults that mean nothing out of the schema for editors. `world_check` finds out what is
+    # missing or too much.
     x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of the car's middle")
     y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of the car's middle")
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")

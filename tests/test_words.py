@@ -37,7 +37,7 @@ FIELDS: Final[Mapping[str, tuple[EnumType, ...]]] = {
     "step": (words.SpeedStep,),
     "trust": (words.CarTrust,),
     "verb": (words.Verb, words.RecorderVerb),
-    "verdict": (words.Verdict, words.FrameVerdict, words.Cause),
+    "verdict": (words.Verdict, words.FrameVerdict, words.Cause, words.LinkVerdict),
     "what": (words.LinkState, words.Motors),
 }
 """The names of fields and variables that hold a closed word, with its enums."""
@@ -103,6 +103,10 @@ def held(node: ast.AST) -> Iterator[tuple[str, ast.Constant]]:
                 *zip(node.kwonlyargs, node.kw_defaults, strict=True),
             ]
             yield from ((argument.arg, each) for argument, default in pairs for each in texts(default))
+        case ast.Dict(keys=keys, values=values):
+            for key, value in zip(keys, values, strict=True):
+                if isinstance(key, ast.Constant):
+                    yield from ((str(key.value), each) for each in texts(value))
         case ast.Subscript(value=ast.Dict(keys=keys), slice=index):
             yield from ((name_of(index), each) for key in keys for each in texts(key))
         case ast.Call(func=ast.Attribute(value=ast.Dict(keys=keys), attr="get"), args=[index, *_]):
@@ -150,6 +154,7 @@ def test_no_module_has_a_closed_word_as_a_literal() -> None:
         "self._state = 'ending'",
         "def f(*, kind: str = 'script'): pass",
         "code = {'rejected': 2, 'failed': 1}.get(answer.status, 0)",
+        "shown = {'state': 'closed'}",
         "PHASES = frozenset({'failed', 'rejected', 'expired'})",
     ],
 )

@@ -94,7 +94,7 @@ class Fleet:
         *,
         person: str | None = None,
         sender: str | None = None,
-        kind: str = Rank.SCRIPT,
+        kind: str = Rank.SCRIPT.value,
         start_hub: bool = False,
     ) -> None:
         self.name = keys.check_name(name, "fleet name")

@@ -6,6 +6,7 @@ from enum import StrEnum
 from typing import Final, Self
 
 from fleet.client.effects import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
+from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
 from schemas.suggestion import did_you_mean
 from schemas.words import Basis, Phase, Reason
 
@@ -20,8 +21,6 @@ _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED
 
 OUTCOME_MARGIN_S: Final = 5.0
 """Margin of the timeouts for a command's last event."""
-STOP_EVIDENCE_S: Final = 18.0
-"""Longest time for a car to show a stop after its worst case; gateway.control.stops.stopping ends it before."""
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus: it tries twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
@@ -30,7 +29,6 @@ OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
 """Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
 LATE_ANSWER_S: Final = 2.0
 """If an answer takes longer than this, further timeouts count from the answer, not from the request."""
-COMMAND_QUEUE_TIMEOUT_S: Final = 15.0  # gateway.control: timeout of a command that waits for a busy car
 
 
 class Until(StrEnum):
@@ -152,10 +150,10 @@ class Progress:
         if self._joined:
             return self._timeout_from + self._duration_s
         wait_s = {
-            Until.SENT: COMMAND_QUEUE_TIMEOUT_S,
-            Until.STOPPED: self._worst_case_s + STOP_EVIDENCE_S,
+            Until.SENT: MAX_QUEUE_TIME_S,
+            Until.STOPPED: self._worst_case_s + MAX_EVIDENCE_TIMEOUT_S,
             # The duration counts from the frame, which may have to wait for a stop.
-            Until.OVER: self._duration_s + (0.0 if self._sent_event else COMMAND_QUEUE_TIMEOUT_S),
+            Until.OVER: self._duration_s + (0.0 if self._sent_event else MAX_QUEUE_TIME_S),
         }[self._until]
         return self._timeout_from + wait_s + OUTCOME_MARGIN_S
 

@@ -42,16 +42,16 @@ class _LightColor(Color):
 
 def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> CommandRequest:
     """Return the request for an action of the servo. Reject a wrong action before any query."""
-    servo = ctx.params["servo"]
+    servo = Servo(ctx.params["servo"])
     if action is None or not re.fullmatch("[0-9]+", action):
-        allowed = ("up", "down", "reset") if servo == Servo.VERTICAL else ("left", "right", "reset")
-        words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo == Servo.FRONT else ''}"
+        allowed = servo.moves
+        words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo is Servo.FRONT else ''}"
         if action is None:
             raise click.BadParameter(f"name what to do with {words}, as: fleet servo red {servo} {allowed[0]}")
         if action not in allowed:
             raise click.BadParameter(f"{action!r} is not allowed for {words}")
         return servo_request(servo, action)
-    if servo != Servo.FRONT:
+    if servo is not Servo.FRONT:
         raise click.BadParameter(f"{action!r} is not allowed: servo {servo} takes no degrees, only front does")
     try:
         return servo_request(servo, deg=int(action))

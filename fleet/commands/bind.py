@@ -30,6 +30,7 @@ from fleet.links import may_be_same, parse_fleet_link
 from fleet.supervisor.temporary_gateway import temporary_gateway
 from schemas.links import TcpUrl
 from schemas.process import signals
+from schemas.words import LinkVerdict
 from schemas.yaml_document.document import BadFile, read_text
 
 _AGAIN: Final = "again"
@@ -54,7 +55,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
         for link in links:
             validate_link(link)
     fleet = read(file, unbound=True)
-    found = [each for each in look_for(links, seconds) if each.verdict != "busy" and _unknown(each, fleet)]
+    found = [each for each in look_for(links, seconds) if each.verdict != LinkVerdict.BUSY and _unknown(each, fleet)]
     if not found:
         raise click.ClickException(
             f"No new car found: all that answered are in {file} already. Is it switched on? "

@@ -1,9 +1,6 @@
 """`fleet check`: checks fleet files, plans and worlds, which it recognizes by their content."""
 
 import json
-import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -28,12 +25,12 @@ from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
 from schemas import bus
-from schemas.words import Platform, Rank
+from schemas.words import Rank
 from schemas.world import WorldEntry
+from schemas.world_check import check_world
 from schemas.yaml_document.document import BadFile, read_text
 
 _CHECK_THREADS: Final = 16
-_WORLD_PROBLEM: Final = re.compile(r"(?P<line>\d+):(?P<column>\d+): error: (?P<words>.*)")
 _Cars = Mapping[str, CarSnapshot] | None
 
 
@@ -151,20 +148,22 @@ class _Checks:
         self._good(file, FileKind.PLAN, ", ".join(f"{n} {part}{'' if n == 1 else 's'}" for part, n in parts.items()))
 
     def _check_world(self, file: Path) -> None:
-        # Worlds belong to the simulator, whose code no part of the fleet imports.
-        cars = [word for name in self._simulated for word in ("--car", f"{name}:{Platform.ARDUINO}:tcp")]
-        command = [sys.executable, "-m", "gateway.cli", "sim", "--check", *cars, "--world", str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        for line in done.stderr.splitlines():
-            words = line.removeprefix("gateway sim: ")
-            found = _WORLD_PROBLEM.fullmatch(words.removeprefix(f"{file}:"))
-            place = {"line": int(found["line"]), "column": int(found["column"])} if found else {}
-            problem = {"words": found["words"] if found else words, **place}
-            self._print({"file": str(file), "severity": "error", **problem}, words, err=True)
-        if done.returncode:
+        try:
+            check_world(read_text(file), str(file), self._simulated or None)
+        except BadFile as error:
+            self._print_world_faults(file, error)
             self._worse(_Result.WRONG)
         else:
             self._good(file, FileKind.WORLD, "can be simulated")
+
+    def _print_world_faults(self, file: Path, error: BadFile) -> None:
+        if not self._as_json:
+            click.echo(str(error), err=True)
+            return
+        for each in error.problems:
+            words = f"{each.field}: {each.words}" if each.field else each.words
+            place = {"line": each.line, "column": each.column} if each.line else {}
+            click.echo(json.dumps({"file": str(file), "severity": "error", "words": words, **place}))
 
     def _wrong(self, error: BadFile) -> None:
         print_errors(error, as_json=self._as_json)
@@ -177,8 +176,8 @@ class _Checks:
     def _worse(self, result: _Result) -> None:
         self.result = max(self.result, result)
 
-    def _print(self, values: Mapping[str, object], line: str, *, err: bool = False) -> None:
-        click.echo(json.dumps(values) if self._as_json else line, err=err and not self._as_json)
+    def _print(self, values: Mapping[str, object], line: str) -> None:
+        click.echo(json.dumps(values) if self._as_json else line)
 
 
 def recognize(text: str) -> FileKind:

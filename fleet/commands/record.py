@@ -20,7 +20,7 @@ from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
-from schemas.words import RecorderVerb
+from schemas.words import RecorderState, RecorderVerb
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -167,13 +167,13 @@ def run(
             if full := recorder.full:
                 _say(
                     as_json,
-                    {"session": str(session), "state": "full"},
+                    {"session": str(session), "state": RecorderState.FULL},
                     f"{keys.describe_fleet(fleet)} is not recorded until there is room: {full}",
                 )
             else:
                 _say(
                     as_json,
-                    {"session": str(session), "state": "recording"},
+                    {"session": str(session), "state": RecorderState.RECORDING},
                     f"recording {keys.describe_fleet(fleet)} to {session}",
                 )
             _wait(bus, stop, recorder.ended, parent)
@@ -190,7 +190,13 @@ def run(
     session = outcome.session  # it may be another by now
     _say(
         as_json,
-        {"session": str(session), "state": "closed", "messages": outcome.messages, "bytes": outcome.bytes, **lost},
+        {
+            "session": str(session),
+            "state": RecorderState.CLOSED,
+            "messages": outcome.messages,
+            "bytes": outcome.bytes,
+            **lost,
+        },
         f"{session}: {outcome.messages} messages, {outcome.bytes} bytes, "
         f"{_count(outcome.drops, 'dropped here')}, {_count(outcome.missed, 'missed on the bus')}",
     )

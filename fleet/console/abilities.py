@@ -5,20 +5,10 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
-from gateway.protocol.platforms import Profile, parse_platform
-from schemas.words import Light, Mode, Motion, ServoAction
+from gateway.protocol.platforms import SPECIAL_CAPABILITIES, Profile, parse_platform
+from schemas.words import Light, Mode
 
-_EXAMPLES: Final[dict[str, Frame]] = {
-    "mode": ModeOpen(Mode.TRACKING),
-    "led": ColorLed(0, 0, 0),
-    "servo_deg": Ptz(90),
-    "arm": ArmSet((90,) * 6),
-    "servo_vertical": General(Motion.STOP, servo=ServoAction.VERTICAL_UP),
-    "servo_horizontal": General(Motion.STOP, servo=ServoAction.HORIZONTAL_LEFT),
-}
-"""A frame for each capability that some cars lack."""
-_CAPABILITIES: Final = (*_EXAMPLES, "drive", "whistle", "speed", "servo", "fan", "light")
+_CAPABILITIES: Final = (*SPECIAL_CAPABILITIES, "drive", "whistle", "speed", "servo", "fan", "light")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +44,7 @@ def abilities_of(platform: str, capabilities: tuple[str, ...]) -> Abilities:
 
 
 def _reason(profile: Profile, name: str) -> str:
-    refusal = profile.refusal(_EXAMPLES[name]) if name in _EXAMPLES else None
-    words = refusal or f"the fleet file leaves out {name}"
+    words = profile.why_lacking(name) or f"the fleet file leaves out {name}"
     return f"{words[0].upper()}{words[1:]}."
 
 

@@ -32,7 +32,7 @@ from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
-from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
+from fleet.console.requests import BadPageMessage, PageMessage
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
@@ -43,6 +43,7 @@ from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
 from schemas.keys import person_of
+from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.words import Phase, Rank, Reason, Scope, Verb
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
+from schemas.limits import STREAM_PAUSE_S
+
 TICK_INTERVAL_S: Final = 0.1
 """Interval of ticks."""
 # A frozen browser still answers pings. A thawed page or a healed link delivers old messages in a burst. Therefore only
@@ -15,8 +17,8 @@ MAX_TICK_AGE_S: Final = 0.3
 """Maximum age of a tick when its echo arrives."""
 MAX_ECHO_GAP_S: Final = 0.3
 """Maximum time without an echo. After it, the press is over."""
-# A gateway rejects the stream of a sender that has not paused for 0.5 s since a stop (gateway.control.senders).
-AFTER_STOP_S: Final = 0.6
+# A gateway rejects the stream of a sender that has not paused since a stop. 0.1 s is one tick.
+AFTER_STOP_S: Final = STREAM_PAUSE_S + 0.1
 """Minimum time from a STOP to the next press."""
 _MAX_TICKS: Final = 16
 """Number of remembered ticks: more than fit into the maximum age."""

@@ -12,12 +12,11 @@ from fleet.client import commands
 from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
 from schemas import keys
 from schemas.commands import STOPS
+from schemas.limits import MAX_REASON_LENGTH
 from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep, Verb
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""
-MAX_REASON_LENGTH: Final = 200
-"""Maximum length of the reason of an e-stop."""
 _STOP_KINDS: Final = (*STOPS, Verb.PAUSE)
 _MAX_NUMBER: Final = 2**53
 MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
@@ -146,7 +145,9 @@ def _servo(message: PageMessage) -> commands.CommandRequest:
     if message.fields.get("deg") is not None:
         return commands.servo_request(Servo.FRONT, deg=message.number("deg"))
     servo = message.one_of("servo", frozenset(map(str, Servo)))
-    return commands.servo_request(servo, message.one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
+    return commands.servo_request(
+        servo, message.one_of("action", frozenset(move for each in Servo for move in each.moves))
+    )
 
 
 def _arm(message: PageMessage) -> commands.CommandRequest:

@@ -12,9 +12,6 @@ from typing import Any, Final
 
 from fleet.fleetfile.models import (
     CAPABILITIES,
-    CRITICAL_V,
-    DEFAULT_MAX_DRIVE_S,
-    LOW_V,
     ConsoleEntry,
     FileEntry,
     LimitsEntry,
@@ -25,6 +22,7 @@ from fleet.fleetfile.models import (
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from gateway.protocol.platforms import parse_platform
 from schemas.colors import Rgb, car_color, hex_color, parse_color
+from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, LOW_V
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, normalize_name, parse_option
 from schemas.words import BatteryAction, Platform

@@ -13,15 +13,12 @@ from fleet.links import parse_fleet_link
 from gateway.protocol.platforms import parse_platform
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
+from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS, parse_option
 from schemas.words import BatteryAction, Mode, Platform
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
-
-DEFAULT_MAX_DRIVE_S: Final = 10.0
-LOW_V, CRITICAL_V = 7.0, 6.6
-EMPTY_V, FULL_V = 6.4, 8.4  # docs/reference/protocol.md#readings: two Li-ion cells
 
 
 class PersonRank(StrEnum):

@@ -11,10 +11,10 @@ from fleet.links import parse_fleet_link
 from schemas.links import SerialUrl, UsbUrl
 from schemas.platform_name import AUTO
 from schemas.process.stdio import printable
-from schemas.words import Platform
+from schemas.words import LinkVerdict, Platform
 
-LIKELY_VERDICTS: Final = ("car", "ble", "given")
-POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
+LIKELY_VERDICTS: Final = (LinkVerdict.CAR, "ble", "given")
+POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, LinkVerdict.SILENT, LinkVerdict.BUSY)
 """Verdicts on links that may be a car's: a scan receives nothing from a car that is off, silent or served already.
 
 `ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
@@ -59,6 +59,6 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
 def _found(fields: Mapping[str, Any]) -> FoundLink:
     if fields["kind"] == "ble":
         words = f"Bluetooth device {printable(fields['name']) or 'without a name'}, {fields['rssi']} dBm"
-        return FoundLink(fields["url"], "ble" if fields["uart"] else "other", words)
+        return FoundLink(fields["url"], "ble" if fields["uart"] else LinkVerdict.OTHER, words)
     settled = fields["platform"] if fields["platform"] in set(Platform) - {Platform.UNKNOWN} else AUTO
     return FoundLink(fields["url"], fields["verdict"], printable(fields["words"]), settled)

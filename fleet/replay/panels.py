@@ -10,8 +10,8 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
-from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from schemas import keys
+from schemas.limits import CRITICAL_V, LOW_V
 from schemas.topics import CAR_TOPICS, TOPICS, Topic
 from schemas.words import FrameVerdict, Phase
 

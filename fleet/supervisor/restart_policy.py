@@ -8,6 +8,7 @@ from enum import StrEnum
 from math import inf
 from typing import Final
 
+from schemas.limits import SHUTDOWN_S
 from schemas.words import RunState
 
 FIRST_RESTART_DELAY_S: Final = 0.25
@@ -20,9 +21,8 @@ WRONG_USE: Final = 2
 """Exit code of a process that rejects its arguments. A restart seldom helps."""
 WRONG_USE_RETRY_S: Final = 60.0
 """Interval of retries after WRONG_USE. The supervisor never gives up: the user may fix a file or a device."""
-# A gateway waits up to 16 s for its car to show the stop (gateway.control.executor, `SHUTDOWN_S`).
-# It leaves the bus after that.
-GATEWAY_GRACE_S: Final = 19.0
+# A gateway leaves the bus after its car has shown the stop. That takes up to two seconds.
+GATEWAY_GRACE_S: Final = SHUTDOWN_S + 3.0
 """Timeout for a gateway's exit after SIGTERM. Then the supervisor kills it."""
 HUNG: Final = "hung"
 """First word of the reason if a process was killed because it hung."""

@@ -31,6 +31,7 @@ from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz,
 from schemas import messages
 from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS
+from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
@@ -38,12 +39,8 @@ from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Se
 
 W = TypeVar("W", bound=str)
 
-DEFAULT_MAX_DRIVE_S: Final = 10.0
-"""Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
-MAX_REASON_LENGTH: Final = 200
-"""Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
@@ -256,25 +253,18 @@ def _led(message: Any) -> Action:
     return _checked(ColorLed(message.r, message.g, message.b))
 
 
-_SERVO_ACTIONS: Final = {
-    Servo.FRONT: ("left", "right", "reset"),
-    Servo.VERTICAL: ("up", "down", "reset"),
-    Servo.HORIZONTAL: ("left", "right", "reset"),
-}
-
-
 def _servo(message: Any) -> Action:
-    servo = message.servo or Servo.FRONT
-    if servo not in _SERVO_ACTIONS:
-        raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
+    if message.servo not in ("", *Servo):
+        raise ValueError(f"servo {message.servo!r}: allowed are {', '.join(Servo)}")
+    servo = Servo(message.servo or Servo.FRONT)
     if message.HasField("deg"):
-        if servo != Servo.FRONT or message.action:
+        if servo is not Servo.FRONT or message.action:
             raise ValueError("deg: only the front servo takes degrees, and then no action")
         return _checked(Ptz(message.deg))
-    if message.action not in _SERVO_ACTIONS[servo]:
+    if message.action not in servo.moves:
         raise ValueError(
-            f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
-            + (", or deg 0..180" if servo == Servo.FRONT else "")
+            f"action {message.action!r} of servo {servo}: allowed are {', '.join(servo.moves)}"
+            + (", or deg 0..180" if servo is Servo.FRONT else "")
         )
     return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
 

@@ -5,17 +5,13 @@ Each command ends with a record. `Executor` decides when a frame is written.
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final
 
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from schemas.authority import Sender
+from schemas.limits import MAX_QUEUE_TIME_S
 from schemas.words import Motion, Phase, Reason
-
-MAX_QUEUE_TIME_S: Final = 15.0
-"""Maximum time that a command waits for a busy car: longer than the longest stop, that of a connect to a car that sends
-nothing (`stopping.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
 
 
 @dataclass(slots=True)

@@ -13,7 +13,7 @@ from gateway.control import arbiter
 from gateway.control.car_model import CarModel
 from gateway.control.car_monitor import CarMonitor
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.command_queue import MAX_QUEUE_TIME_S, HeldMotion
+from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import (
     Action,
     Answer,
@@ -37,12 +37,12 @@ from gateway.control.estimate.learned import Learned
 from gateway.control.events import OutgoingFrame, Record
 from gateway.control.executor import LATE_DRIVE_S, Executor
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
-from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender
+from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
 START_MARGIN_S: Final = 1.0

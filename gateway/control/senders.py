@@ -3,11 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Final
 
+from schemas.limits import STREAM_PAUSE_S
+
 SENDER_GONE_S: Final = 1.0
 """Timeout for a lost token. A restarted hub takes all tokens down for half a second."""
-# Without the pause the next sample of a held joystick would restart the car 50 ms after another person's stop.
-STREAM_PAUSE_S: Final = 0.5
-"""Minimum pause of a drive stream after a stop. A release ends the pause at once."""
 MAX_SENDERS: Final = 256
 """Maximum senders whose last drive is remembered."""
 

@@ -18,10 +18,9 @@ from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.frames import ModeClose
 from gateway.protocol.platforms import StopStyle
 from gateway.protocol.timing import RECOVERY_SILENCE_S
+from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Platform, Reason, Shows
 
-SHUTDOWN_S: Final = 16.0
-"""Maximum time that a gateway that shuts down waits for its car to show the stop."""
 DOUBTED_PROBES: Final = 2
 """Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
 

@@ -3,6 +3,7 @@
 Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -33,7 +34,7 @@ from gateway.protocol.timing import (
     block_s,
 )
 from schemas.platform_name import HEAD, NO_READINGS, OPTIONS, parse_name
-from schemas.words import Light, Mode, Platform, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Platform, ServoAction, SpeedStep
 
 
 class StopStyle(StrEnum):
@@ -95,6 +96,17 @@ _STM32_CONSTANTS: Final = frozenset({"grayscale", "line", "obstacle", "light"})
 # docs/reference/protocol.md#ranges
 _PV_MAX: Final = {2: 12.0, 3: 13.0}
 GRAY_10_BIT, _GRAY_12_BIT = 1023, 4095
+
+
+SPECIAL_CAPABILITIES: Final[Mapping[str, Frame]] = {
+    "mode": ModeOpen(Mode.TRACKING),
+    "led": ColorLed(0, 0, 0),
+    "servo_deg": Ptz(90),
+    "arm": ArmSet((90,) * 6),
+    "servo_vertical": General(Motion.STOP, servo=ServoAction.VERTICAL_UP),
+    "servo_horizontal": General(Motion.STOP, servo=ServoAction.HORIZONTAL_LEFT),
+}
+"""The capabilities that some cars lack, each with a frame that needs it."""
 
 
 @cache
@@ -251,6 +263,11 @@ class Profile:
             case Reset():
                 # hazards of the Raspberry Pi programs: a lone `#` is never sent to this platform
                 return self._unless("mode", "a lone '#'")
+
+    def why_lacking(self, capability: str) -> str | None:
+        """Return why the car lacks a capability, for a person. None if it has it, or if every car has it."""
+        frame = SPECIAL_CAPABILITIES.get(capability)
+        return None if frame is None else self.refusal(frame)
 
     def block_s(self, frame: Frame) -> float:
         """Return the maximum time in seconds for which this frame blocks the car (see `timing.block_s`)."""

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from math import inf
 from typing import Final
 
-from gateway.sim.model.geometry import Point
 from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
 from gateway.sim.world_commands import WorldState
 from schemas import keys
 from schemas.bus import Bus, BusError, Publisher
 from schemas.gen import fleet_v1_pb2
+from schemas.geometry import Point
 from schemas.topics import TOPICS
 
 TRUTH_INTERVAL_S: Final = 0.1

@@ -4,7 +4,6 @@ import asyncio
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
@@ -17,17 +16,7 @@ from gateway.protocol.sensors import Sensors
 from gateway.tools import cli_support
 from gateway.tools.discovery import SerialPort
 from gateway.tools.statistics import LinkStatistics
-from schemas.words import Mode, Platform
-
-
-class LinkVerdict(StrEnum):
-    """The kind of a link, by the bytes from it."""
-
-    CAR = "car"
-    OTHER = "other"
-    SILENT = "silent"
-    BUSY = "busy"
-    FAILED = "failed"
+from schemas.words import LinkVerdict, Mode, Platform
 
 
 @dataclass(slots=True)

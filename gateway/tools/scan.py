@@ -17,9 +17,10 @@ from gateway.link import parse_url
 from gateway.protocol.frames import encode
 from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
-from gateway.tools.probe import LinkProbe, LinkVerdict
+from gateway.tools.probe import LinkProbe
 from schemas.process.stdio import printable
 from schemas.process.usb_bus import explain_missing_port
+from schemas.words import LinkVerdict
 
 DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
 EPILOG: Final = """\

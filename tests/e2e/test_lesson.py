@@ -15,7 +15,7 @@ import pytest
 from fleet.client.client import Fleet
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.spec import UpOptions, build_spec
-from gateway.control.senders import STREAM_PAUSE_S
+from schemas.limits import STREAM_PAUSE_S
 from tests.e2e.test_newcomer import Newcomer, blocks, commands
 from tests.support import in_process
 from tests.support.ports import free_endpoint

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from gateway.control.commands import SetMode
 from gateway.protocol.frames import ModeClose, ModeOpen, encode
-from gateway.sim.model.geometry import Segment
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.world import World
+from schemas.geometry import Segment
 from schemas.words import Mode
 from tests.support.virtual import Pair
 

@@ -35,16 +35,16 @@ from gateway.protocol.platforms import parse_platform
 from schemas import keys
 from schemas.colors import parse_color
 from schemas.platform_name import OPTIONS
-from schemas.words import Mode
+from schemas.words import Mode, Platform
 from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.messages import Where, suggest
 
 BadPlan = BadFile
 """Raised for a plan with faults; the text has one line for each, with file, line and column."""
 CAPABILITIES: Final = frozenset(
-    {*parse_platform("arduino").capabilities, *parse_platform("raspberry_pi").capabilities, *OPTIONS}
+    {*parse_platform(Platform.ARDUINO).capabilities, *parse_platform(Platform.RASPBERRY_PI).capabilities, *OPTIONS}
 )
-_MISSING: Final = {"mode": "manual", "when": "true", "then": []}
+_MISSING: Final = {"mode": Mode.MANUAL, "when": "true", "then": []}
 """Values for missing required fields, so that the rest of a file can be checked."""
 
 

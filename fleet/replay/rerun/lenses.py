@@ -12,9 +12,9 @@ import pyarrow.compute as pc  # type: ignore[import-untyped]  # likewise
 import rerun as rr
 import rerun.chunk as rrc
 
-from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from fleet.replay import panels
 from fleet.replay.panels import Curve, Derivation, StateTrack
+from schemas.limits import CRITICAL_V, LOW_V
 from schemas.topics import TOPICS
 
 MESSAGE_SUFFIX: Final = ":message"

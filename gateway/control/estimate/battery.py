@@ -6,12 +6,9 @@ A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from schemas.limits import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
-EMPTY_V: Final = 6.4  # docs/reference/protocol.md#readings: two Li-ion cells, 6.4 V empty
-FULL_V: Final = 8.4  # to 8.4 V full
-LOW_V: Final = 7.0
-CRITICAL_V: Final = 6.6
 SAG_V: Final = 0.4
 """Maximum voltage drop by motors under load; an estimate, not measured."""
 LOAD_RECOVERY_S: Final = 5.0

@@ -13,6 +13,7 @@ from gateway.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
+from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import FrameOrigin, Mode, Platform
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
@@ -22,9 +23,8 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
 EVIDENCE_INTERVALS: Final = 4
-"""Minimum of that timeout, in intervals with a pause: two pauses, the report before, and the silence after them."""
-MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
-"""Maximum of that timeout: those intervals of the slowest car, one every `SLOWEST_S` with the longest `MODE00`."""
+"""Minimum of that timeout, in intervals with a pause: two pauses, the report before, and the silence after them. Its
+maximum is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer, 23 s at the slowest
 car."""

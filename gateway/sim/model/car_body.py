@@ -4,8 +4,8 @@ from math import atan2, ceil, cos, degrees, hypot, pi, radians, sin
 from typing import Final
 
 from gateway.sim.model.firmware import Pose, Rng
-from gateway.sim.model.geometry import Point
 from gateway.sim.model.world import STEP_S, World
+from schemas.geometry import Point
 
 TOP_SPEED_M_S: Final = 0.5
 """Speed of a wheel at PWM 255."""

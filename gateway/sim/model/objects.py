@@ -10,7 +10,17 @@ from math import cos, hypot, sin, sqrt
 from typing import Final
 
 from gateway.sim.model.firmware import Pose
-from gateway.sim.model.geometry import Hit, Point, Segment, foot, nearest, ray_to_circle, ray_to_segment, turned_box
+from schemas.geometry import (
+    Hit,
+    Point,
+    Segment,
+    foot,
+    in_turned_box,
+    nearest,
+    ray_to_circle,
+    ray_to_segment,
+    turned_box,
+)
 
 FAR_M: Final = 100.0
 """Maximum of x and y in a world."""
@@ -151,9 +161,7 @@ class MovingObject:
         return min(feet, key=lambda point: hypot(x - point[0], y - point[1]))
 
     def _inside(self, pose: Pose, x: float, y: float) -> bool:
-        c, s = cos(pose.heading_rad), sin(pose.heading_rad)
-        dx, dy = x - pose.x_m, y - pose.y_m
-        return abs(dx * c + dy * s) < self.width_m / 2 and abs(dy * c - dx * s) < self.depth_m / 2
+        return in_turned_box(x - pose.x_m, y - pose.y_m, pose.heading_rad, self.width_m, self.depth_m)
 
 
 def _ends(path: tuple[Point, ...]) -> list[float]:

@@ -11,7 +11,10 @@ from math import atan2, ceil, cos, floor, hypot, sin
 from typing import Final, Protocol
 
 from gateway.sim.model.firmware import Pose
-from gateway.sim.model.geometry import (
+from gateway.sim.model.objects import Lamp, MovingObject, carried
+from gateway.sim.model.scheduler import EventScheduler
+from schemas.geometry import (
+    RADIUS_M,
     Hit,
     Point,
     Segment,
@@ -24,11 +27,7 @@ from gateway.sim.model.geometry import (
     ray_to_circle,
     reach,
 )
-from gateway.sim.model.objects import Lamp, MovingObject, carried
-from gateway.sim.model.scheduler import EventScheduler
 
-RADIUS_M: Final = 0.13
-"""Radius of a car, which is a disc for walls, things, other cars and their sensors."""
 STEP_S: Final = 0.04
 """Maximum time between two collision checks, and the tick of a lively world."""
 TAPE_M: Final = 0.025

@@ -9,9 +9,10 @@ from fleet.client import command_tracker
 from fleet.client.command_tracker import PendingCommand, QueryEnded
 from fleet.client.commands import mode_request, resume_request
 from fleet.client.effects import EFFECTS, STOP_VERBS
-from fleet.client.outcome import COMMAND_QUEUE_TIMEOUT_S, STOP_EVIDENCE_S, Progress, Until
+from fleet.client.outcome import Progress, Until
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
 from tests.support.message_length import MAX_LINES, count_lines
 
 # Each step: ("answer" | "event", phase, worst case), at 1, 2, 3 ... s after the request at 100.
@@ -85,14 +86,16 @@ def test_an_answer_that_its_last_record_overtook_still_says_the_worst_case() -> 
 
 
 def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() -> None:
-    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + STOP_EVIDENCE_S + 5.0)
+    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(
+        100 + 7.3 + MAX_EVIDENCE_TIMEOUT_S + 5.0
+    )
 
 
 def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     assert progress.deadline > 110.0, "the query is over before it"
     progress.on_answer("queued", "", "", 0.5, 108.0)
-    assert progress.deadline == pytest.approx(108.0 + 0.5 + STOP_EVIDENCE_S + 5.0)
+    assert progress.deadline == pytest.approx(108.0 + 0.5 + MAX_EVIDENCE_TIMEOUT_S + 5.0)
 
 
 @pytest.mark.parametrize(
@@ -268,7 +271,7 @@ def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
 
 def test_a_drive_whose_records_come_late_is_not_taken_for_one_that_only_prolonged_another() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
-    assert progress.deadline == 100.0 + 2.0 + COMMAND_QUEUE_TIMEOUT_S + 5.0, "it may wait for a stop"
+    assert progress.deadline == 100.0 + 2.0 + MAX_QUEUE_TIME_S + 5.0, "it may wait for a stop"
     for at, phase in enumerate(("queued", "sent"), start=104):
         progress.on_event(phase, "", "", 0.0, at)
     assert progress.deadline == 112.0, "its duration counts from its frame"

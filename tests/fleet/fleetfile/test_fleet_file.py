@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, FileEntry
+from fleet.fleetfile.models import FileEntry
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
-from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
 from schemas.colors import car_color, hex_color
@@ -114,8 +113,6 @@ def test_what_is_not_said() -> None:
 def test_what_is_not_said_is_as_gateways_have_it() -> None:
     policy = battery.BatteryPolicy()
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
-    assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
-    assert requests.DEFAULT_MAX_DRIVE_S == DEFAULT_MAX_DRIVE_S
 
 
 def test_all_faults_of_a_fleet_are_told_at_once() -> None:

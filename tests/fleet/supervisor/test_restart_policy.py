@@ -19,7 +19,7 @@ from fleet.supervisor.restart_policy import (
     RestartAction,
     delay_s,
 )
-from gateway.control.stop_executor import SHUTDOWN_S
+from schemas.limits import SHUTDOWN_S
 from schemas.words import RunState
 
 LEAVES_BUS_S = 2.0

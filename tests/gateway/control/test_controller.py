@@ -8,7 +8,6 @@ from itertools import pairwise
 import pytest
 
 from gateway.control import command_queue
-from gateway.control.command_queue import MAX_QUEUE_TIME_S
 from gateway.control.commands import (
     Action,
     ChangeSpeed,
@@ -22,13 +21,13 @@ from gateway.control.commands import (
     Stop,
 )
 from gateway.control.safety import PersistedSafety
-from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.sim.model.traits import CarTraits
 from schemas.authority import Hold, Sender
+from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.words import (
     Basis,
     CarTrust,

@@ -4,8 +4,8 @@ import pytest
 
 from gateway.control.arbiter import AFTER_SLEEP_S
 from gateway.control.commands import Drive, EmergencyStop, Fan, Lend, OneShot, Pause, SetMode, Stop
-from gateway.control.senders import STREAM_PAUSE_S
 from gateway.protocol.frames import ColorLed
+from schemas.limits import STREAM_PAUSE_S
 from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
 

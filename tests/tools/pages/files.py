@@ -8,8 +8,8 @@ from fleet.fleetfile import fleet_file
 from fleet.fleetfile.models import FileEntry
 from fleet.policy.plan import lint, parser
 from fleet.policy.plan.models import PlanEntry
-from gateway.sim import world_file
 from schemas.world import WorldEntry
+from schemas.world_check import check_world
 from schemas.yaml_document.document import schema_of
 from tests.tools.pages.command_line import escape
 
@@ -122,7 +122,7 @@ def problems(kind: str, text: str) -> list[str]:
         if kind == "fleet":
             fleet_file.parse_fleet(text, Path("fleet.yaml"))
         else:
-            world_file.read_world(text, "world.yaml")
+            check_world(text, "world.yaml")
     except ValueError as error:
         return [str(error)]
     return []

@@ -9,11 +9,9 @@ from typing import Any
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions.fields import LAST, fields_of
-from gateway.bus.requests import DEFAULT_MAX_DRIVE_S
 from gateway.control.car_monitor import STALL_S
 from gateway.control.estimate.trust import TRANSITIONS, TrustEvent, TrustState
-from gateway.control.senders import SENDER_GONE_S, STREAM_PAUSE_S
-from gateway.control.stop_executor import SHUTDOWN_S
+from gateway.control.senders import SENDER_GONE_S
 from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
@@ -21,6 +19,7 @@ from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 from schemas.commands import COMMANDS
+from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_PAUSE_S
 from schemas.words import CarTrust, Mode, Platform
 from tests.support import vectors
 from tests.tools.vectors import STOPS

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.battery import LEVEL_DEBOUNCE_S, LOW_V, Battery, BatteryPolicy, charge
+from gateway.control.estimate.battery import LEVEL_DEBOUNCE_S, Battery, BatteryPolicy, charge
+from schemas.limits import LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
 

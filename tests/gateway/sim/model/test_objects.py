@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware, Pose
-from gateway.sim.model.geometry import box, distance
 from gateway.sim.model.objects import Lamp, MovingObject
-from gateway.sim.model.world import RADIUS_M, World
+from gateway.sim.model.world import World
+from schemas.geometry import RADIUS_M, box, distance
 from tests.gateway.sim.strangers import RUN, VirtualStranger, opening, opening_s
 
 HOME = Pose(0.0, 0.0, 0.0)

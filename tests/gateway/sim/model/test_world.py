@@ -8,7 +8,8 @@ import pytest
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp
-from gateway.sim.model.world import RADIUS_M, World
+from gateway.sim.model.world import World
+from schemas.geometry import RADIUS_M
 from tests.gateway.sim.strangers import opening, opening_s, virtual
 
 

@@ -9,8 +9,9 @@ import pytest
 from fleet.examples import EXAMPLES
 from gateway.control.commands import SetMode, Stop
 from gateway.sim.model.objects import Lamp, MovingObject
-from gateway.sim.model.world import RADIUS_M, World
+from gateway.sim.model.world import World
 from gateway.sim.world_file import WorldSpec, read_world
+from schemas.geometry import RADIUS_M
 from schemas.words import Mode, Verdict
 from tests.support.virtual import Pair
 

@@ -1,4 +1,4 @@
-"""Plane geometry of the simulated world: points, segments, circles, rays. Pure.
+"""Plane geometry of simulated worlds: points, segments, boxes, circles, rays. Pure.
 
 REP-103: meters, x forward, y left, angles counter-clockwise.
 """
@@ -12,6 +12,8 @@ Segment: TypeAlias = tuple[float, float, float, float]
 Hit: TypeAlias = tuple[float, float]
 """The distance along a ray, and the cosine of the angle to the normal of the surface."""
 
+RADIUS_M: Final = 0.13
+"""Radius of a simulated car, which is a disc for walls, things, other cars and their sensors."""
 _PARALLEL: Final = 1e-12
 
 
@@ -26,6 +28,12 @@ def turned_box(x: float, y: float, heading: float, width: float, depth: float) -
     c, s, w, d = cos(heading), sin(heading), width / 2, depth / 2
     corners = ((-w, -d), (w, -d), (w, d), (-w, d))
     return _sides([(x + ahead * c - left * s, y + ahead * s + left * c) for ahead, left in corners])
+
+
+def in_turned_box(x: float, y: float, heading: float, width: float, depth: float) -> bool:
+    """Return True if a point, as seen from the middle of a rectangle turned by `heading` rad, is in it."""
+    c, s = cos(heading), sin(heading)
+    return abs(x * c + y * s) < width / 2 and abs(y * c - x * s) < depth / 2
 
 
 def _sides(corners: list[Point]) -> tuple[Segment, ...]:
