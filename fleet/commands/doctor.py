@@ -12,9 +12,8 @@ from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe
 from fleet.commands.fleets import open_client
 from fleet.commands.group import hint_options, say
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.output import echo_safely
+from fleet.commands.output import echo_safely, watched
 from fleet.commands.params import SessionPath, complete_car, no_cars
-from fleet.commands.sessions import watched
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import is_session
 from fleet.recording.tools.checkup import SessionCheckup

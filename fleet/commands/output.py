@@ -5,9 +5,9 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import click
 
@@ -20,7 +20,10 @@ from schemas.printable import printable_lines
 from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
+_PROGRESS_STEP: Final = 1024
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
+
+T = TypeVar("T")
 
 
 def json_text(reading: Reading) -> str:
@@ -117,3 +120,16 @@ def _value(value: object) -> str:
 
 def _unit(unit: str) -> str:
     return f" {unit}" if unit not in ("", "1") else ""
+
+
+def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
+    """Return a function that passes on items and shows a progress bar."""
+
+    def watch(items: Iterable[T]) -> Iterator[T]:
+        with progress_bar(label, total) as advance:
+            for count, item in enumerate(items, 1):
+                yield item
+                if count % _PROGRESS_STEP == 0:
+                    advance(_PROGRESS_STEP)
+
+    return watch

@@ -70,7 +70,7 @@ def play(
 
     No car moves: a replayed fleet takes no commands.
     """
-    from fleet.commands.sessions import part_of
+    from fleet.commands.session_part import part_of
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session
     from fleet.replay.player.player import LOOP_PAUSE_NS, NameTaken, Player

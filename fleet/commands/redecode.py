@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import echo_safely
+from fleet.commands.output import echo_safely, watched
 from fleet.commands.params import car_option, session_argument
+from fleet.commands.session_part import part_of
 from schemas import keys
 
 if TYPE_CHECKING:
@@ -91,7 +92,6 @@ class _RedecodeReport:
 
     def of_session(self) -> None:
         """Read frames from a session. Raises NoSession."""
-        from fleet.commands.sessions import part_of, watched
         from fleet.recording.reading.session import Session
         from fleet.recording.tools.summary import of_session as overview
         from fleet.replay.analysis.recorded_frames import FRAME_KEYS, of_session
@@ -199,7 +199,6 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
 
     `fleet sessions redecode FILE.jsonl` compares it with the decoder of this version.
     """
-    from fleet.commands.sessions import part_of
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session as overview
     from fleet.replay.analysis import vector_file

@@ -90,7 +90,7 @@ def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str
 
     if not cars and start is None and end is None:
         return WHOLE_SESSION
-    from fleet.commands.sessions import part_of
+    from fleet.commands.session_part import part_of
 
     selection = part_of(session, start, end, cars)
     return Part(cars, selection.start_ns, selection.end_ns)

@@ -2,31 +2,28 @@
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import echo_safely, progress_bar
+from fleet.commands.output import echo_safely, watched
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
+from fleet.commands.session_part import part_of
 from fleet.recording import time_spec
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
-from schemas.local_time import date_and_clock, of_iso, with_offset
+from schemas.local_time import date_and_clock, of_iso
 from schemas.printable import printable
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
     from fleet.recording.tools.summary import SessionSummary
-
-_PROGRESS_STEP: Final = 1024
-
-T = TypeVar("T")
 
 
 @click.group(
@@ -77,19 +74,6 @@ def _open(path: Path) -> "Session":
     from fleet.recording.reading.session import Session
 
     return Session(path)
-
-
-def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
-    """Return a function that passes on items and shows a progress bar."""
-
-    def watch(items: Iterable[T]) -> Iterator[T]:
-        with progress_bar(label, total) as advance:
-            for count, item in enumerate(items, 1):
-                yield item
-                if count % _PROGRESS_STEP == 0:
-                    advance(_PROGRESS_STEP)
-
-    return watch
 
 
 @sessions.command(
@@ -288,32 +272,6 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
     with _session_errors(out):
         count = make(found, out, selection, cars, watched("cut", None))
     echo_safely(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
-
-
-def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
-    """Return the selected part of a session. Raises UsageError for a car or time that is not in the session."""
-    from fleet.recording.selection import Selection
-    from fleet.recording.tools.summary import of_session
-
-    about = of_session(session)
-    if missing := sorted(set(cars) - set(about.cars)):
-        raise click.UsageError(
-            f"--car: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
-        )
-    bounds: list[int | None] = []
-    now_s = time.time()
-    for name, text in (("--from", start), ("--to", end)):
-        try:
-            bounds.append(None if text is None else time_spec.at_ns(text, about.start_ns, about.end_ns, now_s))
-        except ValueError as error:
-            raise click.UsageError(f"{name}: {error}") from None
-    selection = Selection(None, *bounds)
-    there = f"{session.path} runs from {with_offset(about.start_ns)} to {with_offset(about.end_ns)}"
-    if bounds[0] is not None and bounds[1] is not None and bounds[0] >= bounds[1]:
-        raise click.UsageError(f"--from {start} is not before --to {end}: {there}")
-    if not selection.overlaps(about.start_ns, about.end_ns):
-        raise click.UsageError(f"The time range is empty: {there} ({time_spec.words(about.length_s)}).")
-    return selection
 
 
 @sessions.command(
