@@ -261,8 +261,9 @@ class CarGateway:
                 if not may_fail and not await self._is_port_in_use():
                     if looked_again or not isinstance(error, Busy):
                         raise
-                    looked_again = True  # another gateway had the port, and has ended since
-                self._on_link_lost(str(error))
+                    looked_again = True  # the other gateway, which had the port, may have ended since
+                else:
+                    self._on_link_lost(str(error))
                 await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
                 continue
             may_fail = True
