@@ -74,6 +74,15 @@ FOUND = (
         91817, "arduino", "stm32", "no-echo", "drive", 0.8960729485160077, Ending.ESTOP, (),
         traits=CarTraits(interval_s=1.3770950250146663, last_frame_wins=True), kept=True,
     ),
+    # The link began to delay reports. One delay was like the block that the car had shown at an earlier stop.
+    EpisodePlan(
+        253773, "arduino", "arduino", "echo", "drive", 0.31584760952759394, Ending.STOP,
+        (
+            LinkFault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=1.4985314921454769),
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, 2.612158266594101),
+        ),
+        traits=CarTraits(interval_s=2.125256673661981, close_s=1.3),
+    ),
 )  # fmt: skip
 
 

@@ -269,6 +269,8 @@ class StopEvidence:
     """When the last `MODE00` without a result was written."""
     _delay_s: float | None = None
     """The delay of the first report after that `MODE00`, if it is known."""
+    _delayed: int = 0
+    """Number of `MODE00` frames of this stop after which the first report was late, but not by the block."""
     _pauses: int = 0
     _pauses_needed: int = PAUSES
     _unjudged: bool = False
@@ -342,6 +344,7 @@ class StopEvidence:
         """Prepare for another stop. Pauses of the one before stay, the control does not."""
         self.settles_at = None
         self._controlled = False
+        self._delayed = 0
 
     def sent_motion(self) -> None:
         """Drop the evidence: the car may drive."""
@@ -526,7 +529,9 @@ class StopEvidence:
         gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
         delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
         blocked_s = sum(each.block_s for each in blocking)
-        if pending >= before and after_s > IN_FLIGHT_S and not blocking:
+        # A block ends no sooner after its frame than it lasts: a longer delay is the link's.
+        is_possible = after_s > IN_FLIGHT_S and delay_s <= after_s + EARLY_S
+        if pending >= before and is_possible and not blocking:
             self._delay_s = delay_s
         if after_s <= close_s - EARLY_S:
             return Finding.NOTHING
@@ -542,9 +547,11 @@ class StopEvidence:
             return Finding.NOTHING
         self._pending = None
         first_delay_s, self._delay_s = self._delay_s, None
-        if first_delay_s is not None and self.learned.add_delay(
+        agrees = first_delay_s is not None and self.learned.add_delay(
             Blocking.MODE_CLOSE, first_delay_s, self.profile.reopened_s, controlled=self._controlled
-        ):
+        )
+        self._delayed += first_delay_s is not None
+        if first_delay_s is not None and agrees and self._delayed >= PAUSES:
             self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
             return self._pause(at, first_delay_s)
         # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.

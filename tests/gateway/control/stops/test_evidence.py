@@ -159,6 +159,31 @@ def test_the_frame_that_is_judged_is_the_last_one() -> None:
     assert watch.reports(16.75) == [SETTLING]
 
 
+def unlike(watch: EvidenceWatch, at: float, delay_s: float, *, closed_s: float = 0.5) -> list[Finding]:
+    """Send `MODE00` so long after a report. The next report comes late by `delay_s`, the one after it on time."""
+    watch.reports(at)
+    watch.closed(at + closed_s)
+    return watch.reports(at + INTERVAL_S + delay_s, at + 2 * INTERVAL_S + delay_s)
+
+
+def test_delays_of_a_stop_before_show_no_other_stop() -> None:
+    watch = EvidenceWatch()
+    assert SETTLING in [found for number in range(3) for found in unlike(watch, 10.0 + 6 * number, 0.6)]
+    watch.evidence.sent_motion()
+    watch.evidence.begin_stop()
+    watch.learned.forget_reactions()
+    for _ in range(2):
+        watch.learned.add_delay(Blocking.MODE_CLOSE, 0.6, 10.0, controlled=False)
+    assert SETTLING not in unlike(watch, 40.0, 0.6)
+
+
+def test_a_delay_that_is_longer_than_the_time_since_mode_00_is_not_its_own() -> None:
+    watch = EvidenceWatch()
+    found = [each for number in range(4) for each in unlike(watch, 10.0 + 6 * number, 0.6, closed_s=INTERVAL_S + 0.4)]
+    assert SETTLING not in found
+    assert watch.learned.blocks == {}
+
+
 def test_pauses_of_a_stop_before_do_not_count_after_a_motion() -> None:
     watch = EvidenceWatch()
     assert watch.pause(40.0) is PAUSE
