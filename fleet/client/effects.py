@@ -28,7 +28,6 @@ _STOP: Final[dict[str, str]] = {
 EFFECTS: Final[dict[str, dict[str, str]]] = {
     **{verb: {Phase.SENT: row.effect} for verb, row in COMMANDS.items() if row.effect},
     Verb.DRIVE: {
-        Basis.SHOWN: "drove{detail}",
         Phase.COMPLETE: "drive over{detail}",
         UNCONFIRMED: "{words}",
         Phase.SENT: "drive sent,{detail}",

@@ -15,7 +15,6 @@ NO_RESULT: Final = "no_result"
 """The code of a command whose last event is missing."""
 _STAYS: Final = (Reason.ESTOPPED, Reason.HELD)
 """Reasons of a resume after which the car is still stopped."""
-_SENT_FOR: Final = "sent for "
 """First words of the gateway about a drive that went as requested; its time follows."""
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
@@ -272,7 +271,6 @@ class Progress:
         if self.outcome is None:
             took_s = at - self._asked_at
             done = UNCONFIRMED if self._basis == Basis.SENT else self._basis or phase
-            has_time = self._until is Until.OVER and words.startswith(_SENT_FOR)
             effect = describe(
                 self._verb,
                 (done, phase) if ok else (reason, phase if phase in _FAILED_PHASES else ""),
@@ -281,8 +279,6 @@ class Progress:
                 words=words,
                 took_s=took_s,
             )
-            if has_time and done == Basis.SHOWN:
-                effect = f"drove {words.removeprefix(_SENT_FOR)}"
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
             # Of what was done, the gateway says only what is odd about it, often nothing. The effect has that, too.

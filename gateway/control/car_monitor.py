@@ -179,7 +179,7 @@ class CarMonitor:
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
         if model.platform.auto:  # a named one was corrected, and its contradiction says so
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if has_other_head:
+        if has_other_head and self._is_idle:  # a drive is obeyed with any head; it is neither cut nor delayed
             self._stops.recover(now, words)
         elif before not in (Platform.UNKNOWN, model.profile.kind):
             self._on_other_program(now, words)

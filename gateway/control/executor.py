@@ -325,20 +325,20 @@ class Executor:
         self.senders.halt(now, by)
 
     def end_drive(self, words: str, now: float) -> None:
-        """End a held motion that went as requested: as shown if a reading shows that the car moved, else as sent."""
+        """End a held motion that went as requested. It was sent: no reading shows that the car drove all the time.
+
+        A changed distance is told. Something else may have moved before the car.
+        """
         held, model = self.queue.held, self.model
         if held is None or held.began_at is None:
             self.queue.close_held(Phase.COMPLETE, None, words, now)
             return
         sent = f"sent for {now - held.began_at:.1f} s"
         moved = model.moved_since(held.range_cm, held.began_at)
-        if moved:
-            words = "; ".join(filter(None, (words, sent, moved)))
-            self.queue.close_held(Phase.COMPLETE, None, words, now, basis=Basis.SHOWN, evidence=(moved,))
-            return
         doubt = f"{model.name} may not have moved: {self._doubt_of_drive}" if self._doubt_of_drive else ""
-        words = "; ".join(filter(None, (words, sent, doubt)))
-        self.queue.close_held(Phase.SENT, None, words, now, basis=Basis.SENT)
+        words = "; ".join(filter(None, (words, sent, moved or doubt)))
+        evidence = (moved,) if moved else ()
+        self.queue.close_held(Phase.SENT, None, words, now, basis=Basis.SENT, evidence=evidence)
 
     @property
     def _doubt_of_drive(self) -> str:

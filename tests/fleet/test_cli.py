@@ -375,7 +375,7 @@ def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
     while STALE in (done := run(cars.endpoint, "drive", "green", "forward", "--for", "700ms")).stderr:
         pass
     assert done.returncode == 0
-    assert done.stdout.startswith(("green: sent for ", "green: drove ")), done.stdout
+    assert done.stdout.startswith("green: sent for "), done.stdout
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
 
 
