@@ -13,7 +13,7 @@ from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
 from schemas.platform_name import parse_option
-from schemas.words import Basis, Mode, Motion, Shows
+from schemas.words import Basis, Mode, Motion, Phase, Shows
 from tests.support.virtual import Pair
 
 KEPT: dict[str, Any] = {
@@ -259,3 +259,25 @@ def test_another_head_is_used_as_soon_as_it_is_known() -> None:
     pair.until(lambda: pair.control.model.profile.dialect.head == "4WD", 3.0)
     pair.until(lambda: pair.car.truth.mode is Mode.MANUAL, began + 6.0 - pair.now)
     assert not pair.car.truth.driving
+
+
+@pytest.mark.parametrize("told", ["arduino", "auto"])
+def test_a_head_that_is_corrected_neither_cuts_nor_delays_a_drive(told: str) -> None:
+    name, auto = parse_option(told)
+    for tenth in range(0, 40, 3):
+        pair = Pair(start_s=2.0, traits=CarTraits(head="3WD"))
+        pair.control = Controller("red", parse_platform(name), auto=auto)
+        pair.connect()
+        pair.run(tenth / 10)
+        asked_at = pair.now
+        answer = pair.ask(Drive(Motion.FORWARD, 2.0), identity="drive")
+        assert answer.status != Phase.REJECTED, answer
+        bound_s = max(pair.control.wait_s(Drive(Motion.FORWARD, 2.0), asked_at), 0.0) + 0.3
+        pair.until(lambda pair=pair: pair.sent[-1][1].startswith(b"$1"), bound_s)
+        began_at = pair.sent[-1][0]
+        pair.run(3.0)
+        last = pair.last_of("drive")
+        assert last is not None
+        assert (last.phase, last.basis) == (Phase.SENT, "sent"), last
+        stops = [at for at, data in pair.sent if at > began_at and data.startswith(b"$0")]
+        assert abs(min(stops) - began_at - 2.0) <= 0.1, (told, tenth)
