@@ -151,6 +151,8 @@ class CarMonitor:
         else:
             words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
             self._log.log(Level.WARNING, "rhythm_changed", f"{words} What it showed before is forgotten.", now)
+            if self.model.platform.auto:
+                self.model.platform.forget()
             self._on_other_program(now, words)
 
     def _on_other_program(self, now: float, words: str) -> None:

@@ -161,9 +161,9 @@ class Learned:
     # ------------------------------------------------------------------ rhythm and delays
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
-        """Add an undisturbed interval. Return True if that is another rhythm, which ends what the car has shown."""
+        """Add an undisturbed interval. Return True if it completes another rhythm: what the car has shown is over."""
+        was_known = self.shows is not Shows.UNKNOWN or self.echo.is_firm
         changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
-        was_known = self.shows is not Shows.UNKNOWN
         if changed:
             self.forget_reactions()
         return changed and was_known

@@ -17,9 +17,10 @@ from schemas.words import Mode, Platform
 EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
 
-OTHER_HEAD_FRAMES: Final = 12
-"""Number of consecutive frames with another head that replace one with which the car was read. A link that loses or
-changes bytes makes such a frame now and then, and a wrong head keeps every named frame from the car."""
+OTHER_PROGRAM_FRAMES: Final = 12
+"""Number of consecutive frames of another program, or with another head, that replace the one with which the car was
+read. A link that loses or changes bytes makes such a frame now and then, and a wrong head or platform keeps every named
+frame from the car."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
@@ -64,6 +65,9 @@ class PlatformDetector:
     _with_modes: str = ""
     _raspberry_pi: str = ""
     """Evidence for a car with modes, and for a Raspberry Pi. If both are set, the car is of an unknown kind."""
+    _alone: int = 0
+    """Number of consecutive readings that one of the two kinds sends, and the other one does not."""
+    _alone_has_modes: bool = False
     _options: frozenset[str] = frozenset()
     _seen: dict[str, _PlatformEvidence] = field(
         default_factory=lambda: {
@@ -231,7 +235,7 @@ class PlatformDetector:
             return ()
         self._heads = self._heads + 1 if head == self._head else 1
         self._head = head
-        if self._heads != (OTHER_HEAD_FRAMES if self._is_read else EVIDENCE_FRAMES):
+        if self._heads != (OTHER_PROGRAM_FRAMES if self._is_read else EVIDENCE_FRAMES):
             return ()
         self._is_read = False
         option = f"{HEAD}={head}"
@@ -260,6 +264,7 @@ class PlatformDetector:
             _CONSTANT_READINGS: in_manual and whole and pi_constants(event),
             _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
         }
+        self._count_alone(with_modes=shown[_MODE_READINGS] or shown[_MEASURED_READINGS], pi=shown[_CONSTANT_READINGS])
         for words, seen in self._seen.items():
             if seen.update(shown=shown[words]):
                 if words is _CONSTANT_READINGS:
@@ -269,6 +274,29 @@ class PlatformDetector:
                 else:
                     self._with_modes = self._with_modes or words
                 self._apply_evidence()
+
+    def _count_alone(self, *, with_modes: bool, pi: bool) -> None:
+        """Count one reading for the kinds. Many for one kind alone end what another program has shown before."""
+        if with_modes is pi:
+            self._alone = 0
+            return
+        self._alone = self._alone + 1 if with_modes is self._alone_has_modes else 1
+        self._alone_has_modes = with_modes
+        if self._alone != OTHER_PROGRAM_FRAMES or not (self._with_modes and self._raspberry_pi):
+            return
+        if with_modes:
+            self._raspberry_pi = ""
+        else:
+            self._with_modes, self._is_wide = "", False
+        self._apply_evidence()
+
+    def forget(self) -> None:
+        """Forget what the readings have shown of the program: another one runs."""
+        self._with_modes = self._raspberry_pi = ""
+        self._is_wide, self._alone, self._readings = False, 0, 0
+        for words in self._seen:
+            self._seen[words] = _PlatformEvidence()
+        self._apply_evidence()
 
     def _apply_evidence(self) -> None:
         if bool(self._with_modes) is bool(self._raspberry_pi):

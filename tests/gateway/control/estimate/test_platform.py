@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.platform import EVIDENCE_FRAMES, OTHER_HEAD_FRAMES, PlatformDetector
+from gateway.control.estimate.platform import EVIDENCE_FRAMES, OTHER_PROGRAM_FRAMES, PlatformDetector
 from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder
 from gateway.protocol.events import Event
 from gateway.protocol.platforms import parse_platform
@@ -113,7 +113,7 @@ def test_auto_takes_another_head_from_three_readings() -> None:
     assert truth.profile.name == "unknown+head=BALA+text"
     hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES)
     assert truth.profile.name == "arduino+head=BALA+text"
-    hear_raw(truth, *["4WD"] * OTHER_HEAD_FRAMES)
+    hear_raw(truth, *["4WD"] * OTHER_PROGRAM_FRAMES)
     assert truth.profile.dialect.head == "4WD", "another program on the same link"
 
 
@@ -121,7 +121,7 @@ def test_auto_takes_another_head_from_three_readings() -> None:
 def test_damaged_frames_do_not_change_the_head_with_which_a_car_was_read(*, auto: bool) -> None:
     """A link that loses every second frame's `4` made the gateway send `$WD,MODE00#`, which no car knows."""
     truth = PlatformDetector(parse_platform("unknown" if auto else "arduino"), auto=auto)
-    for count in range(1, OTHER_HEAD_FRAMES):
+    for count in range(1, OTHER_PROGRAM_FRAMES):
         hear_raw(truth, "4WD", *["WD"] * count)
         assert truth.profile.dialect.head == "4WD"
     unsettled = Decoder().feed(ARDUINO.encode(), 1.0)

@@ -9,6 +9,7 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import REACTED, Learned
+from gateway.control.estimate.platform import OTHER_PROGRAM_FRAMES
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
@@ -217,6 +218,24 @@ def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, o
     assert model.shows_stops[0] is not Shows.YES
     answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     assert answer.status != "rejected", answer
+
+
+@pytest.mark.parametrize(
+    ("first", "other"), [("raspberry_pi", "arduino"), ("arduino", "raspberry_pi"), ("stm32", "arduino")]
+)
+def test_a_detected_platform_is_detected_again_when_the_program_is_swapped(first: str, other: str) -> None:
+    pair = Pair(first, start_s=2.0)
+    name, auto = parse_option("auto")
+    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.connect()
+    model = pair.control.model
+    pair.until(lambda: model.profile.name == first and model.at_rest and model.learned.echo.is_firm, 60.0)
+    pair.car = Pair(other, start_s=2.0).car
+    pair.car.advance(pair.now)
+    pair.until(lambda: model.profile.name == other, OTHER_PROGRAM_FRAMES * 1.3 + 5.0)
+    if other == "arduino":
+        assert pair.ask(SetMode(Mode.TRACKING), identity="mode").status != Phase.REJECTED
+        pair.until(lambda: pair.car.truth.mode is Mode.TRACKING, 20.0)
 
 
 def swapped(told: str, mode: Mode) -> Pair:
