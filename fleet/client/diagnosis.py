@@ -96,6 +96,8 @@ class DoctorFinding:
     cause: str
     todo: str
     """The command to type."""
+    of_fleet: bool = False
+    """True if it is about the whole fleet, so that each car has it."""
 
     def __str__(self) -> str:
         return f"{self.cause} Type: {self.todo}"
@@ -109,6 +111,7 @@ class DoctorCheck:
     cause: Callable[[CarEvidence], str]
     todo: str
     """`{car}` stands for the car."""
+    of_fleet: bool = False
 
 
 def _ended(e: CarEvidence) -> str:
@@ -318,7 +321,7 @@ def _unrecorded(e: CarEvidence) -> str:
 
 def _drops(e: CarEvidence) -> str:
     count = 0 if e.recording is None else sum(e.recording.drops.values())
-    return f"The recorder dropped {count} messages: its disk is too slow." if count else ""
+    return f"The recorder dropped {count} messages: its disk is full or too slow." if count else ""
 
 
 def _stopped_plan(e: CarEvidence) -> str:
@@ -354,8 +357,8 @@ CHECKS: Final = (
     DoctorCheck("held", _held, "fleet resume {car}"),
     DoctorCheck("plan_stopped", _stopped_plan, "fleet plan restart"),
     DoctorCheck("refused", _refused, "fleet why {car}"),
-    DoctorCheck("not_recorded", _unrecorded, "fleet record status"),
-    DoctorCheck("recorder_drops", _drops, "fleet record status"),
+    DoctorCheck("not_recorded", _unrecorded, "fleet record status", of_fleet=True),
+    DoctorCheck("recorder_drops", _drops, "fleet record status", of_fleet=True),
 )
 """The table of findings, the likeliest cause first."""
 
@@ -364,7 +367,10 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
     """Return what is odd, the likeliest cause first. Empty if nothing is. options: what proposed commands need."""
     found = [
         DoctorFinding(
-            check.code, complete_hints(cause, options), complete_command(check.todo.format(car=evidence.car), options)
+            check.code,
+            complete_hints(cause, options),
+            complete_command(check.todo.format(car=evidence.car), options),
+            check.of_fleet,
         )
         for check in CHECKS
         if (cause := check.cause(evidence))

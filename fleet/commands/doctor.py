@@ -60,11 +60,15 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
             raise click.ClickException(f'No car or session "{name}". {near}')
     cars = list(found.values()) if name is None else [found[name]]
     odd = [diagnose(evidence, hint_options()) for evidence in cars]
+    if name is None and not as_json:
+        # No finding of a car hides that nothing is recorded.
+        for finding in dict.fromkeys(each for findings in odd for each in findings if each.of_fleet):
+            echo_safely(f"{fleet}: {finding}")
     for evidence, findings in zip(cars, odd, strict=True):
         if as_json:
             click.echo(json.dumps(as_dict(evidence, hint_options())))
         elif name is None:
-            echo_safely(_first_line(evidence.car, findings))
+            echo_safely(_first_line(evidence.car, [each for each in findings if not each.of_fleet]))
         else:
             _show_car(evidence, findings)
     raise SystemExit(1 if any(odd) else 0)

@@ -430,7 +430,9 @@ class Supervisor:
             if self.processes.on_heartbeat(RECORDER):
                 self._gateways_from = self.processes.now
             self._recorder_heard_at = self.processes.now
-            over = "what waited is written" if value.state == RecorderState.CLOSED else ""
+            over = ""
+            if value.state == RecorderState.CLOSED:
+                over = "closed, and some of what waited is lost" if value.drops else "what waited is written"
             self._set_unrecorded(why_unrecorded(value), over)
         elif car == COORDINATOR:
             self._on_plan(value)

@@ -85,7 +85,9 @@ class McapReader:
             return ""
         kind = "is damaged"
         if self.cut:
-            kind = "is cut (the recorder was killed or is still at work)" + ("" if self.only_cut else " and damaged")
+            kind = "is cut (the recorder was killed, is still at work, or had no room for the end)" + (
+                "" if self.only_cut else " and damaged"
+            )
         more = f" and in {len(self.damage) - 3} other places" if len(self.damage) > 3 else ""
         return f"{kind}: {'; '.join(str(damage) for damage in self.damage[:3])}{more}"
 

@@ -83,7 +83,7 @@ class SessionCheckup:
             yield DoctorFinding("not_closed", f"{verdict.ended[0].upper()}{verdict.ended[1:]}.", verify)
         if lost := sum(verdict.dropped.values()):
             yield DoctorFinding(
-                "recorder_drops", f"The recorder dropped {lost} messages: its disk was too slow.", verify
+                "recorder_drops", f"The recorder dropped {lost} messages: its disk was full or too slow.", verify
             )
         if verdict.missing_count:
             worst = max(verdict.missing, key=lambda gap: gap["count"])

@@ -89,6 +89,7 @@ def test_each_check_is_tried() -> None:
 def test_each_condition_has_its_cause_and_what_to_type(code: str) -> None:
     found = diagnose(ODD[code])
     assert [each.code for each in found] == [code]
+    assert found[0].of_fleet is (code in ("not_recorded", "recorder_drops"))
     assert found[0].cause.endswith((".", "?"))
     assert found[0].todo.startswith("fleet ")
     assert "{" not in found[0].todo

@@ -132,7 +132,7 @@ def test_a_length_that_leads_nowhere_is_said_and_hides_no_whole_chunk(original: 
     shown = judge(original, data, begin, tmp_path / "x.mcap")
     assert {original.chunk_of(message) for message in shown} == {0, 2, 3, 4}
     words = report(tmp_path / "x.mcap")
-    assert "is cut (the recorder was killed or is still at work) and damaged: " in words
+    assert "is cut (the recorder was killed, is still at work, or had no room for the end) and damaged: " in words
     assert f"byte {begin}: no whole record begins there, {end - begin} bytes are passed over" in words
 
 
