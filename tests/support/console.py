@@ -223,7 +223,7 @@ class ConsoleStage:
         self._reports = before + 1
         act()
         report = page.locator(f"[data-report='{before + 1}']")
-        report.locator("summary").click()
+        report.locator(".report-line").click()
         return report
 
     def details(self, page: Page, car: str = "red") -> Locator:

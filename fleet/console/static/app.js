@@ -89,22 +89,23 @@ const Stopped = ({ car }) => html`<li class=${`chip stop-${car.state}`} data-sto
   ${car.state === "failed" ? ` ${car.words}` : ""}
 </li>`;
 
-// One line, so that it covers no pad. What failed is never folded away.
+// One line, so that it covers no pad. Which cars failed is never folded away.
 let reportSeen = [0, 0];
 function Report({ report }) {
+  const [unfolded, setUnfolded] = useState(0); // the number of the report that is shown car by car
   if (report === null || (report.cars.length === 0 && report.closed > 0)) return null;
   if (reportSeen[0] !== report.number) reportSeen = [report.number, performance.now()];
   const failed = report.cars.filter((car) => car.state === "failed");
-  const others = report.cars.filter((car) => car.state !== "failed");
   if (report.over && failed.length === 0 && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
   const words = t.stopSummary(report.cars, report.closed);
+  const isUnfolded = unfolded === report.number;
+  const others = isUnfolded ? report.cars.filter((car) => car.state !== "failed") : [];
   return html`<div class="report" data-report=${report.number}>
     <p class="unseen" role="status">${t.stopVerbs[report.verb]}: ${words}</p>
-    <ul class="plain chips">${failed.map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
-    <details key=${report.number}>
-      <summary><strong>${t.stopVerbs[report.verb]}</strong>: ${words}</summary>
-      <ul class="plain chips">${others.map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
-    </details>
+    <button class="report-line" aria-expanded=${isUnfolded} onClick=${() => setUnfolded(isUnfolded ? 0 : report.number)}>
+      <span><strong>${t.stopVerbs[report.verb]}</strong>: ${words}</span> <span aria-hidden="true">${isUnfolded ? "▴" : "▾"}</span>
+    </button>
+    <ul class="plain chips">${[...failed, ...others].map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
   </div>`;
 }
 
