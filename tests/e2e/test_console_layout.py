@@ -83,6 +83,11 @@ def test_nothing_covers_the_pad_or_stop_of_a_phone_while_a_report_is_shown(
         assert is_in_reach(page, ".pad")
         assert is_in_reach(page, "#stop")
         assert is_in_reach(page, "nav [aria-current]")
+        page.locator("#estop").tap()  # asks for a reason
+        page.locator("input[name=why]").wait_for()
+        assert is_in_reach(page, "#stop")
+        assert is_in_reach(page, "[data-asking] .danger")
+        page.locator("#estop").tap()
     page.evaluate("document.querySelector('main').scrollTop = 0")
     assert page.locator("[data-motion=forward]").bounding_box() == before, "it has not moved"
     if held is LANDSCAPE:

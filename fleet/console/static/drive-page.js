@@ -323,7 +323,8 @@ export function DrivePage({ cars }) {
   return html`<div class="drive">
     <h1 class="unseen">${t.drive}</h1>
     <${Selection} cars=${cars} />
-    <div class="at-hand"><${Driver} cars=${driven} /><${Live} cars=${driven} /></div>
+    <${Driver} cars=${driven} />
+    <${Live} cars=${driven} />
     <div class="drive-controls">
       <${Results} />
       ${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}
