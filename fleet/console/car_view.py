@@ -11,7 +11,7 @@ from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
-from schemas import messages, topics
+from schemas import keys, messages, topics
 from schemas.authority import Authority, People
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
@@ -288,7 +288,7 @@ class CarView:
         if event.reason or event.words:
             words += f": {event.words or event.reason}"
         level = Level.WARNING if event.phase in FAILED_PHASES else Level.INFO
-        self._note(event.stamp, f"{words} ({event.sender})", level)
+        self._note(event.stamp, f"{words} ({keys.name_of(event.sender)})", level)
 
     def _note(self, stamp: Any, words: str, level: str) -> None:
         self.ledger.append({"at_ms": messages.stamp_ms(stamp), "words": words, "level": level})

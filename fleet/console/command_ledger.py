@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from fleet.client.diagnosis import FAILED_PHASES
 from schemas import messages
+from schemas.keys import name_of
 
 MAX_COMMANDS: Final = 40
 """Number of commands that a page shows."""
@@ -35,7 +36,7 @@ class CommandLedger:
     def on_event(self, event: Any) -> None:
         """Handle a command event."""
         if event.id not in self._commands:
-            requested = f"{event.verb} by {event.sender}{f' ({event.kind})' if event.kind else ''}"
+            requested = f"{event.verb} by {name_of(event.sender)}{f' ({event.kind})' if event.kind else ''}"
             wire = self._early.pop(event.id, [])
             self._commands[event.id] = LedgerCommand(messages.stamp_ms(event.stamp), requested, wire=wire)
             _limit(self._commands)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -240,7 +241,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
             *people_routes(lan),
             *more,
             WebSocketRoute("/ws", connect),
-            Mount("/static", StaticFiles(directory=STATIC)),
+            # Only what is the same for everyone: what is secret must not be compressed beside what a stranger chooses.
+            Mount("/static", GZipMiddleware(StaticFiles(directory=STATIC))),
         ]
     )
 

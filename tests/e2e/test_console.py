@@ -71,7 +71,9 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, ho
     for car, kind in CARS.items():
         state = "shown" if kind.startswith("arduino") else "sent"  # the reports of the others do not react to frames
         report.locator(f"[data-stop={car}].stop-{state}").wait_for()
-        page.locator(f"[data-car={car}]").get_by_text("On hold: you stopped it").wait_for()
+        details = stage.details(page, car)
+        details.get_by_text("On hold: you stopped it").wait_for()
+        details.get_by_role("button", name=f"Close {car}").click()
 
 
 def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: ConsoleStage) -> None:
@@ -94,7 +96,7 @@ def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Cons
     page.locator("#estop").click()
     page.locator("input[name=why]").fill("smoke")
     page.locator("input[name=why]").press("Enter")  # the same as the button beside the field
-    card = page.locator("[data-car=red]")
+    card = stage.details(page)
     card.get_by_text("E-stop of the whole fleet by you: smoke").wait_for()
     refused = stage.person.car("red").drive("forward")
     assert refused.reason == "estopped"
@@ -382,14 +384,16 @@ def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
         assert stage.stands("blue", since_ns=pressed_ns) < STOPPED_WITHIN_S
     finally:
         stage.gateways["red"].popen.send_signal(signal.SIGCONT)
-    page.locator("[data-car=red]").get_by_text("online").wait_for()
+    stage.details(page).get_by_text("online").wait_for()
 
 
 def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -> None:
     page = stage.driving_page("green")
-    modes = page.locator("[data-control=mode]")
+    modes = page.locator(".lacking [data-control=mode]")
+    assert not modes.is_visible(), "one line"
+    page.locator(".lacking summary").click()
     modes.get_by_text("green: Raspberry_pi cars do not know mode tracking").wait_for()
-    assert modes.get_by_role("button").count() == 0
+    assert page.locator("[data-control=mode] button").count() == 0
     assert page.locator("[data-control=servo_vertical] button").count() == 3
     page.locator("input[name=select-green]").uncheck()
     page.locator("input[name=select-red]").check()
@@ -420,7 +424,8 @@ def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> No
     page = stage.page()
     stage.gateways["red"].kill()
     stage.gateways["red"].wait()
-    card = page.locator("[data-car=red]")
+    page.locator("[data-trouble=red]").click()  # leads to the car
+    card = page.locator("[data-details=red]")
     card.get_by_text("Whether red moves is not known").wait_for()
     card.get_by_text("Look at the car.").wait_for()
     card.locator(".row", has_text="Motors").get_by_text("unknown").wait_for()
@@ -443,12 +448,16 @@ def serious(page: Page) -> list[str]:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_serious_violation_on_any_page(stage: ConsoleStage, scheme: str) -> None:
     page = stage.driving_page("red", "green", viewport={"width": 1280, "height": 900}, color_scheme=scheme)
-    page.keyboard.press("Escape")
-    page.locator("[data-stop=red].stop-shown").wait_for()
+    report = stage.report(page, lambda: page.keyboard.press("Escape"))
+    report.locator("[data-stop=red].stop-shown").wait_for()
     for link in page.locator("nav a").all():
         link.click()
         link.and_(page.locator("[aria-current=page]")).wait_for()
+        page.locator("main h1").wait_for()
         assert serious(page) == [], link.inner_text()
+    page.locator("nav a").first.click()
+    stage.details(page)
+    assert serious(page) == []
     page.locator("#estop").click()
     assert serious(page) == []
 

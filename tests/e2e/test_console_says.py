@@ -289,12 +289,14 @@ def test_a_phone_that_sleeps_stops_the_car_and_wakes_without_driving(stage: Cons
 def test_cards_without_news_say_their_age_and_claim_nothing(stage: ConsoleStage) -> None:
     page = stage.page(wired=True)
     red, blue = (page.locator(f"[data-car={car}]") for car in ("red", "blue"))
-    expect(red.get_by_text("online")).to_be_visible()
+    details = stage.details(page)
+    expect(details.get_by_text("online")).to_be_visible()
     expect(page.locator("[data-old]")).to_have_count(0)
     freeze(stage.gateways["red"].pid)
     try:
         expect(red.locator("[data-old]")).to_contain_text(re.compile(r"Nothing new for \d+ s"))
-        expect(red.get_by_text("online")).to_have_count(0)
+        expect(details.get_by_text(re.compile(r"Nothing new for \d+ s: what this card shows"))).to_be_visible()
+        expect(details.get_by_text("online")).to_have_count(0)
         expect(blue.locator("[data-old]")).to_have_count(0)
     finally:
         stage.gateways["red"].popen.send_signal(signal.SIGCONT)
@@ -327,7 +329,7 @@ def test_times_are_those_of_the_console_whatever_the_clock_of_the_browser(stage:
     now_s = int(time.time())
     stage.person.car("red").whistle().check()
     allowed = [time.strftime("%H:%M:%S", time.localtime(now_s + after)) for after in range(60)]
-    said = page.locator("[data-car=red] time")
+    said = stage.details(page).locator("time")
     wait_for(lambda: said.inner_text() in allowed, f"{allowed[0]} or soon after")
     page.goto(f"{stage.console.address}/#/inspect")
     page.locator("select").select_option("red")
@@ -369,7 +371,7 @@ def test_texts_of_others_are_text_and_turn_nothing_around(stage: ConsoleStage) -
         dialog.dismiss()
 
     page.on("dialog", on_dialog)
-    card = page.locator("[data-car=red]")
+    card = stage.details(page)
     words = f"{MARKUP}{TURNED}{HEBREW}"
     shown = f"\u2068{MARKUP} evil {HEBREW}\u2069"  # the gateway writes blanks
     publisher = stage.fleet.bus.publisher("fleet/red/event/log", TOPICS["event/log"], "red")

@@ -164,6 +164,7 @@ class TwentyCars:
 
     def wait_shown(self, page: Page) -> None:
         """Wait until the page shows that each car stands."""
+        page.locator(".report-line").click()
         page.locator(".stop-shown, .stop-sent").nth(len(CARS) - 1).wait_for()
 
     def close(self) -> None:

@@ -217,12 +217,21 @@ class ConsoleStage:
                 time.sleep(0.7)  # after a stop, the gateway rejects a stream that does not pause
 
     def report(self, page: Page, act: Callable[[], object]) -> Locator:
-        """Stop the cars by an action. Return the page's report of that stop."""
+        """Stop the cars by an action. Return the page's report of that stop, unfolded."""
         shown = page.locator("[data-report]")
         before = int(shown.get_attribute("data-report") or 0) if shown.count() else self._reports
         self._reports = before + 1
         act()
-        return page.locator(f"[data-report='{before + 1}']")
+        report = page.locator(f"[data-report='{before + 1}']")
+        report.locator(".report-line").click()
+        return report
+
+    def details(self, page: Page, car: str = "red") -> Locator:
+        """Open all about a car on the fleet page. Return it."""
+        page.locator(f"[data-car={car}]").click()
+        details = page.locator(f"[data-details={car}]")
+        details.wait_for()
+        return details
 
     def stands(self, car: str = "red", *, since_ns: int | None = None) -> float:
         """Wait until the car's true motors are off. Return the time from `since_ns` (default: now), s."""

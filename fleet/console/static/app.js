@@ -6,16 +6,50 @@ import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
 import { PeoplePage } from "./people-page.js";
 import { PlanPage } from "./plan-page.js";
-import { PlotsPage } from "./plots-page.js";
 import { SessionsPage } from "./sessions-page.js";
 import { SetupPage } from "./setup-page.js";
 import { stopStates, t } from "./texts.js";
-import { Component, html, Refused, render, useState, Verdict } from "./ui.js";
+import { Component, html, Refused, render, useEffect, useRef, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage], "#/people": [t.people, PeoplePage], "#/sessions": [t.sessions, SessionsPage], "#/setup": [t.setup, SetupPage] };
+// uPlot is three times as large as all else: only this page loads it.
+const loadPlots = async () => {
+  const looks = document.createElement("link");
+  Object.assign(looks, { rel: "stylesheet", href: "/static/vendor/uplot.css" });
+  document.head.append(looks);
+  return (await import("./plots-page.js")).PlotsPage;
+};
+let Plots = null;
+function PlotsLater({ cars }) {
+  const [failed, setFailed] = useState(false);
+  const [, setLoaded] = useState(Plots !== null);
+  useEffect(() => {
+    if (Plots !== null) return;
+    loadPlots().then(
+      (page) => {
+        Plots = page;
+        setLoaded(true);
+      },
+      () => setFailed(true),
+    );
+  }, []);
+  if (Plots !== null) return html`<${Plots} cars=${cars} />`;
+  return failed ? html`<h1>${t.plots}</h1><p>${t.unreachable}</p>` : html`<p>${t.loading}</p>`;
+}
+
+// Each page with the symbol of its tab.
+const PAGES = {
+  "#/": [t.fleet, FleetPage, "▦"],
+  "#/drive": [t.drive, DrivePage, "✥"],
+  "#/plan": [t.plan, PlanPage, "☰"],
+  "#/plots": [t.plots, PlotsLater, "∿"],
+  "#/inspect": [t.inspect, InspectPage, "⌕"],
+  "#/people": [t.people, PeoplePage, "☺"],
+  "#/sessions": [t.sessions, SessionsPage, "◉"],
+  "#/setup": [t.setup, SetupPage, "⚙"],
+};
 
 // ---------------------------------------------------------------- STOP
 
@@ -50,26 +84,32 @@ const onStopClick = () => {
 const stopDetail = (car) =>
   car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s, clock(car.moved_at_ms ?? car.at_ms));
 
+const Stopped = ({ car }) => html`<li class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
+  <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${stopDetail(car)} />
+  ${car.state === "failed" ? ` ${car.words}` : ""}
+</li>`;
+
+// One line, so that it covers no pad. Which cars failed is never folded away.
 let reportSeen = [0, 0];
 function Report({ report }) {
+  const [unfolded, setUnfolded] = useState(0); // the number of the report that is shown car by car
   if (report === null || (report.cars.length === 0 && report.closed > 0)) return null;
   if (reportSeen[0] !== report.number) reportSeen = [report.number, performance.now()];
-  const failed = report.cars.some((car) => car.state === "failed");
-  if (report.over && !failed && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
+  const failed = report.cars.filter((car) => car.state === "failed");
+  if (report.over && failed.length === 0 && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
+  const words = t.stopSummary(report.cars, report.closed);
+  const isUnfolded = unfolded === report.number;
+  const others = isUnfolded ? report.cars.filter((car) => car.state !== "failed") : [];
   return html`<div class="report" data-report=${report.number}>
-    <p role="status"><strong>${t.stopVerbs[report.verb]}</strong>: ${t.stopSummary(report.cars, report.closed)}</p>
-    <ul class="plain chips">
-      ${report.cars.map(
-        (car) => html`<li key=${car.name} class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
-          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${stopDetail(car)} />
-          ${car.state === "failed" ? ` ${car.words}` : ""}
-        </li>`,
-      )}
-    </ul>
+    <p class="unseen" role="status">${t.stopVerbs[report.verb]}: ${words}</p>
+    <button class="report-line" aria-expanded=${isUnfolded} onClick=${() => setUnfolded(isUnfolded ? 0 : report.number)}>
+      <span><strong>${t.stopVerbs[report.verb]}</strong>: ${words}</span> <span aria-hidden="true">${isUnfolded ? "▴" : "▾"}</span>
+    </button>
+    <ul class="plain chips">${[...failed, ...others].map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
   </div>`;
 }
 
-function StopBar({ report }) {
+function StopBar() {
   const [asking, setAsking] = useState(null); // estop, pause
   const [why, setWhy] = useState("");
   const act = () => {
@@ -83,7 +123,6 @@ function StopBar({ report }) {
   const forbidden = asking === "pause" && refused !== "";
   const onWhyKey = (event) => event.key === "Enter" && !event.repeat && !event.isComposing && !forbidden && act();
   return html`<section class="stopbar" aria-label="STOP">
-    <${Report} report=${report} />
     ${asking &&
     html`<div class="estop" data-asking=${asking}>
       <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} onKeyDown=${onWhyKey} /></label>
@@ -116,6 +155,18 @@ function Paused({ cars }) {
   </div>`;
 }
 
+// Above the content on a large screen, a tab bar at the bottom of a phone, which a finger pushes sideways.
+function Navigation({ here }) {
+  const bar = useRef(null);
+  useEffect(() => bar.current.querySelector("[aria-current]").scrollIntoView({ block: "nearest", inline: "nearest" }), [here]);
+  return html`<nav aria-label="Pages" ref=${bar}>
+    ${Object.entries(PAGES).map(
+      ([to, [name, , symbol]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : undefined}
+        ><span class="tab-symbol" aria-hidden="true">${symbol}</span>${name}</a>`,
+    )}
+  </nav>`;
+}
+
 class App extends Component {
   componentDidMount() {
     subscribe(() => this.setState({}));
@@ -131,25 +182,24 @@ class App extends Component {
         event.preventDefault();
         document.getElementById("content").focus();
       }}>${t.skip}</a>
+      <${Navigation} here=${here} />
       <header class="top">
-        <nav aria-label="Pages">
-          ${Object.entries(PAGES).map(
-            ([to, [name]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : undefined}>${name}</a>`,
-          )}
-        </nav>
         <span class="person">${store.hello ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
-      ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
-      ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
-      ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
-      ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
-      ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
-      <${Paused} cars=${state?.cars ?? []} />
       <main id="content" tabindex="-1">
         ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}
       </main>
-      <${StopBar} report=${state?.stop ?? null} />
+      <div class="notices">
+        ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
+        ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
+        ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
+        ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
+        ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
+        <${Paused} cars=${state?.cars ?? []} />
+        <${Report} report=${state?.stop ?? null} />
+      </div>
+      <${StopBar} />
     `;
   }
 }

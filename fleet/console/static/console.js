@@ -14,6 +14,17 @@ const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
 const MAX_DRAWING_MS = 150; // the longest time that counts, so that the page rests 450 ms at most
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
+// A page that is loaded again, as phones do with one that slept, has the same cars selected. Another tab has its own.
+const SELECTED = "fleet-selected";
+function remembered() {
+  try {
+    const names = JSON.parse(sessionStorage.getItem(SELECTED));
+    return Array.isArray(names) ? names.filter((name) => typeof name === "string") : [];
+  } catch {
+    return []; // a browser that keeps nothing
+  }
+}
+
 const listeners = new Set();
 export const store = {
   state: null,
@@ -29,8 +40,15 @@ export const store = {
   unpaired: "", // "revoked": not even STOP works. "expired": STOP by fetch works
   press: null, // the motion that is driven: {id, motion, cars}
   results: [],
-  selected: new Set(),
+  selected: new Set(remembered()), // the names of the cars to drive
 };
+
+export function select(names) {
+  store.selected = new Set(names);
+  try {
+    sessionStorage.setItem(SELECTED, JSON.stringify([...store.selected]));
+  } catch {}
+}
 
 let socket = null;
 let tick = 0;
@@ -135,13 +153,9 @@ export function estopAll(why) {
 
 // ---------------------------------------------------------------- who may do what
 
-const personOf = (sender) => seen(sender.split("@")[0]);
-// Another program of the same person has its whole name.
-export function who(sender) {
-  const own = store.hello?.sender ?? "";
-  if (sender === own) return describe.you;
-  return personOf(sender) === personOf(own) ? sender : personOf(sender);
-}
+// A person without host and process, also if it is this one by another program; a sender without a person as it is.
+const personOf = (sender) => seen(sender.split("@")[0] || sender);
+export const who = (sender) => (sender === store.hello?.sender ? describe.you : personOf(sender));
 
 // Why cars refuse an action of this person, each once. The gateways decide; the page says it before.
 export function refusals(action, cars) {

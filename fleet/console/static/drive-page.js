@@ -1,8 +1,8 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
-import { changed, command, isHeld, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
+import { changed, command, isHeld, isRefused, lease, onTick, press, refusals, release, select, store, who } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
-import { html, Refused, Results, useEffect, useState } from "./ui.js";
+import { Battery, html, Refused, Results, useEffect, useState } from "./ui.js";
 
 const KEYS = {
   ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
@@ -98,28 +98,42 @@ function PadButton({ motion, symbol, words, letter }) {
   </button>`;
 }
 
-const Pad = () => html`<p class="hint" id="pad-hint">${t.padHint}</p>
-  <div class="pads">
+const Pad = () => html`<div class="pads">
     ${pad.map(([motion, symbol, words, letter]) => html`<${PadButton} ...${{ motion, symbol, words, letter }} />`)}
   </div>
-  <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>`;
+  <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>
+  <p class="hint" id="pad-hint">${t.padHint}</p>`;
 
 function Selection({ cars }) {
   const toggle = (name) => {
-    if (!store.selected.delete(name)) store.selected.add(name);
+    const names = new Set(store.selected);
+    if (!names.delete(name)) names.add(name);
+    select(names);
     release();
     changed();
   };
-  return html`<fieldset class="selection">
-    <legend>${t.select}</legend>
+  return html`<fieldset class="selection car-chips">
+    <legend class="unseen">${t.select}</legend>
     ${cars.map(
-      (car) => html`<label key=${car.name} style=${{ "--car": car.color }}>
+      (car) => html`<label key=${car.name} class=${store.selected.has(car.name) ? "car-chip chosen" : "car-chip"} style=${{ "--car": car.color }}>
         <input type="checkbox" name=${`select-${car.name}`} checked=${store.selected.has(car.name)} onChange=${() => toggle(car.name)} />
-        ${car.name}
+        <span aria-hidden="true">${store.selected.has(car.name) ? "✓" : "+"}</span> ${car.name}
       </label>`,
     )}
   </fieldset>`;
 }
+
+// What a driver looks at while the thumb is on the pad.
+const Live = ({ cars }) => html`<ul class="plain live">
+  ${cars.map(
+    (car) => html`<li key=${car.name} data-live=${car.name}>
+      <strong>${car.name}</strong>${" "}
+      <span>${t.distance} ${car.range_m === undefined ? t.noReading : car.range_m === null ? t.noEcho : `${car.range_m.toFixed(2)} m`}</span>
+      <span class=${car.obstacle?.some(Boolean) ? "bad" : ""}>${t.obstacle} ${car.obstacle ? t.seesObstacle(t.sideNames.filter((_, side) => car.obstacle[side])) : t.noReading}</span>
+      <${Battery} battery=${car.gateway ? car.battery : undefined} />
+    </li>`,
+  )}
+</ul>`;
 
 const Leases = ({ cars }) => html`<section>
   <h2>${t.lease}</h2>
@@ -165,18 +179,40 @@ function Lend({ cars }) {
 
 const ACTS = ["led", "light", "whistle"];
 
-// A control that all cars have. Of the others, it says which car lacks it and why.
+// A control that all cars have. What some lack is in `Lacking`.
+const lacking = (cars, needs) => cars.filter((car) => needs in car.cannot);
 function Offer({ title, needs, cars, children }) {
-  const lacking = cars.filter((car) => needs in car.cannot);
-  const action = ACTS.includes(needs) ? "act" : "move";
-  // Once, beside the pad: what forbids the other controls forbids driving, too.
-  const words = needs === "drive" ? refusals(action, names()) : [];
+  if (lacking(cars, needs).length > 0) return null;
   return html`<section data-control=${needs}>
     <h2>${title}</h2>
-    ${lacking.length === 0
-      ? html`<fieldset class="bare" disabled=${needs !== "drive" && isRefused(action, names())}>${children}</fieldset>
-          <${Refused} words=${words} />`
-      : lacking.map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot[needs])}</p>`)}
+    <fieldset class="bare" disabled=${isRefused(ACTS.includes(needs) ? "act" : "move", names())}>${children}</fieldset>
+  </section>`;
+}
+
+// What not all cars can do: one line, and behind it which car lacks what, and why.
+const OFFERS = [
+  [t.mode, "mode"], [t.speed, "speed"], [t.led, "led"], [t.light, "light"], [t.sounds, "whistle"], [t.servo, "servo_deg"],
+  [t.servoNames.vertical, "servo_vertical"], [t.servoNames.horizontal, "servo_horizontal"], [t.arm, "arm"], [t.fan, "fan"],
+];
+function Lacking({ cars }) {
+  const missing = OFFERS.filter(([, needs]) => lacking(cars, needs).length > 0);
+  if (missing.length === 0) return null;
+  return html`<details class="lacking">
+    <summary>${t.lacking(cars.map((car) => car.name), missing.map(([title]) => title))}</summary>
+    <ul class="plain">
+      ${missing.map(([title, needs]) => html`<li key=${needs} data-control=${needs}><strong>${title}</strong>
+        ${lacking(cars, needs).map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot[needs])}</p>`)}</li>`)}
+    </ul>
+  </details>`;
+}
+
+// What forbids driving forbids the other controls, too: it is said once, here.
+function Driver({ cars }) {
+  const cannot = lacking(cars, "drive");
+  return html`<section class="driver" data-control="drive" aria-label=${t.padLabel}>
+    ${cannot.length === 0
+      ? html`<${Pad} /><${Refused} words=${refusals("move", names())} />`
+      : cannot.map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot.drive)}</p>`)}
   </section>`;
 }
 
@@ -278,20 +314,20 @@ const Controls = ({ cars }) => html`
   <//>
   <${Offer} title=${t.arm} needs="arm" cars=${cars}><${Arm} /><//>
   <${Offer} title=${t.fan} needs="fan" cars=${cars}><${Fan} cars=${cars} /><//>
+  <${Lacking} cars=${cars} />
 `;
 
 export function DrivePage({ cars }) {
   useDriving();
   const driven = selected();
-  return html`
-    <h1>${t.drive}</h1>
-    <div class="drive">
-      <div class="drive-pad">
-        <${Selection} cars=${cars} />
-        <${Offer} title=${t.padLabel} needs="drive" cars=${driven}><${Pad} /><//>
-        <${Results} />
-      </div>
-      <div class="drive-controls">${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}</div>
+  return html`<div class="drive">
+    <h1 class="unseen">${t.drive}</h1>
+    <${Selection} cars=${cars} />
+    <${Driver} cars=${driven} />
+    <${Live} cars=${driven} />
+    <div class="drive-controls">
+      <${Results} />
+      ${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}
     </div>
-  `;
+  </div>`;
 }

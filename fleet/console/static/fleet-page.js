@@ -1,8 +1,11 @@
-// The fleet page: a card for each car.
+// The fleet page: a tile for each car, to be read at a glance, and all about the chosen one.
+//
+// No tile ever moves: a press must not meet another car than the one that the eye has chosen. So each tile has one
+// size whatever is in it, and what comes and goes (trouble, all about a car) has a place of its own.
 
-import { clock, command, isRefused, refusals, store, who } from "./console.js";
-import { links, modes, motions, motors, t, trends, verdicts } from "./texts.js";
-import { html, Memo, Refused, Results, useState, Verdict } from "./ui.js";
+import { changed, clock, command, isRefused, refusals, select, store, who } from "./console.js";
+import { links, modes, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
+import { Battery, html, Memo, Refused, Results, useState, Verdict } from "./ui.js";
 
 export const motorName = (car) => {
   const { state, basis } = car.motors;
@@ -71,21 +74,83 @@ const Loan = ({ car }) =>
 // How long nothing new has come of a car, s. 0 while news come.
 const silence = (car) => (car.silent_s ?? 0) + store.silent_s;
 
-function Card({ car }) {
-  const select = () => {
-    store.selected = new Set([car.name]);
+const isMoving = (car) => car.motors.state === "on";
+const movesAs = (car) => (isMoving(car) && car.motion.motion in motions && !["stop", "unknown"].includes(car.motion.motion) ? motions[car.motion.motion] : t.isMoving);
+
+// What is wrong with a car, the worst first, each with its class and short words.
+function troublesOf(car) {
+  const silent_s = silence(car);
+  return [
+    car.estops.length > 0 && ["bad", "estopped"],
+    !car.gateway && ["bad", "gone"],
+    car.gateway && car.link.state === "lost" && ["bad", "lost"],
+    silent_s > 0 && ["warn", "old", t.ago(silent_s)],
+    car.gateway && car.link.state === "stale" && ["warn", "stale"],
+    car.battery?.level === "critical" && ["bad", "battery"],
+  ]
+    .filter(Boolean)
+    .map(([level, name, words]) => ({ level, name, words: t.troubles[name](words) }));
+}
+
+let chosen = null; // the car that the page shows all about
+function choose(name) {
+  chosen = name;
+  changed();
+}
+
+function Tile({ car }) {
+  const troubles = troublesOf(car);
+  const mark = car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : "";
+  const moving = isMoving(car);
+  return html`<button class=${`tile ${moving ? "moving" : ""} ${troubles[0]?.level ?? ""}`} style=${{ "--car": car.color }} data-car=${car.name}
+    aria-pressed=${chosen === car.name} onClick=${() => choose(car.name)}>
+    <span class="tile-name">${car.name}</span>
+    <span class="tile-motion">${moving ? movesAs(car) : html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`}</span>
+    <span class="tile-mode">${(modes[car.mode.asked] ?? modes.unknown)[0]}<${Battery} battery=${car.battery} /></span>
+    <span class="tile-trouble">
+      ${troubles.length > 0
+        ? html`<span class="bad" data-old=${troubles.some((each) => each.name === "old") ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>`
+        : mark}
+    </span>
+  </button>`;
+}
+
+const TroubleStrip = ({ cars }) => {
+  const troubled = cars.filter((car) => troublesOf(car).length > 0);
+  const show = (name) => {
+    choose(name);
+    document.querySelector(`[data-car="${CSS.escape(name)}"]`)?.scrollIntoView({ block: "nearest" });
   };
+  return html`<div class="strip" role="group" aria-label=${t.trouble}>
+    ${troubled.length === 0
+      ? html`<p class="hint">${t.noTrouble}</p>`
+      : troubled.map(
+          (car) => html`<button key=${car.name} data-trouble=${car.name} onClick=${() => show(car.name)}>
+            ⚠ <strong>${car.name}</strong> ${troublesOf(car)[0].words}</button>`,
+        )}
+  </div>`;
+};
+
+function Details({ car }) {
   const { battery, mode, event } = car;
   const silent_s = silence(car);
   const reports = car.gateway && silent_s === 0 && (car.link.state === "online" || car.link.state === "quiet");
   const missing = reports ? t.notMeasured : t.notKnown;
-  return html`<article class="card" style=${{ "--car": car.color }} aria-labelledby=${`car-${car.name}`} data-car=${car.name}>
+  return html`<article class="card" style=${{ "--car": car.color }} aria-label=${t.details(car.name)} data-details=${car.name}>
     <header>
-      <h2 id=${`car-${car.name}`}>${car.name}</h2>
+      <h2>${car.name}</h2>
       <span class="platform">${car.platform}</span>
+      <button class="close" aria-label=${`${t.close} ${car.name}`} onClick=${() => choose(null)}>✕</button>
     </header>
+    <footer>
+      <a class="button" href="#/drive" onClick=${() => select([car.name])} aria-label=${`${t.drive} ${car.name}`}>${t.drive}</a>
+      <button class="stop-one" onClick=${() => command("stop", [car.name])} aria-label=${`${t.stopCar} ${car.name}`}>
+        ${t.stopCar}
+      </button>
+    </footer>
+    <${Results} />
     <${Trouble} car=${car} />
-    ${silent_s > 0 && html`<p class="note" data-old>${t.old(t.ago(silent_s))}</p>`}
+    ${silent_s > 0 && html`<p class="note">${t.old(t.ago(silent_s))}</p>`}
     <${Estops} car=${car} />
     <${Hold} car=${car} />
     <${Loan} car=${car} />
@@ -126,20 +191,30 @@ function Card({ car }) {
           : "–"}
       <//>
     </dl>
-    <footer>
-      <a class="button" href="#/drive" onClick=${select} aria-label=${`${t.drive} ${car.name}`}>${t.drive}</a>
-      <button class="stop-one" onClick=${() => command("stop", [car.name])} aria-label=${`${t.stopCar} ${car.name}`}>
-        ${t.stopCar}
-      </button>
-    </footer>
   </article>`;
 }
 
-export const FleetPage = ({ cars }) => html`
-  <h1>${t.fleet}</h1>
-  <${Results} />
-  ${cars.length === 0 && html`<p>${t.noCars}</p>`}
-  <div class="cards">
-    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify([car, store.rights.cars[car.name], store.silent_s])} draw=${() => html`<${Card} car=${car} />`} />`)}
-  </div>
-`;
+// A tile is drawn again if anything that it shows has changed, or if it is chosen.
+const drawn = (car, ...more) => JSON.stringify([car, store.rights.cars[car.name], store.silent_s, ...more]);
+
+export function FleetPage({ cars }) {
+  const shown = cars.find((car) => car.name === chosen);
+  const count = (is) => cars.filter(is).length;
+  const troubled = count((car) => troublesOf(car).length > 0);
+  return html`<div class="fleet">
+    <div class="summary">
+      <h1>${t.fleet}</h1>
+      <p data-summary>${t.summary(cars.length, count(isMoving), count((car) => car.hold !== null), troubled)}</p>
+    </div>
+    <${TroubleStrip} cars=${cars} />
+    <div class="tiles">
+      ${cars.length === 0 && html`<p>${t.noCars}</p>`}
+      ${cars.map((car) => html`<${Memo} key=${car.name} data=${drawn(car, chosen === car.name)} draw=${() => html`<${Tile} car=${car} />`} />`)}
+    </div>
+    <div class=${shown ? "details" : "details empty"}>
+      ${shown
+        ? html`<${Memo} key=${shown.name} data=${drawn(shown, store.results)} draw=${() => html`<${Details} car=${shown} />`} />`
+        : html`<p class="hint">${t.chooseCar}</p>`}
+    </div>
+  </div>`;
+}

@@ -1,6 +1,6 @@
 // The plan page: the plan in force, who has which role and why, and another plan.
 
-import { clock, plan, sendPlan, store } from "./console.js";
+import { clock, plan, sendPlan, store, who } from "./console.js";
 import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, Refused, useRef, useState } from "./ui.js";
@@ -14,8 +14,8 @@ function Status({ shown }) {
   const words = !shown.running
     ? t.planOld(version)
     : shown.stopped_by
-      ? t.planStopped(version, shown.stopped_by)
-      : t.planRuns(version, set_by);
+      ? t.planStopped(version, who(shown.stopped_by))
+      : t.planRuns(version, set_by && who(set_by));
   return html`<p role="status"><strong>${words}</strong></p>
     ${shown.phase && html`<p>${t.phase(shown.phase)}</p>`}
     ${shown.rules?.length > 0 && html`<p>${t.rules(shown.rules)}</p>`}

@@ -23,6 +23,15 @@ export const motors = {
   unknown: ["?", "unknown"],
 };
 
+// Short, for a tile; what shows that a car stands is among all about it.
+export const tileMotors = {
+  "off shown": ["■", "standing"],
+  "off sent": ["□", "off as sent"],
+  off: ["□", "off"],
+  stopping: ["…", "stopping"],
+  unknown: ["?", "unknown"],
+};
+
 export const motions = {
   stop: "standing",
   forward: "↑ forward",
@@ -293,4 +302,25 @@ export const t = {
   size: (bytes) => (bytes < 1e6 ? `${(bytes / 1e3).toFixed(1)} kB` : bytes < 1e9 ? `${(bytes / 1e6).toFixed(1)} MB` : `${(bytes / 1e9).toFixed(1)} GB`),
   unreachable: "The console does not answer.",
   skip: "Skip to content",
+  loading: "Loading…",
+  close: "Close",
+  details: (car) => `All about ${car}`,
+  chooseCar: "Choose a car to see all about it.",
+  isMoving: "moving",
+  holdMark: "on hold",
+  lentMark: (to) => `lent to ${to}`,
+  troubles: {
+    estopped: () => "E-stopped",
+    gone: () => "gateway gone",
+    lost: () => "link lost",
+    stale: () => "stale",
+    old: (ago) => `Nothing new for ${ago}`,
+    battery: () => "battery critical",
+  },
+  trouble: "Cars in trouble",
+  noTrouble: "No car is in trouble.",
+  summary: (all, moving, held, troubled) =>
+    [`${all} ${all === 1 ? "car" : "cars"}`, `${moving} moving`, held && `${held} on hold`, troubled && `${troubled} in trouble`].filter(Boolean).join(" · "),
+  noReading: "–",
+  lacking: (cars, controls) => `Not with ${cars.length === 1 ? cars[0] : "these cars"}: ${controls.join(", ")}`,
 };

@@ -17,6 +17,16 @@ export const Verdict = ({ table, name, detail = "" }) => {
   >`;
 };
 
+// A bar for the eye and a number for all.
+export function Battery({ battery }) {
+  if (!battery) return html`<span class="battery dim">${t.noReading}</span>`;
+  const share = battery.charge === null ? null : Math.round(battery.charge * 100);
+  return html`<span class=${`battery level-${battery.level}`}>
+    ${share !== null && html`<span class="bar" aria-hidden="true"><span style=${{ width: `${share}%` }}></span></span>`}
+    ${share === null ? `${battery.v.toFixed(1)} V` : `${share} %`}
+  </span>`;
+}
+
 // Why an action is refused, before it is tried.
 export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
 

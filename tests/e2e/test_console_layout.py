@@ -1,0 +1,201 @@
+"""Where things are on the pages, in a real browser: a pad in reach, tiles that stay, and a small first load."""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from schemas import keys
+from tests.support.console import CARS, ConsoleProcess, ConsoleStage
+from tests.support.processes import PATIENCE_S
+
+pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
+
+TOUCH: dict[str, Any] = {"has_touch": True, "is_mobile": True}
+PORTRAIT: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, **TOUCH}
+LANDSCAPE: dict[str, Any] = {"viewport": {"width": 844, "height": 390}, **TOUCH}
+LAPTOP: dict[str, Any] = {"viewport": {"width": 1366, "height": 768}}
+MANY = 20
+"""A class: two pupils a car."""
+MAX_FIRST_LOAD = 150_000
+"""Maximum size of the first load as it is sent, bytes."""
+MIN_PAD_SHARE = 1 / 3
+"""Minimum share of the screen for the pad of a phone that is held across."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patient() -> None:
+    expect.set_options(timeout=PATIENCE_S * 1000)
+
+
+@pytest.fixture
+def many(stage: ConsoleStage) -> Iterator[ConsoleStage]:
+    """Add cars of which nothing but their presence is known, up to MANY."""
+    names = [f"car{number:02d}" for number in range(MANY - len(CARS))]
+    tokens = [stage.fleet.bus.token(keys.car_token("fleet", name)) for name in names]
+    yield stage
+    for token in tokens:
+        token.undeclare()  # type: ignore[no-untyped-call]
+    stage.console.process.kill()
+    stage.console.process.wait()
+    stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)  # this one has not known them
+
+
+def is_in_reach(page: Page, selector: str) -> bool:
+    """Return True if each element is in view as a whole, and a press on its corners and its middle meets it."""
+    script = """(all) => all.length > 0 && all.every((each) => {
+      const box = each.getBoundingClientRect();
+      const places = [[0.5, 0.5], [0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]];
+      return box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight
+        && places.map(([x, y]) => [box.left + x * box.width, box.top + y * box.height])
+          .every(([x, y]) => each.contains(document.elementFromPoint(x, y)));
+    })"""
+    return bool(page.locator(selector).evaluate_all(script))
+
+
+def boxes(tiles: Locator) -> dict[str, list[float]]:
+    """Return the place of each tile by car."""
+    script = "(all) => all.map((each) => [each.dataset.car, each.getBoundingClientRect().toJSON()])"
+    return {car: [box["x"], box["y"], box["width"], box["height"]] for car, box in tiles.evaluate_all(script)}
+
+
+@pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE], ids=["portrait", "landscape"])
+def test_nothing_covers_the_pad_or_stop_of_a_phone_while_a_report_is_shown(
+    many: ConsoleStage, held: dict[str, Any]
+) -> None:
+    page = many.driving_page("red", **held)
+    expect(page.locator("[data-live=red]")).to_contain_text(re.compile(r"Distance [\d.]+ m"))
+    before = page.locator("[data-motion=forward]").bounding_box()
+    page.locator("#stop").tap()
+    page.locator("[data-report]").wait_for()
+    assert is_in_reach(page, ".pad")
+    assert is_in_reach(page, "#stop")
+    # The presences answer no stop: 17 cars are named, the worst report there is.
+    expect(page.locator("[data-stop].stop-failed")).to_have_count(MANY - len(CARS))
+    page.locator(".report-line").tap()
+    first = page.locator("[data-stop]").evaluate_all("(all) => all.map((each) => each.className.includes('failed'))")
+    assert first == sorted(first, reverse=True)
+    assert first.count(True) == MANY - len(CARS)
+    for scrolled in (0, 10_000):
+        page.evaluate(f"document.querySelector('main').scrollTop = {scrolled}")
+        assert is_in_reach(page, ".pad")
+        assert is_in_reach(page, "#stop")
+        assert is_in_reach(page, "nav [aria-current]")
+        page.locator("#estop").tap()  # asks for a reason
+        page.locator("input[name=why]").wait_for()
+        assert is_in_reach(page, "#stop")
+        assert is_in_reach(page, "[data-asking] .danger")
+        page.locator("#estop").tap()
+    page.evaluate("document.querySelector('main').scrollTop = 0")
+    assert page.locator("[data-motion=forward]").bounding_box() == before, "it has not moved"
+    if held is LANDSCAPE:
+        pad = page.locator(".pads").bounding_box()
+        assert pad is not None
+        assert pad["width"] * pad["height"] >= MIN_PAD_SHARE * 844 * 390
+
+
+def test_a_report_is_one_line_until_it_is_unfolded(stage: ConsoleStage) -> None:
+    page = stage.page("#/drive", **PORTRAIT)
+    page.locator("#stop").tap()
+    report = page.locator("[data-report]")
+    expect(report.locator(".report-line")).to_contain_text("1 of 3 shown, 2 sent")
+    expect(page.locator("[data-stop]")).to_have_count(0)
+    box = report.bounding_box()
+    assert box is not None
+    assert box["height"] < 60, "less than two buttons"
+    report.locator(".report-line").tap()
+    expect(page.locator("[data-stop]")).to_have_count(len(CARS))
+
+
+@pytest.mark.parametrize("held", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
+def test_twenty_cars_fit_a_laptop_and_six_a_phone(many: ConsoleStage, held: dict[str, Any]) -> None:
+    page = many.page(**held)
+    tiles = page.locator("[data-car]")
+    expect(tiles).to_have_count(MANY)
+    fit = MANY if held is LAPTOP else 6
+    assert is_in_reach(page, f".cell:nth-child(-n+{fit}) [data-car]")
+    expect(page.locator("[data-summary]")).to_contain_text(f"{MANY} cars · 0 moving")
+
+
+@pytest.mark.parametrize("held", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
+def test_no_tile_moves_when_a_car_gets_into_trouble(stage: ConsoleStage, held: dict[str, Any]) -> None:
+    page = stage.page(**held)
+    tiles = page.locator("[data-car]")
+    expect(tiles).to_have_count(len(CARS))
+    expect(page.locator("[data-trouble]")).to_have_count(0)
+    before = boxes(tiles)
+    stage.person.car("red").estop("smoke").check()
+    expect(page.locator("[data-trouble=red]")).to_contain_text("E-stopped")
+    expect(page.locator("[data-car=red]")).to_contain_text("E-stopped")
+    assert boxes(tiles) == before
+    stage.person.stop(list(CARS))
+    for car in ("blue", "green"):
+        expect(page.locator(f"[data-car={car}]")).to_contain_text("on hold")
+    assert boxes(tiles) == before
+    stage.person.pause("lunch")
+    try:
+        expect(page.locator("[data-paused]")).to_contain_text("Paused by mia: lunch")
+        assert boxes(tiles) == before
+    finally:
+        stage.person.unpause()
+    page.locator("[data-trouble=red]").click()
+    expect(page.locator("[data-details=red]")).to_contain_text("E-stop of this car by mia: smoke")
+    assert boxes(tiles) == before
+
+
+def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
+    page = stage.page()
+    tile = page.locator("[data-car=red]")
+    expect(tile).to_contain_text("standing")
+    stage.person.car("red").drive("forward", 10.0, wait=False).check()
+    expect(tile).to_contain_text("↑ forward")
+    expect(page.locator("[data-summary]")).to_contain_text("1 moving")
+    stage.person.stop(["red"])
+    expect(tile).not_to_contain_text("forward")
+    stage.stands()
+
+
+def test_the_selection_outlives_a_reload_but_not_its_tab(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red", "green")
+    page.reload()
+    for car, chosen in (("red", True), ("green", True), ("blue", False)):
+        expect(page.locator(f"input[name=select-{car}]")).to_be_checked(checked=chosen)
+    page.locator("input[name=select-green]").uncheck()
+    page.reload()
+    expect(page.locator("input[name=select-red]")).to_be_checked()
+    expect(page.locator("input[name=select-green]")).not_to_be_checked()
+    with stage.held(page, "forward"):
+        pass
+    stage.stands()
+    other = page.context.new_page()
+    other.goto(page.url)
+    expect(other.locator("input[name=select-red]")).not_to_be_checked()
+
+
+def test_a_person_is_named_without_host_and_process(stage: ConsoleStage) -> None:
+    page = stage.page()
+    for car in CARS:
+        stage.person.car(car).estop("smoke").check()
+    stage.details(page)
+    expect(page.locator("[data-details=red]")).to_contain_text("by mia: smoke")
+    for link in page.locator("nav a").all():
+        link.click()
+        page.locator("main h1").wait_for()
+        assert not re.search(r"\w@\w", page.locator("body").inner_text()), link.inner_text()
+
+
+def test_the_first_load_is_small_and_plots_are_loaded_on_their_page(stage: ConsoleStage) -> None:
+    page = stage.page()
+    entries = "performance.getEntries().filter((each) => 'transferSize' in each)"
+    sent = f"{entries}.map((each) => [each.name, each.transferSize])"
+    page.locator("[data-car=red]").wait_for()
+    loaded = {name.rpartition("/")[2]: size for name, size in page.evaluate(sent)}
+    print(f"\nfirst load: {sum(loaded.values())} bytes in {len(loaded)} requests")
+    assert "app.js" in loaded
+    assert sum(loaded.values()) <= MAX_FIRST_LOAD
+    assert not any(name.startswith(("uplot", "plots")) for name in loaded)
+    page.locator("nav a", has_text="Plots").click()
+    page.locator("[data-plot='0'] canvas").wait_for()
+    assert "uplot.js" in str(page.evaluate(sent))
