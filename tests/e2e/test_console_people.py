@@ -102,6 +102,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     expect(theirs.locator("[data-control=drive] .refused")).to_have_count(0)
     hold_until_driving(theirs, room.judge)
     teacher.goto(f"{room.consoles['teacher'].address}/#/")
+    teacher.locator("[data-car=red]").click()
     teacher.get_by_role("button", name="End the loan red").click()
     wait_for(lambda: not room.judge.driving, "the end of the loan stops it")
     theirs.mouse.up()
