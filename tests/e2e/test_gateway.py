@@ -16,6 +16,7 @@ import pytest
 import serial
 
 from schemas import bus
+from schemas.limits import SHUTDOWN_S
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
@@ -33,8 +34,6 @@ from tests.support.processes import (
 
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
 
-SHOWN_S = 3.75
-"""Time until a driven car has shown its stop by two pauses of its reports, each around a `MODE00`."""
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 
@@ -441,7 +440,7 @@ def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None
     assert not driving(sim, car)
     took_s = judge.wait_off(asked_ns, watched_s=0.5)
     assert took_s < min(1.2 + BUSY_S, ended_s), "its recipe, on a machine that is busy, and before it ends"
-    assert ended_s < SHOWN_S + 1.0 + 2 * BUSY_S, "the evidence, one second, and a process that ends on such a machine"
+    assert ended_s < SHUTDOWN_S + 1.0 + 2 * BUSY_S, "the time for evidence that it announces, and the end of a process"
     assert "Traceback" not in gateway.stderr
     assert fleet.left() == []
     assert wait_for(lambda: not fleet.get(f"fleet/{car}/**"), "nobody answers for it")
