@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any, Final
 
-from fleet.client.commands import CommandRequest
-from fleet.client.outcome import Outcome, Progress
+from fleet.client.commands import STOP_TTL_S, CommandRequest
+from fleet.client.outcome import GATEWAY_RETURN_TIMEOUT_S, Outcome, Progress
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.commands import STOPS
@@ -19,6 +19,10 @@ ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
 WAIT_SAID_S: Final = 1.0
 """Time until the message that a command waits for a busy car."""
+SEND_AGAIN_INTERVAL_S: Final = 0.5
+"""Interval at which a stop without an answer is sent again: the longest pause between two tries of a lost session."""
+BUS_LOOK_INTERVAL_S: Final = 0.1
+"""Interval at which a stop without an answer looks for the bus: half the shortest time for which a session is lost."""
 _MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 
@@ -60,6 +64,10 @@ class PendingCommand:
 
     # A stop must not miss a car whose gateway hangs: 2 s later its token is gone, and a plain wildcard query passes it
     # by. Therefore a stop also concerns the cars that a supervisor knows, and is sent again to their new gateways.
+    #
+    # Nor must it be lost with the bus: a hub that hangs takes the query, and drops it when its links are cut after the
+    # lease. So a stop that a gateway has not answered is sent again when the bus is back, as long as a gateway takes it
+    # (STOP_TTL_S). No car gets it again that has answered: a person may have released it meanwhile.
 
     def __init__(
         self,
@@ -79,8 +87,17 @@ class PendingCommand:
         self._named = named
         self._hubs = hubs
         self._hubs_then = hubs()
+        self.is_taken: Future[bool] = Future()
+        """True as soon as a gateway has answered, or there is none. False if the bus was lost and nobody has."""
+        self.lost_bus = False
+        """True if the bus was lost before the stop was answered."""
+        self._bus_back_at: float | None = None
+        """The time since which the bus is there again."""
+        self._unanswered_at: dict[str, float] = {}
+        """When the last query of a stop to a car has ended without an answer."""
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)
         self._asked_at = time.monotonic()
+        self._is_closed = False
         self._late_at: float | None = self._asked_at + ANSWER_TIMEOUT_S
         """Time of the warning about missing answers. None after the warning."""
         self._waits_said: set[str] = set()
@@ -101,9 +118,12 @@ class PendingCommand:
     def wait(self) -> None:
         """Wait until every car's outcome is known or its deadline has passed."""
         while True:
+            if self.is_stop:
+                self._look_for_bus(time.monotonic())
             waiting = [progress for progress in self._progress.values() if progress.outcome is None]
             # A car without a token may answer a wildcard query, too. So wait for the end of the query.
-            if not waiting and not self._open:
+            if not waiting and not self._open and not self._awaits_bus:
+                self._note_taken(taken=not self.lost_bus and not self._is_closed)
                 return
             now = time.monotonic()
             if self._late_at is not None and now >= self._late_at:
@@ -113,13 +133,15 @@ class PendingCommand:
             if now >= waits_at:
                 self._say_waits(waiting)
             for progress in waiting:
-                if now >= progress.deadline and self._hubs() != self._hubs_then:
+                if now >= progress.deadline and not progress.awaits_bus and self._hubs() != self._hubs_then:
                     progress.on_presence(now, alive=True)  # the hub was lost, not the gateway
                 if now >= progress.deadline and self.inbox.empty():  # after a stall, an answer may be queued
                     progress.give_up(now)
             until = min((each.deadline for each in waiting), default=now + ANSWER_TIMEOUT_S)
             until = until if self._late_at is None else min(until, self._late_at)
             until = until if now >= waits_at else min(until, waits_at)
+            if self.is_stop and (self._awaits_bus or not all(each.answered for each in waiting)):
+                until = min(until, now + BUS_LOOK_INTERVAL_S)
             try:
                 at, item = self.inbox.get(timeout=max(0.0, until - now))
             except queue.Empty:
@@ -135,9 +157,40 @@ class PendingCommand:
         """Return True if the command is, or may be, for this car. May run on any thread."""
         return car in self._progress or self.is_stop
 
+    @property
+    def _awaits_bus(self) -> bool:
+        """True while a stop waits for the bus, and for the gateways that join it again."""
+        now = time.monotonic()
+        if not self.lost_bus or self._is_closed or now >= self._asked_at + STOP_TTL_S:
+            return False
+        return self._bus_back_at is None or now < self._bus_back_at + GATEWAY_RETURN_TIMEOUT_S
+
+    def _look_for_bus(self, now: float) -> None:
+        """Note a loss of the bus before all have answered. Send the stop again to those who have not."""
+        unanswered = [each for each in self._progress.values() if each.outcome is None and not each.answered]
+        if not (hubs := self._hubs()):
+            if unanswered or not self._progress:
+                self.lost_bus, self._bus_back_at = True, None
+            for progress in unanswered:
+                progress.on_bus_lost(now, self._asked_at + STOP_TTL_S)
+            return
+        if hubs != self._hubs_then and unanswered:  # another hub, perhaps between two looks
+            self.lost_bus = True
+        if self.lost_bus and self._bus_back_at is None:
+            self._bus_back_at = now
+        for progress in unanswered:
+            ended_at = self._unanswered_at.get(progress.car)
+            if ended_at is not None and now >= ended_at + SEND_AGAIN_INTERVAL_S and progress.car in self._present:
+                self._stop_again(progress)
+
+    def _note_taken(self, *, taken: bool) -> None:
+        if not self.is_taken.done():
+            self.is_taken.set_result(taken)
+
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
-            log.warning("%s: no answer yet, still waiting. Computer or gateway may be overloaded.", ", ".join(late))
+            why = "The fleet's bus does not answer" if self.lost_bus else "Computer or gateway may be overloaded"
+            log.warning("%s: no answer yet, still waiting. %s.", ", ".join(late), why)
 
     def _say_waits(self, waiting: list[Progress]) -> None:
         for progress in waiting:
@@ -148,6 +201,7 @@ class PendingCommand:
     def _take(self, item: Any, at: float) -> None:
         if item is CLOSED:
             self._open = 0
+            self._is_closed = True
             for progress in self._progress.values():
                 progress.give_up(at)
         elif isinstance(item, QueryEnded):
@@ -155,6 +209,7 @@ class PendingCommand:
             for progress in self._progress.values():
                 if item.target not in ("*", progress.car):
                     continue
+                self._unanswered_at[progress.car] = at
                 if item.words:
                     progress.on_query_failed(item.words.replace("*", progress.car, 1), at)
                 else:
@@ -169,6 +224,7 @@ class PendingCommand:
             self._open -= 1
             self._on_supervised(item, at)
         elif self._named is None or self.concerns(item.car):
+            self._note_taken(taken=True)
             # A gateway forwards the end of an e-stop of the fleet under the same id. Those cars were not asked.
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
@@ -176,6 +232,8 @@ class PendingCommand:
         (self._present.add if change.alive else self._present.discard)(change.car)
         progress = self._progress.get(change.car)
         if progress is None:
+            if change.alive and self.lost_bus and self._named is None:
+                self._stop_again(self._of(change.car))
             return
         was_awaited = progress.is_awaited
         progress.on_presence(at, alive=change.alive)
@@ -190,7 +248,7 @@ class PendingCommand:
             progress = self._of(car)
             if car in supervised.names:
                 progress.on_supervised(at, present=car in present)
-            elif car not in present:
+            elif car not in present and not self.lost_bus:
                 progress.on_missing(sorted(present), at)
             if car in present and car not in queried:
                 self._stop_again(progress)
@@ -199,6 +257,7 @@ class PendingCommand:
         """Send the stop to a gateway that joined the bus after the first query."""
         if self.is_stop and not progress.answered and progress.outcome is None:
             self._open += 1
+            self._unanswered_at.pop(progress.car, None)
             self._send_again(progress.car)
 
     def _on_answer(self, progress: Progress, item: Sample, at: float) -> None:
@@ -208,6 +267,7 @@ class PendingCommand:
         except messages.BadPayload as error:
             progress.on_foreign_answer(f"another program answered for {progress.car}: {error}")
             return
+        self._note_taken(taken=True)
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 
     def _of(self, car: str) -> Progress:

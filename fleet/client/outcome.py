@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Self
 
+from fleet.client.claims import NOT_STOPPED
 from fleet.client.effects import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
 from schemas.suggestion import did_you_mean
@@ -102,6 +103,11 @@ class LeaseLost(NotCarriedOut):
     """Another sender has taken or stopped the car. The text names the sender."""
 
 
+def bus_lost_words(car: str) -> str:
+    """Return the words of a stop that reached no gateway because the bus was lost."""
+    return f"{NOT_STOPPED}: the fleet's bus does not answer. If {car} moves, go to the car."
+
+
 class Progress:
     """The progress of one command on one car. `outcome` is None until it is known."""
 
@@ -127,11 +133,20 @@ class Progress:
         self._gone_at: float | None = None
         self._is_supervised = False
         self._foreign = ""
+        self._unanswered = ""
+        """Why the last query of a stop has ended without an answer."""
+        self._bus_lost_until: float | None = None
+        """The time to give up a stop that nobody has answered since the bus was lost."""
 
     @property
     def is_awaited(self) -> bool:
         """True if the gateway is gone and may come back."""
         return self.outcome is None and self._gone_at is not None
+
+    @property
+    def awaits_bus(self) -> bool:
+        """True if it is a stop that waits for the bus, to be sent again."""
+        return self.outcome is None and self._bus_lost_until is not None and not self.answered
 
     @property
     def _joined(self) -> bool:
@@ -142,6 +157,8 @@ class Progress:
     @property
     def deadline(self) -> float:
         """The time to give up, on the clock of `asked_at`."""
+        if self._bus_lost_until is not None and self.awaits_bus:
+            return self._bus_lost_until
         if self._gone_at is not None:
             return self._gone_at + (GATEWAY_RESTART_TIMEOUT_S if self._is_supervised else GATEWAY_RETURN_TIMEOUT_S)
         if not self.answered:
@@ -188,8 +205,14 @@ class Progress:
         there = f"Connected: {', '.join(present)}." if present else "No car is connected."
         words = f'No car named "{self.car}". {" ".join(filter(None, (did_you_mean(self.car, present), there)))}'
         if self._verb in STOP_VERBS:
-            words = f"NOT STOPPED: {words} If it moves, go to the car."
+            words = f"{NOT_STOPPED}: {words} If it moves, go to the car."
         self._end(NO_ANSWER, "", words, at, ok=False)
+
+    def on_bus_lost(self, at: float, until: float) -> None:
+        """Note that the bus was lost before an answer to this stop. It is sent again until this time."""
+        if self.outcome is None and not self.answered:
+            self._bus_lost_until = until
+            self.on_presence(at, alive=False)
 
     def on_supervised(self, at: float, *, present: bool) -> None:
         """Wait longer for a gateway that is gone: a supervisor starts a new one."""
@@ -204,6 +227,9 @@ class Progress:
     def on_query_failed(self, words: str, at: float) -> None:
         """Give up if the query has ended without an answer. Where a supervisor starts a new gateway, wait for that."""
         if self._is_supervised and not self.answered:
+            self.on_presence(at, alive=False)
+        elif self._verb in STOP_VERBS and not self.answered:  # gateway or bus may be back in a moment
+            self._unanswered = f"{self._foreign}. {words}" if self._foreign else words
             self.on_presence(at, alive=False)
         else:
             self._give_up_unanswered(words, at)
@@ -234,6 +260,12 @@ class Progress:
 
     def give_up(self, at: float) -> None:
         """End with an unknown outcome: the deadline has passed."""
+        if self.awaits_bus:
+            self._end(NO_ANSWER, "", bus_lost_words(self.car), at, ok=False)
+            return
+        if self._unanswered and not self.answered:
+            self._end(NO_ANSWER, "", self._unanswered, at, ok=False)
+            return
         if self._gone_at is not None:
             words = (
                 f"{self.car} may be moving and nothing can stop it from here: its gateway is gone. Go to the car. "

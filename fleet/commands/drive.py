@@ -6,6 +6,7 @@ from typing import Final, Never
 
 import click
 
+from fleet.client.claims import NOT_STOPPED
 from fleet.client.client import Fleet
 from fleet.client.commands import (
     MAX_DRIVE_S,
@@ -28,6 +29,7 @@ from fleet.commands.options import (
     with_client,
 )
 from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
+from schemas.bus import BusError, NoFleet
 from schemas.process import signals, startup
 from schemas.words import Mode, Motion, Scope
 
@@ -114,6 +116,17 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
     )
 
 
+def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
+    """Open the client. A hub that hangs must not read as a stop that was carried out."""
+    try:
+        return client_in(connect, fleet)
+    except NoFleet:  # nothing is running, which is no fault
+        raise
+    except BusError as error:
+        words = f"{NOT_STOPPED}: the fleet's bus does not answer. If a car moves, go to the car."
+        raise BusError(f"{words} ({error})") from None
+
+
 def _stop(
     connect: str | None,
     fleet: str,
@@ -129,7 +142,7 @@ def _stop(
         request = request_for(named)
         return [*there.ask(request, named), *_strangers(there, request, cars)]
 
-    with client_in(connect, fleet) as client:
+    with _client_that_stops(connect, fleet) as client:
         end_with(client, in_all_fleets(client, connect, cars, act), as_json=as_json)
 
 

@@ -113,12 +113,14 @@ class ConsoleOperator:
 
     # ------------------------------------------------------------------ STOP
 
-    def stop(self, request: CommandRequest, report: StopReport) -> None:
-        """Stop every car. The report gets the outcomes."""
-        self.spawn(self._stop(request, report))
-
-    async def _stop(self, request: CommandRequest, report: StopReport) -> None:
+    def stop(self, request: CommandRequest, report: StopReport) -> PendingCommand:
+        """Stop every car, and return the command. The report gets the outcomes."""
         command = self._fleet.sync.send(request)
+        report.command_id = command.id
+        self.spawn(self._report_stop(request, command, report))
+        return command
+
+    async def _report_stop(self, request: CommandRequest, command: PendingCommand, report: StopReport) -> None:
         # A person who stops again asks for the outcome of the newest stop, which concerns the same cars. A wait takes a
         # thread, for as long as the slowest car needs to stand: ten stops a second would take 60 of them.
         who = (report.sender, request.verb)
@@ -130,7 +132,8 @@ class ConsoleOperator:
         finally:
             if self._stops.get(who) is command:
                 del self._stops[who]
-        report.on_outcomes([each for each in outcomes if is_shown(each.car)], time.monotonic())
+        shown = [each for each in outcomes if is_shown(each.car)]
+        report.on_outcomes(shown, time.monotonic(), lost_bus=command.lost_bus)
 
     # ------------------------------------------------------------------ the rest
 

@@ -47,6 +47,8 @@ MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
 HELLO: Final = "fleet console"
 """What `/hello` answers. A second console finds the first one by it."""
+STOP_NOT_TAKEN: Final = "NOT STOPPED yet: the fleet's bus does not answer. If a car moves, go to the car."
+"""Answer to a STOP that no gateway has answered yet."""
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Room for what a message contains beside the text of a plan, bytes."""
@@ -190,6 +192,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         # A lead's name on the stop of a person without an open page would keep the cars from this person.
         named = replace(stop_request(), sender=console.sender_of(person))
         console.stop_all(stop_id, console.operator_of(person), named)
+        if not await console.is_stop_taken():  # the console sends it again for as long as it counts
+            return JSONResponse({"ok": False, "words": STOP_NOT_TAKEN}, 503)
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:

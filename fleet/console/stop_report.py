@@ -9,7 +9,7 @@ whatever ended that motion was not this STOP.
 from collections.abc import Collection, Iterable
 from typing import Any, Final
 
-from fleet.client.outcome import NO_ANSWER, Outcome
+from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
 from schemas import messages
 from schemas.commands import STOPS
 from schemas.words import Basis, Motors, Phase, Verb
@@ -26,6 +26,8 @@ class StopReport:
     def __init__(self, number: int, verb: str, sender: str, cars: Iterable[str], now: float, at_ms: int) -> None:
         self.number = number
         self.sender = sender
+        self.command_id = ""
+        """The id of its command. Events of other commands say nothing about this STOP. Empty: not sent yet."""
         self._verb = verb
         self._asked_at = now
         self._at_ms = at_ms
@@ -41,12 +43,14 @@ class StopReport:
         return all(entry["state"] not in _UNDER_WAY for entry in self._cars.values())
 
     def on_event(self, car: str, event: Any, now: float) -> None:
-        """Handle a command event of the sender of this STOP."""
-        if event.verb not in (*STOPS, Verb.PAUSE) or car in self._closed:
+        """Handle a command event. Those of other commands say nothing about this STOP."""
+        if event.verb not in (*STOPS, Verb.PAUSE) or event.id != self.command_id or car in self._closed:
             return
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
-        if self._is_over(car):
+        is_stopped = event.phase == Phase.COMPLETE or (event.phase == Phase.SENT and event.basis)
+        # A car that seemed not to be reached may be stopped later, by this STOP itself.
+        if self._is_over(car) and not (is_stopped and self._cars[car]["state"] == Phase.FAILED):
             return
         match event.phase:
             case Phase.COMPLETE:
@@ -65,7 +69,8 @@ class StopReport:
         """
         state = self._cars[car]["state"] if car in self._cars else ""
         stamp_ns = messages.stamp_ns(safety.stamp)
-        if state == Phase.FAILED and safety.motors == Motors.OFF and safety.motors_basis:
+        is_off = safety.motors == Motors.OFF and safety.motors_basis
+        if state == Phase.FAILED and is_off and self._began_since(safety, stamp_ns, now):
             self._set(car, safety.motors_basis, now)
             self._result_ns[car] = stamp_ns
         elif state in tuple(Basis) and safety.motors == Motors.ON and stamp_ns > self._result_ns.get(car, 0):
@@ -81,15 +86,19 @@ class StopReport:
         for car in [car for car, entry in self._cars.items() if entry["state"] == MOVED and car not in present]:
             self._close(car)
 
-    def on_outcomes(self, outcomes: Iterable[Outcome], now: float) -> None:
-        """Handle the final outcomes. A car without an outcome was not reached."""
+    def on_outcomes(self, outcomes: Iterable[Outcome], now: float, *, lost_bus: bool = False) -> None:
+        """Handle the final outcomes. A car without an outcome was not reached.
+
+        lost_bus: True if the bus was lost before the stop was answered.
+        """
         by_car = {outcome.car: outcome for outcome in outcomes}
         for car in {*self._cars, *by_car}:
             outcome = by_car.get(car)
             if self._is_over(car) or car in self._closed:
                 continue
             if outcome is None:
-                self._set(car, Phase.FAILED, now, "its gateway is not on the bus: look at the car")
+                words = bus_lost_words(car) if lost_bus else "its gateway is not on the bus: look at the car"
+                self._set(car, Phase.FAILED, now, words)
             elif outcome.ok:
                 self._set(car, outcome.basis or Basis.SENT, now, outcome.words)
             else:
@@ -106,6 +115,14 @@ class StopReport:
             "cars": cars,
             "closed": len(self._closed),
         }
+
+    def _began_since(self, safety: Any, stamp_ns: int, now: float) -> bool:
+        """Return True if this claim about the motors began after this STOP. An older one is no result of it."""
+        if not safety.HasField("trust_since_s"):
+            return False
+        # By both clocks: a bus that hung hands over old states, and the clock of another computer may be ahead.
+        began_ns = stamp_ns - int(safety.trust_since_s * 1e9)
+        return now - safety.trust_since_s > self._asked_at and began_ns > self._at_ms * 1_000_000
 
     def _close(self, car: str) -> None:
         del self._cars[car]

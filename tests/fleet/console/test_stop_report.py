@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from fleet.client.claims import NOT_STOPPED
 from fleet.client.outcome import Outcome
 from fleet.console.stop_report import StopReport
 from schemas.gen import fleet_v1_pb2 as pb
@@ -58,15 +59,57 @@ def test_a_car_without_an_outcome_was_not_reached() -> None:
     }
 
 
+def claim(at_s: float, since_s: float, basis: str = "sent") -> Any:
+    """Return a claim that the motors are off, stamped at `at_s` by the clock of its gateway, and so for `since_s`."""
+    found = pb.Safety(motors="off", motors_basis=basis, trust_since_s=since_s)
+    found.stamp.FromNanoseconds(int(at_s * 1e9))
+    return found
+
+
 def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
-    report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
-    report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 10.1)
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
+    report.on_safety("red", claim(50.1, 0.0, "shown"), 10.1)
     assert states(report)["red"][0] == "asked", "the state may be older than the stop"
     report.on_outcomes([], 12.0)
     report.on_safety("red", pb.Safety(motors="on"), 13.0)
     assert states(report)["red"][0] == "failed"
-    report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 14.0)
+    report.on_safety("red", claim(54.0, 0.5, "shown"), 14.0)
     assert states(report)["red"][0] == "shown"
+
+
+@pytest.mark.parametrize(
+    "old",
+    [
+        claim(54.0, 30.0),  # off since long before
+        claim(49.0, 0.5),  # handed over late, by a bus that hung
+        claim(64.0, 4.5),  # by a clock that is ahead
+        pb.Safety(motors="off", motors_basis="sent"),  # nobody knows since when
+    ],
+)
+def test_an_older_claim_is_no_result_of_a_stop_that_did_not_reach_its_car(old: Any) -> None:
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
+    report.on_outcomes([], 12.0)
+    report.on_safety("red", old, 14.0)
+    assert states(report)["red"][0] == "failed"
+
+
+def test_only_events_of_its_own_command_count_also_late() -> None:
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
+    report.command_id = "this"
+    report.on_event("red", event("complete", id="other", basis="shown"), 10.5)
+    assert states(report)["red"][0] == "asked"
+    report.on_outcomes([], 12.0)
+    report.on_event("red", event("complete", id="other", basis="shown"), 12.5)
+    assert states(report)["red"][0] == "failed"
+    report.on_event("red", event("complete", id="this", basis="shown"), 13.0)
+    assert states(report)["red"][0] == "shown"
+
+
+@pytest.mark.parametrize(("lost_bus", "begins"), [(True, NOT_STOPPED), (False, "its gateway is not on the bus")])
+def test_a_stop_that_no_gateway_took_says_whether_the_bus_was_lost(lost_bus: bool, begins: str) -> None:
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
+    report.on_outcomes([], 12.0, lost_bus=lost_bus)
+    assert states(report)["red"][1].startswith(begins)
 
 
 def safety(motors: str, at_s: int, basis: str = "") -> Any:
