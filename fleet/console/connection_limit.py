@@ -1,13 +1,13 @@
 """How many connections from the network the console keeps. Pure: time is an argument (s, monotonic).
 
+`waiting_room` decides when a connection begins TLS, and is counted here.
+
 Strangers must not use up the file descriptors and the time of the process that stops the cars.
 """
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
-
-from schemas.token_bucket import TokenBucket
 
 MAX_CONNECTIONS: Final = 640
 """Maximum number of connections from the network: forty devices that take all they may."""
@@ -16,16 +16,6 @@ MAX_PER_DEVICE: Final = 16
 MAX_STRANGERS_PER_ADDRESS: Final = 24
 STRANGER_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that has shown no cookie of a paired device."""
-# A TLS handshake takes a millisecond or two of the loop that stops the cars.
-ADDRESS_BURST: Final = 300.0
-"""New connections of one address at once: a class behind one address opens forty pages, with seven connections each."""
-ADDRESS_RATE: Final = 10.0
-"""New connections per second of one address."""
-TOTAL_BURST: Final = 1000.0
-"""The same of all addresses. Three that flood leave some for the others."""
-TOTAL_RATE: Final = 50.0
-MAX_ADDRESSES: Final = 1024
-"""Maximum number of remembered addresses. More are forgotten, the oldest first."""
 
 
 @dataclass(slots=True)
@@ -41,18 +31,9 @@ class ConnectionLimit:
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
-    _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
-    _addresses: dict[str, TokenBucket] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
         """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
-        budget = self._addresses.pop(address, None) or TokenBucket(ADDRESS_RATE, ADDRESS_BURST)
-        self._addresses[address] = budget
-        if len(self._addresses) > MAX_ADDRESSES:
-            del self._addresses[next(iter(self._addresses))]
-        # One address in a flood uses up its own budget, not that of all.
-        if not budget.take_one(now) or not self._total.take_one(now):
-            return False, None
         strangers = [other for other, each in self._open.items() if not each.device]
         neighbors = [other for other in strangers if self._open[other].address == address]
         ended: Hashable | None = None

@@ -7,7 +7,7 @@ import asyncio
 import socket
 from typing import Final, cast
 
-from uvicorn._types import ASGIReceiveEvent
+from uvicorn._types import ASGIReceiveEvent, ASGISendEvent
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 
@@ -58,6 +58,21 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         """End all waits."""
         self._read_again()
         super().connection_lost(exc)
+
+    async def send(self, message: ASGISendEvent) -> None:
+        """Send. A connection that is closed ends for sure."""
+        await super().send(message)
+        # asyncio's TLS forgets a connection whose peer has gone while reading is paused: its place would stay taken.
+        if message["type"] == "websocket.close":
+            self._end_later()
+
+    def handle_close(self, event: Frame) -> None:
+        """Answer the closing of the page. The connection ends for sure."""
+        super().handle_close(event)
+        self._end_later()
+
+    def _end_later(self) -> None:
+        self.loop.call_later(2 * CLOSE_TIMEOUT_S, self.transport.abort)  # after the answer, and the end of TLS
 
     def _read_again(self) -> None:
         if self._full is not None:

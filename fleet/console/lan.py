@@ -37,6 +37,8 @@ REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
 TLS_BUFFER_BYTES: Final = 16 * 1024
 """Size of the buffer of a TLS connection, and of one read: a record. asyncio's own are 256 KiB, 160 MB for 640."""
+BACKLOG: Final = 1024
+"""Connections that the kernel keeps until they are accepted: those of half a second at the highest rate."""
 ADDRESS_INTERVAL_S: Final = 60.0
 """Interval at which this computer's addresses are read."""
 
@@ -44,43 +46,34 @@ log = logging.getLogger("fleet")
 
 
 class LimitedListener(socket.socket):
-    """A listening socket that refuses too many connections where they are accepted: before TLS and HTTP."""
+    """A listening socket, and its connections that have begun TLS. `entrance` accepts them."""
 
     limit: ConnectionLimit
     _accepted: dict[Hashable, socket.socket]
-    _takes_turns: bool
 
     @classmethod
     def on_port(cls, port: int) -> "LimitedListener":
         """Listen on all IPv4 addresses. Raises OSError if the port is in use."""
         made = cls(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # for TCP_NODELAY, as in `listen`
-        made.limit, made._accepted, made._takes_turns = ConnectionLimit(), {}, False
+        made.limit, made._accepted = ConnectionLimit(), {}
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             made.bind(("0.0.0.0", port))  # noqa: S104 - `--lan` asks for it
-            made.listen()
+            made.listen(BACKLOG)
         except OSError:
             made.close()
             raise
         return made
 
-    def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection. Raises ConnectionAbortedError for one too many, which asyncio expects."""
-        # asyncio accepts all that wait, and then begins TLS with all at once: some tenths of a second for a class.
-        # So every other call ends its turn. Between two handshakes, a STOP is carried out.
-        self._takes_turns = not self._takes_turns
-        if not self._takes_turns:
-            raise BlockingIOError
-        connection, address = super().accept()
+    def admit(self, connection: socket.socket, address: tuple[str, int]) -> bool:
+        """Keep a connection that begins TLS, perhaps in place of another one. Return False if it is one too many."""
         self._forget_closed()
         admitted, ended = self.limit.admit(address, address[0], time.monotonic())
         if ended is not None:
             self._end(ended)
-        if not admitted:
-            connection.close()
-            raise ConnectionAbortedError
-        self._accepted[address] = connection
-        return connection, address
+        if admitted:
+            self._accepted[address] = connection
+        return admitted
 
     def on_paired(self, key: Hashable, device: str) -> None:
         """Keep the connection of a paired device, or end it if the device has too many."""

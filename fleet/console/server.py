@@ -25,6 +25,7 @@ from fleet.aio import Fleet
 from fleet.client.commands import stop_request
 from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
+from fleet.console.entrance import Entrance
 from fleet.console.fair_socket import FairWebSocket
 from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
 from fleet.console.log_rate import LogRate
@@ -82,6 +83,35 @@ class ConsoleServer(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Leave the signals to `serve`."""
         yield
+
+
+class NetworkServer(ConsoleServer):
+    """The server for the network: its connections come from an entrance, which lets no flood in."""
+
+    def __init__(self, config: uvicorn.Config, lan: "Lan") -> None:
+        super().__init__(config)
+        self._lan = lan
+        self._entrance: Entrance | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:  # noqa: ARG002 - uvicorn's own
+        """Begin to accept. uvicorn itself would begin TLS with all that wait at once."""
+        await super().startup(sockets=[])
+
+        def make_protocol() -> asyncio.Protocol:
+            state = self.lifespan.state
+            protocol: asyncio.Protocol = self.config.http_protocol_class(  # type: ignore[call-arg]
+                config=self.config, server_state=self.server_state, app_state=state
+            )
+            return protocol
+
+        self._entrance = Entrance(self._lan.listener, self._lan.context, make_protocol)
+        self._entrance.open()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Accept nobody any more, and end what runs."""
+        if self._entrance is not None:
+            self._entrance.close()
+        await super().shutdown(sockets)
 
 
 def listen(port: int) -> socket.socket:
@@ -158,7 +188,7 @@ async def serve(
         config = _config(network_app(console, lan))
         config.load()
         config.ssl = lan.context
-        servers.append((ConsoleServer(config), lan.listener))
+        servers.append((NetworkServer(config, lan), lan.listener))
         running.append(asyncio.ensure_future(lan.run(lambda: console.people)))
 
     def end(_: object) -> None:

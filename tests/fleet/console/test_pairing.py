@@ -8,14 +8,10 @@ from hypothesis import strategies as st
 
 from fleet.console import pairing
 from fleet.console.connection_limit import (
-    ADDRESS_BURST,
-    ADDRESS_RATE,
-    MAX_ADDRESSES,
     MAX_CONNECTIONS,
     MAX_PER_DEVICE,
     MAX_STRANGERS_PER_ADDRESS,
     STRANGER_TIMEOUT_S,
-    TOTAL_BURST,
     ConnectionLimit,
     LogLimit,
 )
@@ -178,7 +174,7 @@ EVENTS = st.lists(
 
 @given(EVENTS)
 def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, float]]) -> None:
-    limit, now, opened, admitted = ConnectionLimit(), 0.0, 0, 0
+    limit, now, opened = ConnectionLimit(), 0.0, 0
     strangers: dict[int, float] = {}
     paired_ones: set[int] = set()
     for kind, number, pause in events:
@@ -191,7 +187,6 @@ def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, 
                 assert ended not in paired_ones
                 if isinstance(ended, int):
                     del strangers[ended]
-                admitted += stays
                 if stays:
                     strangers[key] = now
             case "pair" if strangers:
@@ -209,18 +204,6 @@ def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, 
                 strangers = {key: since for key, since in strangers.items() if key not in late}
         assert len(limit) == len(strangers) + len(paired_ones) <= MAX_CONNECTIONS
         assert len(strangers) <= 3 * MAX_STRANGERS_PER_ADDRESS
-    assert admitted <= 3 * (ADDRESS_BURST + now * ADDRESS_RATE) + 1e-6
-
-
-def test_a_flood_is_refused_and_costs_no_other_address_a_connection() -> None:
-    limit = ConnectionLimit()
-    assert sum(limit.admit(number, "10.0.0.9", 0.0)[0] for number in range(5000)) == ADDRESS_BURST
-    assert limit.admit("phone", "10.0.0.7", 0.0)[0]
-    assert limit.admit("later", "10.0.0.9", 1.0)[0]
-    many = sum(limit.admit(("more", number), f"10.1.{number}.1", 1.0)[0] for number in range(5000))
-    assert many <= TOTAL_BURST
-    assert len(limit) <= MAX_CONNECTIONS
-    assert len(limit._addresses) <= MAX_ADDRESSES
 
 
 def test_a_full_house_ends_the_oldest_stranger_never_a_paired_device() -> None:

@@ -43,6 +43,7 @@ from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.plot_buffer import MAX_SERIES
 from fleet.console.request_body import BODY_TIMEOUT_S
 from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
+from fleet.console.waiting_room import ADDRESS_BURST
 from schemas.bus import Sample, reply_message
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import person_of
@@ -896,6 +897,34 @@ def test_one_device_has_so_many_pages_and_others_still_come(stage: ServerStage) 
         assert close_code(one_more) == TRY_AGAIN_LATER
         other = pages.enter_context(calm.socket())
         assert json.loads(other.recv(30))["t"] == "hello"
+
+
+def test_a_stranger_who_floods_takes_no_stop_from_those_behind_the_same_address(stage: ServerStage) -> None:
+    """It asks again and again from several threads, beyond the burst of the address."""
+    address, over, refused = "127.0.0.50", threading.Event(), Counter[int]()
+    calm = stage.device("calm", source=address)
+
+    def flood() -> None:
+        stranger = NetworkDevice(stage.lan_port, source=address)
+        while not over.is_set():
+            refused[stranger.ask("GET", "/hello")[0]] += 1
+
+    flooders = [threading.Thread(target=flood) for _ in range(4)]
+    for each in flooders:
+        each.start()
+    try:
+        wait_for(lambda: refused[403] > ADDRESS_BURST, "it floods")
+        for _ in range(3):
+            stage.drive()
+            assert calm.ask("POST", "/stop")[0] == 204
+            wait_for(lambda: not stage.judge.driving, "red stands")
+            with calm.socket() as page:
+                assert json.loads(page.recv(30))["t"] == "hello"
+    finally:
+        over.set()
+        for each in flooders:
+            each.join()
+    assert set(refused) == {403}, "it is slowed down, never cut off"
 
 
 @pytest.mark.soak

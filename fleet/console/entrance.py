@@ -1,0 +1,150 @@
+"""Accepts the connections of the network and hands them to TLS at a bounded rate. `waiting_room` decides."""
+
+import asyncio
+import random
+import socket
+import ssl
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from fleet.console.waiting_room import WaitingRoom
+
+if TYPE_CHECKING:  # only `--lan` needs its packages
+    from fleet.console.lan import LimitedListener
+
+Address = tuple[str, int]
+ACCEPTS_AT_ONCE: Final = 20
+"""Connections that are accepted in one turn of the loop. Each takes some 0.05 ms."""
+ACCEPT_PAUSE_S: Final = 0.01
+"""Pause after a full turn: 2000 connections a second at most, which take a tenth of a core. The kernel keeps others."""
+SERVE_INTERVAL_S: Final = 0.02
+"""Interval at which a line that has used up its rate is looked at: less than that of one address."""
+EXPIRY_INTERVAL_S: Final = 0.25
+"""Interval at which silent connections are ended."""
+HANDSHAKE_TIMEOUT_S: Final = 3.0
+"""Timeout of a handshake: two round trips of a bad Wi-Fi (0.5 s), one of them sent again after a second."""
+# asyncio's own is 30 s. A page that was closed in a flood never ends TLS: its places, and its buffers, stay taken.
+SHUTDOWN_TIMEOUT_S: Final = 2.0
+"""Timeout for the client's end of TLS: as for the end of its WebSocket before (`fair_socket`)."""
+_READ_BYTES: Final = 4096
+_TLS_HELLO: Final = b"\x16"
+"""The first byte of a TLS client: a handshake record (RFC 8446, 5.1)."""
+
+
+class Entrance:
+    """Where connections from the network come in. All methods run on the loop."""
+
+    def __init__(
+        self, listener: "LimitedListener", context: ssl.SSLContext, make_protocol: Callable[[], asyncio.Protocol]
+    ) -> None:
+        self._listener = listener
+        self._context = context
+        self._make_protocol = make_protocol
+        self._loop = asyncio.get_running_loop()
+        self._room = WaitingRoom(random.choice)
+        self._waiting: dict[Address, socket.socket] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._timers: dict[Callable[[], None], asyncio.TimerHandle] = {}
+
+    def open(self) -> None:
+        """Begin to accept."""
+        self._listener.settimeout(0.0)
+        self._loop.add_reader(self._listener.fileno(), self._accept)
+        self._expire()
+
+    def close(self) -> None:
+        """Accept nobody any more, and close what waits. Close the listener afterwards."""
+        for timer in self._timers.values():
+            timer.cancel()
+        self._loop.remove_reader(self._listener.fileno())
+        for task in self._tasks:
+            task.cancel()
+        for key in list(self._waiting):
+            self._drop(key)
+
+    def _after(self, delay_s: float, call: Callable[[], None]) -> None:
+        """Call once after a delay. A call that waits already stands for it."""
+        if call not in self._timers:
+
+            def run() -> None:
+                del self._timers[call]
+                call()
+
+            self._timers[call] = self._loop.call_later(delay_s, run)
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTS_AT_ONCE):
+            try:
+                connection, address = self._listener.accept()
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError:  # too many open files: some end in a moment
+                break
+            connection.settimeout(0.0)
+            self._waiting[address] = connection
+            self._loop.add_reader(connection.fileno(), self._on_readable, address)
+            dropped = self._room.add(address, address[0], time.monotonic())
+            if isinstance(dropped, tuple):
+                self._drop(dropped)
+        self._loop.remove_reader(self._listener.fileno())
+        self._after(ACCEPT_PAUSE_S, self._accept_again)
+
+    def _accept_again(self) -> None:
+        self._loop.add_reader(self._listener.fileno(), self._accept)
+
+    def _on_readable(self, key: Address) -> None:
+        connection = self._waiting[key]
+        try:
+            start = connection.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return
+        except OSError:
+            start = b""
+        if start != _TLS_HELLO:  # it has gone, or speaks no TLS
+            if start:
+                connection.recv(_READ_BYTES)  # to close what is unread would reset the connection
+            self._drop(key)
+            return
+        self._loop.remove_reader(connection.fileno())
+        self._room.on_hello(key, key[0])
+        self._after(0.0, self._serve_next)
+
+    def _serve_next(self) -> None:
+        """Begin one handshake. The next one begins in another turn: between two, a STOP is carried out."""
+        key = self._room.take(time.monotonic())
+        if isinstance(key, tuple):
+            task = asyncio.ensure_future(self._begin(self._waiting.pop(key), key))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        if self._room.has_ready:
+            self._after(SERVE_INTERVAL_S if key is None else 0.0, self._serve_next)
+
+    async def _begin(self, connection: socket.socket, key: Address) -> None:
+        try:
+            if not self._listener.admit(connection, key):
+                connection.close()
+                return
+            await self._loop.connect_accepted_socket(
+                self._make_protocol,
+                connection,
+                ssl=self._context,
+                ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
+                ssl_shutdown_timeout=SHUTDOWN_TIMEOUT_S,
+            )
+        except OSError:  # also of TLS, and its timeout: whoever it was has gone
+            connection.close()
+        finally:
+            self._room.on_begun(key[0])
+
+    def _drop(self, key: Address) -> None:
+        connection = self._waiting.pop(key)
+        self._loop.remove_reader(connection.fileno())
+        connection.close()
+        self._room.remove(key, key[0])
+
+    def _expire(self) -> None:
+        for key in self._room.expire(time.monotonic()):
+            if isinstance(key, tuple):
+                self._drop(key)
+        self._after(EXPIRY_INTERVAL_S, self._expire)

@@ -1,0 +1,132 @@
+"""The connections from the network that were accepted and wait for TLS. Pure: time is an argument (s, monotonic).
+
+A TLS handshake takes some milliseconds of the loop that stops the cars, so an address may begin only so many. But a
+class has one address behind its access point, and one client that floods must not lock the others there out. So what
+is over the rate is not closed: it waits in the line of its address. Whoever has sent nothing costs nothing but a place
+and loses it first, the oldest before the others: an honest client sends its TLS hello at once. Those with a hello are
+served in their order, so that a client which connects again and again waits behind everybody else each time.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from schemas.token_bucket import TokenBucket
+
+ADDRESS_BURST: Final = 300.0
+"""Handshakes of one address at once: a class behind one address opens forty pages, with seven connections each."""
+ADDRESS_RATE: Final = 20.0
+"""Handshakes per second of one address. With a request each, they take some 8 % of a core."""
+TOTAL_BURST: Final = 1000.0
+"""The same of all addresses. Three that flood leave some for the others."""
+TOTAL_RATE: Final = 100.0
+MAX_HANDSHAKES_PER_ADDRESS: Final = 16
+"""Handshakes of one address that are under way: less than the strangers that an address may have."""
+MAX_WAITING_PER_ADDRESS: Final = 160
+"""Most connections in one line. A flood of 1000 a second without a hello leaves 0.16 s for that of an honest client."""
+MAX_WAITING: Final = 224
+"""Most connections in all lines: with those that are open, fewer than the 1024 files of a process."""
+HELLO_TIMEOUT_S: Final = 10.0
+"""Timeout of a connection that sends nothing: that of a stranger (`connection_limit`)."""
+MAX_ADDRESSES: Final = 1024
+"""Maximum number of remembered addresses without a connection. For more, an idle one is forgotten."""
+
+
+@dataclass(slots=True)
+class _AddressLine:
+    """The connections of one address."""
+
+    budget: TokenBucket = field(default_factory=lambda: TokenBucket(ADDRESS_RATE, ADDRESS_BURST))
+    silent: dict[Hashable, float] = field(default_factory=dict)
+    """When each connection without a hello came, the oldest first."""
+    ready: dict[Hashable, None] = field(default_factory=dict)
+    """The connections with a hello, the oldest first."""
+    begun: int = 0
+    """Number of handshakes under way."""
+
+    def __len__(self) -> int:
+        return len(self.silent) + len(self.ready)
+
+
+@dataclass(slots=True)
+class WaitingRoom:
+    """The lines by address. choose: returns a random one of some connections."""
+
+    choose: Callable[[Sequence[Hashable]], Hashable]
+    _lines: dict[str, _AddressLine] = field(default_factory=dict)
+    _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
+
+    def add(self, key: Hashable, address: str, now: float) -> Hashable | None:
+        """Add a connection. Return the key of one that loses its place, perhaps this one."""
+        line = self._lines.setdefault(address, _AddressLine())
+        line.silent[key] = now
+        self._forget_idle()
+        if len(line) > MAX_WAITING_PER_ADDRESS:
+            return self._drop_one(line)
+        if len(self) > MAX_WAITING:
+            return self._drop_one(max(self._lines.values(), key=len))
+        return None
+
+    def on_hello(self, key: Hashable, address: str) -> None:
+        """Note that a connection has sent its TLS hello."""
+        line = self._lines.get(address)
+        if line is not None and line.silent.pop(key, None) is not None:
+            line.ready[key] = None
+
+    def remove(self, key: Hashable, address: str) -> None:
+        """Forget a connection that has gone."""
+        if (line := self._lines.get(address)) is not None:
+            line.silent.pop(key, None)
+            line.ready.pop(key, None)
+
+    def take(self, now: float) -> Hashable | None:
+        """Return the connection whose handshake begins now. None: nobody may begin. The addresses take turns."""
+        if not self._total.has(now):
+            return None
+        for address, line in self._lines.items():
+            if line.ready and line.begun < MAX_HANDSHAKES_PER_ADDRESS and line.budget.take_one(now):
+                self._total.take_one(now)
+                key = next(iter(line.ready))
+                del line.ready[key]
+                line.begun += 1
+                self._lines[address] = self._lines.pop(address)  # the last one of the next round
+                return key
+        return None
+
+    def on_begun(self, address: str) -> None:
+        """Note the end of a handshake, good or bad."""
+        self._lines[address].begun -= 1
+
+    def expire(self, now: float) -> list[Hashable]:
+        """Remove the connections that have sent nothing for too long. Return their keys."""
+        late = []
+        for line in self._lines.values():
+            old = [key for key, since in line.silent.items() if now - since >= HELLO_TIMEOUT_S]
+            for key in old:
+                del line.silent[key]
+            late += old
+        return late
+
+    @property
+    def has_ready(self) -> bool:
+        """True if a connection with a hello waits."""
+        return any(line.ready for line in self._lines.values())
+
+    def __len__(self) -> int:
+        return sum(len(line) for line in self._lines.values())
+
+    def _drop_one(self, line: _AddressLine) -> Hashable:
+        """Take a place away: that of the oldest without a hello, else that of any."""
+        if line.silent:
+            key = next(iter(line.silent))
+            del line.silent[key]
+        else:
+            key = self.choose(list(line.ready))
+            del line.ready[key]
+        return key
+
+    def _forget_idle(self) -> None:
+        if len(self._lines) > MAX_ADDRESSES:
+            idle = next((address for address, line in self._lines.items() if len(line) + line.begun == 0), None)
+            if idle is not None:
+                del self._lines[idle]
