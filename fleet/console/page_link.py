@@ -62,13 +62,16 @@ class PageLink:
 
     async def run(self) -> None:
         """Send until the page has gone. Raises TimeoutError if it does not read."""
+        greeted = False
         while True:
             await self._not_empty.wait()
             self._not_empty.clear()
             while self._newest or self._answers:
-                # The tick first: its echo keeps a car driving.
+                # The tick first: its echo keeps a car driving. Only the greeting, the first answer, precedes it.
                 kind = "tick" if "tick" in self._newest else next(iter(self._newest), "")
-                text = self._answers.popleft() if self._answers and kind != "tick" else self._newest.pop(kind)
+                answers = bool(self._answers) and (kind != "tick" or not greeted)
+                text = self._answers.popleft() if answers else self._newest.pop(kind)
+                greeted = greeted or answers
                 # Python 3.11's wait_for forgets a cancellation that comes as the message is sent.
                 async with asyncio.timeout(SEND_TIMEOUT_S):
                     await self._send(text)
