@@ -59,7 +59,20 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 GUESTS = (
     *("calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
-    *("giver", "presser", "plotter", "pinger", "lister", "twotab", "tworeq", "viewer"),
+    *(
+        "giver",
+        "giver_take",
+        "giver_give_back",
+        "giver_unpause",
+        "giver_do",
+        "presser",
+        "plotter",
+        "pinger",
+        "lister",
+        "twotab",
+        "tworeq",
+        "viewer",
+    ),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
