@@ -59,20 +59,8 @@ PEOPLE = ("teacher:lead", "mia", "thief")
 GUESTS = (
     *("calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
-    *(
-        "giver",
-        "giver_take",
-        "giver_give_back",
-        "giver_unpause",
-        "giver_do",
-        "presser",
-        "plotter",
-        "pinger",
-        "lister",
-        "twotab",
-        "tworeq",
-        "viewer",
-    ),
+    *("giver", *(f"giver_{kind}" for kind in ("take", "give_back", "unpause", "do"))),
+    *("presser", "plotter", "pinger", "lister", "twotab", "tworeq", "viewer"),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
@@ -663,7 +651,7 @@ def test_commands_in_a_flood_reach_gateways_at_a_devices_rate(stage: ServerStage
         threads = server.num_threads()
     subscribed.undeclare()
     assert answers["done"] <= allowed_commands(since)
-    assert begun.count(giver) <= 1.2 * allowed_commands(since), "a third of what was sent; a busy machine adds a few"
+    assert begun.count(giver) <= allowed_commands(since)
     assert threads < 150
 
 
