@@ -84,3 +84,5 @@ _ROWS: Final = (
 
 COMMANDS: Final[Mapping[str, CommandType]] = MappingProxyType({row.verb: row for row in _ROWS})
 STOPS: Final = tuple(row.verb for row in _ROWS if row.stops)
+STOPPING_VERBS: Final = frozenset({*STOPS, Verb.PAUSE})
+"""Verbs that stop a car, for now or until somebody ends it."""

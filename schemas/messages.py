@@ -66,6 +66,12 @@ def log_message(at_ns: int, level: Level, name: str, words: str) -> Message:
     return message  # type: ignore[no-any-return]  # the class has no types
 
 
+def level_of(message: Any) -> Level:
+    """Return the level of a foxglove.Log: DEBUG for one below, ERROR for one above those that we write."""
+    below = [level for level, number in _FOXGLOVE_LEVELS.items() if number <= message.level]
+    return below[-1] if below else Level.DEBUG
+
+
 def stamp_ns(stamp: Any) -> int:
     """Return a Timestamp as ns since the epoch."""
     return int(stamp.seconds * 1_000_000_000 + stamp.nanos)

@@ -12,8 +12,7 @@ from fleet.client.commands import STOP_TTL_S, CommandRequest
 from fleet.client.outcome import GATEWAY_RETURN_TIMEOUT_S, Outcome, Progress
 from schemas import keys, messages, topics
 from schemas.bus import Sample
-from schemas.commands import STOPS
-from schemas.words import Verb
+from schemas.commands import STOPPING_VERBS
 
 ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
@@ -81,7 +80,7 @@ class PendingCommand:
         self.id = command_id
         self.request = request
         self.queries: list[Future[None]] = []
-        self.is_stop = request.verb in STOPS or request.verb == Verb.PAUSE
+        self.is_stop = request.verb in STOPPING_VERBS
         self._send_again = send_again
         self._present = set(present)
         self._named = named

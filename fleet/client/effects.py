@@ -3,7 +3,7 @@
 from typing import Final
 
 from fleet.client.claims import NOT_CONFIRMED, STOP_SENT, STOPPED
-from schemas.commands import COMMANDS, STOPS
+from schemas.commands import COMMANDS, STOPPING_VERBS
 from schemas.words import Basis, Phase, Reason, Verb
 
 _ANY: Final = "*"
@@ -61,7 +61,7 @@ _STOP_FAILURES: Final = {
     Phase.FAILED: "{words}",
 }
 """The gateway's words of a stop that failed begin with the fact for the car."""
-STOP_VERBS: Final = frozenset({*STOPS, Verb.PAUSE, RELEASE, ESTOP_FLEET})
+STOP_VERBS: Final = STOPPING_VERBS | {RELEASE, ESTOP_FLEET}
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:

@@ -16,7 +16,6 @@ NO_RESULT: Final = "no_result"
 """The code of a command whose last event is missing."""
 _STAYS: Final = (Reason.ESTOPPED, Reason.HELD)
 """Reasons of a resume after which the car is still stopped."""
-"""First words of the gateway about a drive that went as requested; its time follows."""
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 OUTCOME_MARGIN_S: Final = 5.0

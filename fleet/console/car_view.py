@@ -91,8 +91,8 @@ class CarView:
                 self._events.append((now, value))
             case "event/log":
                 words = value.message.removeprefix(f"{self.name} ")
-                level = Level.ERROR if value.level >= 4 else Level.WARNING if value.level == 3 else Level.INFO
-                self._note(value.timestamp, words, level)
+                level = messages.level_of(value)
+                self._note(value.timestamp, words, Level.INFO if level is Level.DEBUG else level)
             case _:
                 if not self._counts(topic, value):
                     return
@@ -345,5 +345,5 @@ class FleetView:
 
     @property
     def authority(self) -> dict[str, Authority]:
-        """What decides about the rights of each person, by car."""
+        """The authority of each car, by name."""
         return {name: self._cars[name].authority for name in self.names}

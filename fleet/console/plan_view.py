@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from schemas import keys
+from schemas import keys, messages
+from schemas.words import Level
 
 
 class PlanView:
@@ -30,7 +31,8 @@ class PlanView:
                 self._decisions[value.subject] = value
             case _:  # the log
                 at_ms = value.timestamp.seconds * 1000
-                self._log = [{"at_ms": at_ms, "words": value.message, "bad": value.level >= 3}, *self._log[:9]]
+                is_bad = messages.level_of(value) in (Level.WARNING, Level.ERROR)
+                self._log = [{"at_ms": at_ms, "words": value.message, "bad": is_bad}, *self._log[:9]]
         self.changed = True
 
     def on_presence(self, *, running: bool) -> None:

@@ -11,13 +11,12 @@ from typing import Any, Final, Self
 from fleet.client import commands
 from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
 from schemas import keys
-from schemas.commands import STOPS
+from schemas.commands import STOPPING_VERBS, STOPS
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep, Verb
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""
-_STOP_KINDS: Final = (*STOPS, Verb.PAUSE)
 _MAX_NUMBER: Final = 2**53
 MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
 
@@ -169,7 +168,7 @@ def is_stop(text: str) -> bool:
     """Return True if a page's message stops cars, all or some."""
     try:
         message = PageMessage.of(text)
-        return message.kind in _STOP_KINDS or (message.kind == "do" and message.fields.get("verb") in STOPS)
+        return message.kind in STOPPING_VERBS or (message.kind == "do" and message.fields.get("verb") in STOPS)
     except BadPageMessage:
         return False
 

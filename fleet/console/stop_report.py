@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
 from schemas import messages
-from schemas.commands import STOPS
-from schemas.words import Basis, Motors, Phase, Verb
+from schemas.commands import STOPPING_VERBS
+from schemas.words import Basis, Motors, Phase
 
 MOVED: Final = "moved"
 """State of a car that was stopped, and moves again."""
@@ -44,7 +44,7 @@ class StopReport:
 
     def on_event(self, car: str, event: Any, now: float) -> None:
         """Handle a command event. Those of other commands say nothing about this STOP."""
-        if event.verb not in (*STOPS, Verb.PAUSE) or event.id != self.command_id or car in self._closed:
+        if event.verb not in STOPPING_VERBS or event.id != self.command_id or car in self._closed:
             return
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))

@@ -11,13 +11,13 @@ from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.tools.stop_findings import (
     NOT_SHOWN_CODE,
     NOT_STOPPED_CODE,
-    STOP_VERBS,
     WATCHED_TOPICS,
     StopFindings,
     log_code,
 )
 from fleet.recording.tools.verify import SessionVerdict
 from schemas import keys
+from schemas.commands import STOPPING_VERBS
 from schemas.local_time import clock
 from schemas.words import Basis, Phase
 
@@ -61,7 +61,7 @@ class SessionCheckup:
         if topic == "event/log":
             self.broken[car] += log_code(message) == "link_lost"
         elif topic == "event/command":
-            is_stop = message.verb in STOP_VERBS
+            is_stop = message.verb in STOPPING_VERBS
             if is_stop and (message.basis or message.phase == Phase.FAILED):
                 self.stops[message.basis or Phase.FAILED] += 1
             if message.phase in _REFUSED_PHASES and not is_stop:

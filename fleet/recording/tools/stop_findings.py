@@ -11,18 +11,16 @@ from typing import Any, Final
 
 from fleet.client.claims import claims_of
 from schemas import messages
-from schemas.commands import STOPS
+from schemas.commands import STOPPING_VERBS
 from schemas.keys import name_of
 from schemas.local_time import clock
-from schemas.words import UNKNOWN, LinkState, Phase, Reason, Shows, Verb
+from schemas.words import UNKNOWN, LinkState, Phase, Reason, Shows
 
 NOT_STOPPED_CODE: Final = "not_stopped"
 NOT_SHOWN_CODE: Final = str(Reason.NOT_SHOWN)
 WATCHED_TOPICS: Final = ("event/command", "event/log", "state/link", "state/health")
 _SAME_STOP_NS: Final = 3_000_000_000
 """Maximum time between the records of one stop."""
-STOP_VERBS: Final = frozenset({*STOPS, Verb.PAUSE})
-"""Verbs of commands that stop a car."""
 _FAILED: Final = frozenset({Phase.FAILED, Phase.REJECTED, Phase.EXPIRED})
 _OPEN: Final = frozenset({LinkState.ONLINE, LinkState.QUIET})
 
@@ -77,7 +75,7 @@ class StopFindings:
             code = log_code(message)
             if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
                 self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
-        elif message.verb in STOP_VERBS and message.phase in _FAILED:
+        elif message.verb in STOPPING_VERBS and message.phase in _FAILED:
             code = NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
             asked = f"{message.verb} by {name_of(message.sender) or 'somebody'}"
             self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)
