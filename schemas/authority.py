@@ -237,7 +237,7 @@ Mark = Hold | Estop | FleetPause | Loan | LeaseState
 
 
 class Right(StrEnum):
-    """What somebody may do with a car."""
+    """A right of a sender on a car."""
 
     MOVE = "move"
     """Drive it, change its mode or speed, move its servos or arm, switch its fan."""
@@ -256,7 +256,7 @@ class Right(StrEnum):
 
 
 class Bar(StrEnum):
-    """What keeps somebody from it."""
+    """The rule by which a right is denied."""
 
     NOT_A_LEAD = "not_a_lead"
     NOT_A_PERSON = "not_a_person"
@@ -305,7 +305,7 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """What decides who may do what with one car now. e-stops and pauses: oldest first."""
+    """The rules and facts that decide about rights on one car now. e-stops and pauses: oldest first."""
 
     people: People = NO_PEOPLE
     estops: tuple[Estop, ...] = ()
@@ -316,7 +316,7 @@ class Authority:
 
     @classmethod
     def of(cls, safety: Any) -> Self:
-        """Return what a fleet.v1.Safety says."""
+        """Return the authority of a car by its fleet.v1.Safety."""
         hold, loan, lease = safety.hold, safety.loan, safety.lease
         return cls(
             People.of(safety.people if safety.HasField("people") else None),

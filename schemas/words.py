@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Final
 
 UNKNOWN: Final = "unknown"
-"""What a field of a message holds in place of a word that is not known: of a mode or a motion, say."""
+"""The text in place of a word that is not known, such as a mode or a motion."""
 
 
 class Platform(StrEnum):
@@ -73,7 +73,7 @@ class Servo(StrEnum):
 
     @property
     def moves(self) -> tuple[str, ...]:
-        """What a command may say beside this servo: `left` for `ServoAction.FRONT_LEFT`."""
+        """The words of a command beside this servo: `left` for `ServoAction.FRONT_LEFT`."""
         return tuple(each.removeprefix(f"{self}_") for each in ServoAction if each.startswith(f"{self}_"))
 
 
@@ -134,7 +134,7 @@ class Rank(StrEnum):
 
 
 class Scope(StrEnum):
-    """What an e-stop stops: one car, or every car of the fleet."""
+    """The reach of an e-stop: one car, or every car of the fleet."""
 
     CAR = "car"
     FLEET = "fleet"
@@ -203,7 +203,7 @@ class Verdict(StrEnum):
 
 
 class MotionSource(StrEnum):
-    """What the current motion of a car is known from."""
+    """The source of the current motion of a car."""
 
     COMMANDED = "commanded"
     ASSUMED = "assumed"
@@ -291,7 +291,7 @@ class Blocking(StrEnum):
 
 
 class FrameVerdict(StrEnum):
-    """What a received frame was. Bytes that are no frame have a `Cause` instead."""
+    """The kind of a received frame. Bytes that are no frame have a `Cause` instead."""
 
     SENSORS = "sensors"
     ARM = "arm"

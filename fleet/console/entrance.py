@@ -33,7 +33,7 @@ _TLS_HELLO: Final = b"\x16"
 
 
 class Entrance:
-    """Where connections from the network come in. All methods run on the loop."""
+    """Accepts connections from the network, and begins TLS in turn. All methods run on the loop."""
 
     def __init__(
         self, listener: "LimitedListener", context: ssl.SSLContext, make_protocol: Callable[[], asyncio.Protocol]

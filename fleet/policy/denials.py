@@ -1,4 +1,4 @@
-"""What keeps a person from a car or from the fleet, in a few words for a page or an answer. Pure.
+"""Describes a denial of a right in a few words, for a page or an answer. Pure.
 
 The gateway's own words are longer: they say what to type.
 """

@@ -74,7 +74,7 @@ class Needs:
     """The conditions for a command."""
 
     right: Right | None = Right.ACT
-    """What the sender must be allowed to do; None: everybody may."""
+    """The right that the sender needs; None: everybody may."""
     battery: bool = False
     link: bool = True
     manual: bool = False
@@ -260,6 +260,15 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
 # ---------------------------------------------------------------------- words
 
 
+_DEEDS: Final = {
+    Right.PAUSE: "pause the fleet",
+    Right.UNPAUSE: "end the pause",
+    Right.LEND: "lend {car}",
+    Right.END_LOAN: "end the loan of {car}",
+}
+"""The rights that concern the whole fleet, in words."""
+
+
 def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Right | None = None) -> Refusal:
     """Return the refusal for a person at a terminal: what keeps the sender from it, and what to do."""
     return denial.reason, _words(denial, sender, context, right)
@@ -267,12 +276,7 @@ def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Rig
 
 def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right | None) -> str:
     car, person, people = context.car, sender.person, context.authority.people
-    deed = {
-        Right.PAUSE: "pause the fleet",
-        Right.UNPAUSE: "end the pause",
-        Right.LEND: f"lend {car}",
-        Right.END_LOAN: f"end the loan of {car}",
-    }.get(right or Right.MOVE, "")
+    deed = "" if right is None else _DEEDS.get(right, "").format(car=car)
     mark = denial.mark
     why = f': "{mark.why}"' if isinstance(mark, Estop | FleetPause) and mark.why else ""
     by = mark.by if mark is not None else ""

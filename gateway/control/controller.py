@@ -650,7 +650,7 @@ class Controller:
             self.safety.hold = None
 
     def authority_at(self, now: float) -> Authority:
-        """Return what decides who may do what with the car."""
+        """Return the authority of the car now."""
         safety = self.safety
         return Authority(
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)

@@ -363,18 +363,17 @@ class Recorder:
         with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report it
             self._publisher.put(self._last, self._now())
 
+    @property
+    def _state(self) -> RecorderState:
+        if not self._recording:
+            return RecorderState.STOPPED
+        return RecorderState.FULL if self._session.full else RecorderState.RECORDING
+
     def _status(self, state: str = "") -> fleet_v1_pb2.Recording:
         session = self._session
         return fleet_v1_pb2.Recording(
             session=str(session.path),
-            state=state
-            or (
-                RecorderState.STOPPED
-                if not self._recording
-                else RecorderState.FULL
-                if session.full
-                else RecorderState.RECORDING
-            ),
+            state=state or self._state,
             bytes=session.bytes,
             messages=session.messages,
             drops=dict(session.drops),

@@ -547,11 +547,7 @@ class StopEvidence:
             return Finding.NOTHING
         self._pending = None
         first_delay_s, self._delay_s = self._delay_s, None
-        agrees = first_delay_s is not None and self.learned.add_delay(
-            Blocking.MODE_CLOSE, first_delay_s, self.profile.reopened_s, controlled=self._controlled
-        )
-        self._delayed += first_delay_s is not None
-        if first_delay_s is not None and agrees and self._delayed >= PAUSES:
+        if first_delay_s is not None and self._agrees(first_delay_s):
             self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
             return self._pause(at, first_delay_s)
         # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
@@ -572,6 +568,16 @@ class StopEvidence:
             self.found_out = self.learned.on_no_reaction() or self.found_out
         return Finding.LOST
 
+    def _agrees(self, delay_s: float) -> bool:
+        """Count a delay other than the expected block. Return True if the last ones agree, with enough of this stop."""
+        self._delayed += 1
+        return self._add_close(delay_s) and self._delayed >= PAUSES
+
+    def _add_close(self, delay_s: float) -> bool:
+        """Learn from the delay after a `MODE00`. Return True if the last delays agree."""
+        kind, longest_s = Blocking.MODE_CLOSE, self.profile.reopened_s
+        return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
+
     def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
         """Count a pause. `learn`: it is not as long as expected, and may be the block of this car."""
         self._pauses += 1
@@ -580,7 +586,7 @@ class StopEvidence:
         self._misfits = 0
         self.learned.on_reaction(sure=self._controlled or not self.learned.is_confusable(delay_s))
         if learn:
-            self.learned.add_delay(Blocking.MODE_CLOSE, delay_s, self.profile.reopened_s, controlled=self._controlled)
+            self._add_close(delay_s)
         if not self._controlled and self.learned.is_confusable(delay_s):
             return Finding.CONTROL
         if self._pauses < self._pauses_needed or self._unjudged:
