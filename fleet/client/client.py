@@ -39,6 +39,7 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.condition import KeyCondition, check_car, check_key
+from fleet.client.job_threads import JobThreads
 from fleet.client.lease import Lease
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.reading import Reading, Watch, reading_of
@@ -107,7 +108,7 @@ class Fleet:
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         # The query of a gateway that hangs occupies its thread for 10 s. A stop never waits for such a thread.
-        self._stop_pool = ThreadPoolExecutor(max_workers=_MAX_STOP_THREADS, thread_name_prefix="fleet-stop")
+        self._stop_pool = JobThreads(_MAX_STOP_THREADS, "fleet-stop")
         self.dropped = 0
         """Number of dropped command events: the queue of their command was full."""
         try:
@@ -131,10 +132,11 @@ class Fleet:
             watch.close()
         for command in list(self._pending.values()):
             command.inbox.put((time.monotonic(), CLOSED))
-        for pool in (self._pool, self._stop_pool):
+        pools = self._pool, self._stop_pool
+        for pool in pools:
             pool.shutdown(wait=False, cancel_futures=True)
         self.bus.close()  # ends every pending query
-        for pool in (self._pool, self._stop_pool):
+        for pool in pools:
             pool.shutdown()
 
     def _check_open(self) -> None:
