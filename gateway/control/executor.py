@@ -19,7 +19,7 @@ from gateway.control.stop_executor import StopExecutor
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
 from gateway.control.stops.stopping import StopInProgress
-from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
+from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen
 from gateway.protocol.platforms import StopStyle
 from schemas.words import Basis, FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
@@ -112,7 +112,9 @@ class Executor:
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
         if not self.stops.is_step_due(running, now):
             return None
-        return self._write(running.frame, running.why, running, running.commands[0] if running.commands else None)
+        # A color that clears a string is the last one, also if somebody has set another one during this stop.
+        frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
+        return self._write(frame, running.why, running, running.commands[0] if running.commands else None)
 
     def _next_command(self, now: float) -> OutgoingFrame | None:
         model, queue = self.model, self.queue

@@ -385,6 +385,10 @@ class StopExecutor:
         doubted = running.case is StopCase.WRONG_PLATFORM
         if not doubted and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
             self._try_again(running, now)
+            if running.sequence.is_recovery:
+                # The reports of a car that blocks may come by a timer. Then the block of the last frame may run still,
+                # and a `#` that arrives before its end is read as one string with the `MODE00` after it.
+                running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(
         self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL

@@ -276,7 +276,7 @@ class Wild:
         known = control.model.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
-            stopping = isinstance(frame, General) and frame == General(Motion.STOP)
+            stopping = isinstance(frame, Reset) or frame == General(Motion.STOP)
             assert self.now >= self.free_at - 1e-9 or stopping, "not into a block of ours"
         self._check_motion(write)
         self._check_once(frame, write.why)

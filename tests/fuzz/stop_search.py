@@ -19,6 +19,7 @@ from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneS
 from gateway.control.controller import Controller
 from gateway.control.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.control.events import CommandRecord
+from gateway.control.stops.stopping import evidence_s
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.frames import ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
@@ -787,10 +788,12 @@ class Episode:
     def _ends_s(self) -> float:
         """Return the maximum time from the request of a stop to its end.
 
-        The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block.
+        The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block. On a link that loses
+        reports it learns a slower rhythm than the car has.
         """
-        traits = self.plan.traits
-        return 5.5 + max(12.0, 4 * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1))
+        traits, model = self.plan.traits, self.control.model
+        true_s = 4 * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1)
+        return 5.5 + max(true_s, evidence_s(model.profile, model.learned))
 
     @property
     def _shows(self) -> bool:

@@ -47,8 +47,9 @@ UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
 REACTED: Final = 3
 """Number of consecutive reactions that end that finding."""
-MAX_KEPT_S: Final = 10.0
-"""Maximum interval or block in a state file: three times those of the slowest car."""
+MAX_LEARNED_S: Final = 10.0
+"""Maximum interval or block: three times those of the slowest car. A longer gap is the link's or the loop's. As the
+first interval it would be the rhythm, and each stop would wait that long for a report before it is sent again."""
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:
@@ -162,6 +163,8 @@ class Learned:
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
         """Add an undisturbed interval. Return True if it completes another rhythm: what the car has shown is over."""
+        if interval_s > MAX_LEARNED_S:
+            return False
         was_known = self.shows is not Shows.UNKNOWN or self.echo.is_firm
         changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
         if changed:
@@ -284,10 +287,10 @@ class Learned:
         )
         for rhythm, name in ((learned.echo, "echo_s"), (learned.no_echo, "no_echo_s")):
             intervals = [float(each) for each in kept[name]]
-            if not all(0.0 < each <= MAX_KEPT_S for each in intervals):  # also refuses NaN
+            if not all(0.0 < each <= MAX_LEARNED_S for each in intervals):  # also refuses NaN
                 raise ValueError(f"{name}: {intervals}")
             rhythm.intervals.extend(intervals)
         learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
-        if not all(0.0 < each <= MAX_KEPT_S for each in learned._blocks.values()):
+        if not all(0.0 < each <= MAX_LEARNED_S for each in learned._blocks.values()):
             raise ValueError(f"blocks_s: {learned._blocks}")
         return learned

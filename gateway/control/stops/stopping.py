@@ -232,6 +232,8 @@ class StopInProgress:
     def on_other_written(self, now: float) -> None:
         """Move the rest of the stop: its frames keep their distance from the command that went before them."""
         self.last_at = now
+        if self.index == 0 and self.tries > 1:  # a try that waits for a block to end
+            self.try_at = max(self.try_at, now + FLIGHT_S)
 
     def begin_try(self, sequence: StopSequence, now: float) -> None:
         """Begin the next try."""

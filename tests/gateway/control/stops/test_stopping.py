@@ -10,11 +10,12 @@ from itertools import product
 
 import pytest
 
-from gateway.control.commands import Drive, SetMode, Stop
+from gateway.control.commands import Drive, OneShot, SetMode, Stop
 from gateway.control.estimate.learned import Learned
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import EVIDENCE, StopCase
+from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
@@ -102,6 +103,21 @@ def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
     pair.run(20.0)
     assert pair.control.model.motors == "off"
     assert pair.off_for_good_at() < pair.now
+
+
+def test_a_recovery_keeps_the_color_that_is_set_during_it() -> None:
+    pair = Pair(start_s=2.0).ready()
+    pair.cut = 9
+    pair.ask(Drive(Motion.FORWARD, 5.0))
+    pair.connect()
+    pair.deaf_until = pair.now + 20.0
+    pair.run(12.0)  # in the second try, which began with the color from before
+    count = len(pair.sent)
+    pair.ask(OneShot(ColorLed(255, 0, 7)))
+    pair.run(6.0)
+    colors = [data for _, data in pair.sent[count:] if b"CLR" in data]
+    assert set(colors) == {b"$4WD,CLR255,CLG0,CLB7#"}
+    assert len(colors) == 2, "the command, and the recovery"
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
