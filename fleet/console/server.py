@@ -1,6 +1,7 @@
 """Serves the console: the page's files, STOP by fetch, and one WebSocket for each page."""
 
 import asyncio
+import gc
 import logging
 import secrets
 import socket
@@ -200,6 +201,9 @@ async def serve(
         each.add_done_callback(end)
     try:
         on_ready()
+        # Imported objects stay alive. Without them a collection of what connections leave is short (see `entrance`).
+        gc.collect()
+        gc.freeze()
         await asyncio.gather(*(server.serve(sockets=[listens]) for server, listens in servers))
     finally:
         await console.close()
