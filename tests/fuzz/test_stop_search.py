@@ -83,6 +83,16 @@ FOUND = (
         ),
         traits=CarTraits(interval_s=2.125256673661981, close_s=1.3),
     ),
+    # A held report, and a `MODE00` that lost a digit and so blocked longer, made two pauses. Few intervals were known.
+    EpisodePlan(
+        548956, "arduino", "arduino", "echo", "drive", 3.023257620828898, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_CAR, 0.0109375, 0.0010416666666666667),
+            LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, 3.2175078137217583),
+            LinkFault(Kind.STUCK, Way.TO_HOST, -0.08776365315181955, 1.1425506217950376),
+        ),
+        traits=CarTraits(interval_s=1.493, spread_s=0.05243534881069913, last_frame_wins=True, text=True),
+    ),
 )  # fmt: skip
 
 

@@ -101,9 +101,14 @@ class Rhythm:
         return len(self.intervals) >= FIRM_INTERVALS
 
     @property
+    def seen_tolerance_s(self) -> float:
+        """Return the maximum difference of an interval from the median, as far as the intervals show it."""
+        return self.spread_s + LINK_TOLERANCE_S
+
+    @property
     def tolerance_s(self) -> float:
         """Return the maximum difference of an interval of this car, on this link, from the median."""
-        return max(self.spread_s + LINK_TOLERANCE_S, 0.0 if self.is_firm else FIRST_TOLERANCE_S)
+        return max(self.seen_tolerance_s, 0.0 if self.is_firm else FIRST_TOLERANCE_S)
 
     def fits(self, interval_s: float) -> bool:
         """Return True if an interval belongs to this rhythm."""

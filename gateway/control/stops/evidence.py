@@ -18,7 +18,8 @@ it nothing is ever shown here, which costs it nothing else: stops end as `sent`,
 *Why not one pause.* A link that swallows both `MODE00` and the report after it leaves a gap, too: two intervals instead
 of one. If the interval is about as long as the block, that gap equals a pause. Half of all outages of 0.6 s around a
 stop do that on a car that reports every second. So two pauses are needed, each around a `MODE00` of its own. If one of
-them is longer than it should be (a slow link, or a report that the link held), three are.
+them is in doubt, three are: if it is longer than it should be (a slow link, or a report that the link held), or if it
+differs from the block by more than the intervals have spread so far, and these are few.
 
 *Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
 `MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length
@@ -142,7 +143,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
         "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
-        "longer. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
+        "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
         "the stop goes on, and a command may take its place",
     ),
     StopCase.NO_REACTION: EvidenceRow(
@@ -539,8 +540,11 @@ class StopEvidence:
         longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
             self._pending = None
-            # Nobody has judged an earlier `MODE00` that may have delayed this report.
-            if not matches or any(each.kind is None for each in blocking):
+            # Few intervals do not show how far they spread. And nobody has judged an earlier `MODE00` that may have
+            # delayed this report.
+            seen_s = rhythm.seen_tolerance_s
+            is_close = -seen_s <= delay_s - close_s <= blocked_s + seen_s
+            if not is_close or any(each.kind is None for each in blocking):
                 self._pauses_needed = PAUSES_IN_DOUBT
             return self._pause(at, delay_s, learn=not matches)
         if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:
