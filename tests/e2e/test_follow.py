@@ -16,6 +16,7 @@ def _truth(sim: GatewayProcess) -> dict[str, tuple[str, tuple[float, float]]]:
     return {car: (str(each["mode"]), (float(each["x_m"]), float(each["y_m"]))) for car, each in said.items()}
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(240)
 def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(EXAMPLES / "worlds" / "follow.yaml"))

@@ -47,7 +47,10 @@ def post_stop(port: int, stop_id: str = "") -> int:
     return status
 
 
-@pytest.mark.parametrize("frozen_s", [0.5 * LEASE_S, LEASE_S + 0.5, 2 * LEASE_S])
+@pytest.mark.parametrize(
+    "frozen_s",
+    [*(pytest.param(each, marks=pytest.mark.soak) for each in (0.5 * LEASE_S, LEASE_S + 0.5)), 2 * LEASE_S],
+)
 def test_a_stop_during_a_hang_of_the_hub_stops_the_car_after_it(
     fleet: FleetProcesses, judge: Judge, frozen_s: float
 ) -> None:

@@ -62,6 +62,7 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
     assert not found, "\n\n".join(found)
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(240)
 def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_stand_or_a_second_ctrl_c(
     tmp_path: Path, fleet: FleetProcesses

@@ -265,6 +265,7 @@ async def test_a_stop_waits_for_no_command_that_nobody_answers(
     assert len(await unanswered) == 80
 
 
+@pytest.mark.soak
 def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(cars: Cars, gateway: Bus) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
