@@ -61,11 +61,11 @@ def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
     first = _local(start_ns / _NS).replace(
         hour=int(found[1]), minute=int(found[2]), second=int(found[3] or 0), microsecond=0, tzinfo=None
     )
-    days = [
-        round((first + timedelta(days=day)).timestamp()) * _NS
-        for day in range((end_ns - start_ns) // (86_400 * _NS) + 2)
-    ]
-    return [each for each in days if each + length_ns > start_ns and each <= end_ns]
+    days = [first + timedelta(days=day) for day in range((end_ns - start_ns) // (86_400 * _NS) + 2)]
+    # On the day that summer time ends, an hour is there twice (fold). On the day that it begins, one is missing.
+    both = [round(day.replace(fold=fold).timestamp()) for day in days for fold in (0, 1)]
+    begins = [each * _NS for each in dict.fromkeys(both) if _local(each).time() == first.time()]
+    return [each for each in begins if each + length_ns > start_ns and each <= end_ns]
 
 
 def clock_length_ns(text: str) -> int:

@@ -23,6 +23,7 @@ from fleet.commands.output import json_text, line, show_table
 from fleet.commands.params import (
     Duration,
     Number,
+    Since,
     any_cars_argument,
     complete_car,
     complete_cars,
@@ -215,7 +216,11 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
 )
 @click.argument("keyexpr", metavar="KEY", shell_complete=complete_car)
 @click.option("-n", "--last", type=Number(int, 1), help="The last N values of each key, oldest first.")
-@click.option("--since", type=Duration(history.MAX_HISTORY_S), help="The values of this last time, such as 30s or 5m.")
+@click.option(
+    "--since",
+    type=Since(history.MAX_HISTORY_S),
+    help="The values since then: 30s or 5m ago, a local time (14:05, yesterday 14:05), or a date.",
+)
 @click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
 @json_option
 @bus_options

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,10 +15,11 @@ from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.supervision import ask_status, fleets_on
 from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
+from fleet.recording.time_spec import ago_s
 from schemas import keys
 from schemas.bus import Bus, canon
 from schemas.colors import COLORS, parse_color
-from schemas.duration import duration_s, parse_duration
+from schemas.duration import duration_s, format_duration, parse_duration
 from schemas.suggestion import did_you_mean
 from schemas.topics import likely_name
 
@@ -46,6 +48,29 @@ class Duration(click.ParamType[float]):
             return parse_duration(str(value), self._min_s, self._max_s)
         except ValueError as error:
             self.fail(f"{error}.", param, ctx)
+
+
+class Since(click.ParamType[float]):
+    """A time in the past: how long ago (`30s`, `-5m`), a local time of day (`14:05`), or a date."""
+
+    name = "TIME"
+
+    def __init__(self, max_s: float) -> None:
+        self._max_s = max_s
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return how long ago it was, s. Fail if it was not, or longer ago than the maximum."""
+        text = str(value)
+        ago = text.removeprefix("-")
+        if duration_s(ago) is not None:
+            return Duration(self._max_s).convert(ago, param, ctx)
+        try:
+            found_s = ago_s(text, time.time())
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+        if found_s > self._max_s:
+            self.fail(f"{text} is too long ago: at most {format_duration(self._max_s)}.", param, ctx)
+        return found_s
 
 
 class Number(click.ParamType[N]):

@@ -43,7 +43,7 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         raise click.UsageError(f"--at: {error}") from None
     span = f"{date_and_clock(summary.start_ns / 1e9)} to {date_and_clock(summary.end_ns / 1e9)}"
     if end_ns <= summary.start_ns or begin_ns > summary.end_ns:
-        raise click.ClickException(f"{at} is not in {session.name}: it is from {span}.")
+        raise click.UsageError(f"--at: {at} is not in {session.name}: it is from {span}.")
     cars = sorted({key.car for each in summary.keys if (key := keys.parse(each)) and not key.car.startswith("@")})
     if car not in cars:
         near = did_you_mean(car, cars) or f"Cars: {', '.join(cars)}."

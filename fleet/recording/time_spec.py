@@ -5,14 +5,13 @@ from datetime import UTC, datetime
 from typing import Final
 
 from schemas.duration import duration_s
-from schemas.local_time import clock_begins, clock_length_ns, date, date_and_clock
+from schemas.local_time import clock, clock_begins, clock_length_ns, date, date_and_clock, with_offset
 
-RULE: Final = (
-    "an offset from the start (90s, 1m30s, 1h, 500ms), from the end with - (-60s), a local time of day (14:05, "
-    "yesterday 14:05), or a date (2026-03-14 15:16, 2026-03-14T15:16:17Z)"
-)
+RULE: Final = "90s (after the start), -5m (before the end), 14:05 (local), yesterday 14:05, or 2026-03-14 15:16"
+PAST_RULE: Final = "30s or 5m (ago), 14:05 (local), yesterday 14:05, or 2026-03-14 15:16"
 _DAYS: Final = {"today": 0, "yesterday": 1}
 _NS: Final = 1_000_000_000
+_DAY_NS: Final = 86_400 * _NS
 _MAX_DAYS: Final = 3
 """Maximum days that a message proposes."""
 
@@ -26,8 +25,20 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
     """Return begin and end of a time as a person types it for a session from `start_ns` to `end_ns`, ns.
 
     A time of day and a date without a zone are local. A time of day without a day is that of the session. Raises
-    ValueError with the syntax, or with the days if the time of day is on none or on several. now_s: the wall clock.
+    ValueError with the syntax and the range of the session, or with the days if the time of day is on several.
+    now_s: the wall clock.
     """
+    try:
+        return _span_ns(text, start_ns, end_ns, now_s)
+    except _Unreadable as error:
+        raise ValueError(f"{error} Write {RULE}. The session is from {_range(start_ns, end_ns)}.") from None
+
+
+class _Unreadable(ValueError):
+    """A text that is not a time. Its words say what may have been meant, and not what may be written."""
+
+
+def _span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, int]:
     if (offset_s := duration_s(text.removeprefix("-"))) is not None:
         offset_ns = round(offset_s * 1e9)
         begin_ns = end_ns - offset_ns if text.startswith("-") else start_ns + offset_ns
@@ -37,15 +48,41 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
         text = f"{date(now_s, _DAYS[day])} {rest}".strip()
     elif (begins := clock_begins(text, start_ns, end_ns)) is not None:
         return _only(text, begins, start_ns, end_ns)
+    return _date_ns(text)
+
+
+def _date_ns(text: str) -> tuple[int, int]:
+    """Return begin and end of a date with a time, ns. Raises _Unreadable."""
     try:
         when = datetime.fromisoformat(text)
-    except ValueError:
-        clock = re.fullmatch(r"(\d+):(\d+)", text)  # such as 90:00
-        near = f"Minutes and seconds are written as {clock[1]}m{clock[2]}s. " if clock else ""
-        raise ValueError(f"{text!r} is not a time. {near}Write {RULE}.") from None
-    whole = int(when.replace(microsecond=0).timestamp())
+        whole = int(when.replace(microsecond=0).timestamp())
+    except (ValueError, OverflowError, OSError):  # the year 1 is before the first time of this computer
+        typed = re.fullmatch(r"(\d+):(\d+)", text)  # such as 90:00
+        near = f" Minutes and seconds are written as {typed[1]}m{typed[2]}s." if typed else ""
+        raise _Unreadable(f"{text!r} is not a time.{near}") from None
     begin_ns = whole * _NS + when.microsecond * 1000
     return begin_ns, begin_ns + clock_length_ns(text.partition("+")[0])
+
+
+def ago_s(text: str, now_s: float) -> float:
+    """Return how long ago a time was as a person types it, s: a duration (`5m` or `-5m`), a local time, or a date.
+
+    A time of day without a day is the last one that has passed. Raises ValueError with the syntax, also for a time that
+    is not over. now_s: the wall clock.
+    """
+    if (duration := duration_s(text.removeprefix("-"))) is not None:
+        return duration
+    now_ns = round(now_s * _NS)
+    begins = clock_begins(text, now_ns - _DAY_NS, now_ns - 1)
+    if begins == []:  # summer time began
+        raise ValueError(f"{text} was not in the last 24 hours.")
+    try:
+        begin_ns = begins[-1] if begins is not None else _span_ns(text, now_ns, now_ns, now_s)[0]
+    except _Unreadable as error:
+        raise ValueError(f"{error} Write {PAST_RULE}.") from None
+    if begin_ns >= now_ns:
+        raise ValueError(f"{text} is not over: it is {date_and_clock(now_s)}.")
+    return (now_ns - begin_ns) / _NS
 
 
 def is_within(text: str, start_ns: int, end_ns: int, now_s: float) -> bool:
@@ -54,20 +91,29 @@ def is_within(text: str, start_ns: int, end_ns: int, now_s: float) -> bool:
         raise ValueError(f"{text} is an offset within one session. Write a local time (14:05) or a date.")
     if (begins := clock_begins(text, start_ns, end_ns)) is not None:
         return bool(begins)
-    begin_ns, behind_ns = span_ns(text, start_ns, end_ns, now_s)
+    try:
+        begin_ns, behind_ns = _span_ns(text, start_ns, end_ns, now_s)
+    except _Unreadable as error:
+        raise ValueError(f"{error} Write a local time of day (14:05, yesterday 14:05), or a date.") from None
     return begin_ns <= end_ns and behind_ns > start_ns
 
 
 def _only(text: str, begins: list[int], start_ns: int, end_ns: int) -> tuple[int, int]:
     if len(begins) > 1:
-        days = ", ".join(f"{date(each // _NS)} {text}" for each in begins[:_MAX_DAYS])
-        raise ValueError(f"{text} is on {len(begins)} days of the session. Write the day: {days}")
+        days = [f"{date(each // _NS)} {text}" for each in begins]
+        if len(set(days)) < len(days):  # the end of summer time
+            days = [with_offset(each) for each in begins]
+        raise ValueError(f"{text} is in the session {len(begins)} times. Write the day: {', '.join(days[:_MAX_DAYS])}")
     if not begins:
-        span = f"{date_and_clock(start_ns / 1e9)} to {date_and_clock(end_ns / 1e9)}"
         minutes, _, rest = text.partition(":")
-        near = f". Minutes and seconds are written as {minutes}m{rest}s" if ":" not in rest else ""
-        raise ValueError(f"{text} is not in the session: it is from {span}{near}")
+        near = f" Minutes and seconds are written as {minutes}m{rest}s." if ":" not in rest else ""
+        raise ValueError(f"{text} is not in the session: it is from {_range(start_ns, end_ns)}.{near}")
     return begins[0], begins[0] + clock_length_ns(text)
+
+
+def _range(start_ns: int, end_ns: int) -> str:
+    first, last = start_ns / _NS, end_ns / _NS
+    return f"{date_and_clock(first)} to {clock(last) if date(first) == date(last) else date_and_clock(last)}"
 
 
 def format_utc(when: datetime, timespec: str = "milliseconds") -> str:

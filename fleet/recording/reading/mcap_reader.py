@@ -9,7 +9,6 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Final, NamedTuple
@@ -24,6 +23,7 @@ from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, Record
 from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES, ChunkPlace, Index
 from fleet.recording.reading.mcap_scan import MAGIC, RecordScanner
 from fleet.recording.selection import EVERYTHING, Selection
+from schemas.local_time import exact
 
 _FOOTER_SIZE: Final = HEAD.size + 20
 _DATA_END_SIZE: Final = HEAD.size + 4
@@ -364,10 +364,4 @@ def _checksum(file: IO[bytes], start: int, end: int) -> int:
 
 
 def _span(chunk: ChunkPlace) -> str:
-    try:
-        first, last = (
-            datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3] for ns in (chunk.first_ns, chunk.last_ns)
-        )
-    except (OverflowError, ValueError, OSError):
-        return ""  # the clock of another writer was wrong
-    return f" (its messages, {first} to {last} UTC, are lost)"
+    return f" (its messages, {exact(chunk.first_ns)} to {exact(chunk.last_ns)}, are lost)"

@@ -38,6 +38,48 @@ def test_a_time_is_local_and_within_the_session(text: str, begins: float, length
     assert found == (begins * S, (begins + length_s) * S)
 
 
+@pytest.mark.parametrize(
+    ("text", "ago_s"),
+    [
+        ("30s", 30),
+        ("-5m", 300),
+        ("11:58", 120),
+        ("12:30", DAY_S - 1800),
+        ("12:00", DAY_S),
+        ("yesterday 12:00", DAY_S),
+        ("2026-11-25 11:00", HOUR_S),
+        ("2026-11-25T10:00:00Z", HOUR_S),
+    ],
+)
+def test_a_time_in_the_past_is_the_last_one(text: str, ago_s: int) -> None:
+    assert time_spec.ago_s(text, NOON) == ago_s
+
+
+@pytest.mark.parametrize("text", ["noon", "today 12:30", "tomorrow 12:00", "2027-01-01", "25:00", "0001-01-01"])
+def test_what_is_not_over_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is not over|is not a time"):
+        time_spec.ago_s(text, NOON)
+
+
+def test_a_wrong_time_names_the_formats_and_the_range_of_the_session() -> None:
+    with pytest.raises(ValueError, match=r"from 2026-11-25 12:00:00 CET to 12:01:00 CET") as refused:
+        time_spec.span_ns("noon", NOON * S, (NOON + 60) * S, NOON)
+    assert time_spec.RULE in str(refused.value)
+
+
+def test_the_hour_that_is_there_twice_is_named_twice_and_the_missing_one_is_not_there() -> None:
+    with zone("CET-1CEST,M3.5.0,M10.5.0/3"):
+        twice = 1_792_886_400  # 2026-10-25 00:00 UTC: 2:00 CEST. One hour later it is 2:00 CET.
+        with pytest.raises(ValueError, match=r"2026-10-25T02:30:00\.000\+02:00, 2026-10-25T02:30:00\.000\+01:00"):
+            time_spec.at_ns("2:30", twice * S, (twice + 2 * HOUR_S) * S, NOON)
+        assert time_spec.at_ns("2:30", (twice + HOUR_S) * S, (twice + 2 * HOUR_S) * S, NOON) == (twice + 5400) * S
+        missing = 1_774_742_400  # 2026-03-29 00:00 UTC: 1:00 CET. One hour later it is 3:00 CEST.
+        with pytest.raises(ValueError, match="is not in the session"):
+            time_spec.at_ns("2:30", missing * S, (missing + 2 * HOUR_S) * S, NOON)
+        with pytest.raises(ValueError, match="was not in the last 24 hours"):
+            time_spec.ago_s("2:30", missing + 2 * HOUR_S)
+
+
 def test_a_time_of_day_on_two_days_names_both() -> None:
     with pytest.raises(ValueError, match=r"2026-11-25 14:05, 2026-11-26 14:05"):
         time_spec.at_ns("14:05", NOON * S, (NOON + 2 * DAY_S) * S, NOON)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from fleet.recording import session_dir
+from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_scan import MAGIC
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
@@ -118,10 +118,11 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
         assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) == len(expected)
     again = fleet("cut", session, "--out", out)
     assert (again.returncode, "is there already" in again.stderr) == (2, True)
+    began = of_iso("2026-09-21T14:13:20Z")
     for arguments, words in (
         (("--from", "1h"), "The time range is empty"),
         (("--from", "2s", "--to", "1s"), "is not before"),
-        (("--from", "soon"), "is not a time"),
+        (("--from", "soon"), f"is not a time. Write {time_spec.RULE}. The session is from {began} to "),
         (("--from", "12:34"), "are written as 12m34s"),
         (("--car", "pink"), "pink is not in"),
         (("--to", "2026-09-21T14:13:19Z"), "The time range is empty"),
@@ -129,6 +130,14 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
         wrong = fleet("cut", session, *arguments, "--out", tmp_path / "other")
         assert (wrong.returncode, words in wrong.stderr) == (2, True), wrong.stderr
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(("at", "words"), [("soon", "is not a time. Write "), ("2026-09-21T14:14:00Z", "it is from ")])
+def test_why_refuses_a_time_that_is_not_in_the_session(at: str, words: str, session: Path) -> None:
+    done = in_process.fleet("why", "red", "--session", session, "--at", at)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert f"from {of_iso('2026-09-21T14:13:20Z')} to " in done.stderr
 
 
 def test_files_that_went_are_told_also_the_last(session: Path) -> None:
