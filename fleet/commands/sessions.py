@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -43,6 +43,8 @@ def sessions() -> None:
 
 sessions.add_command(redecode)
 sessions.add_command(vector)
+
+_COLUMNS: Final = ("session", "start", "state", "length", "size", "messages", "lost", "stops", "marks", "cars")
 
 out_option = click.option(
     "-o", "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="The new session's directory."
@@ -83,7 +85,10 @@ def _open(path: Path) -> "Session":
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, marks and cars."""
+    """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, stops, marks and cars.
+
+    A stop of several cars counts once, whoever asked for it. Damaged sessions are in the list, with what is wrong.
+    """
     _show(_summaries(directory), as_json=as_json)
 
 
@@ -100,6 +105,7 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     """
     now_s = time.time()
     try:
+        time_spec.is_within(time_text, 0, 0, now_s)  # refuses a wrong time also where no session is
         ran = [one for one in _summaries(directory) if time_spec.is_within(time_text, one.start_ns, one.end_ns, now_s)]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
@@ -130,7 +136,7 @@ def _show(found: list["SessionSummary"], *, as_json: bool) -> None:
         return
     if not found:
         return
-    rows = [("session", "start", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
+    rows = [_COLUMNS, *map(_row, found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -144,7 +150,8 @@ def _row(one: "SessionSummary") -> tuple[str, ...]:
     marks = str(len(one.marks)) + (" kept" if one.kept else "")
     length = time_spec.words(one.length_s)
     start = date_and_clock(one.start_ns / 1e9) if one.messages else "-"
-    return one.name, start, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), marks, cars
+    stops = "-" if one.stops is None else str(one.stops)
+    return one.name, start, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), stops, marks, cars
 
 
 def _size(count: int) -> str:
@@ -164,13 +171,14 @@ def info(session: Path, *, as_json: bool) -> None:
 
     The exit code is 1 if no message could be read.
     """
-    from fleet.recording.tools.summary import SessionState, marks_of, of_session
+    from fleet.recording.tools.summary import SessionState, marks_of, of_session, stops_of
     from fleet.recording.tools.transform import origin_words
 
     with _session_errors():
         found = _open(session)
         about = of_session(found)
         about.marks = marks_of(found, about)
+        about.stops = stops_of(found, about)
         description = found.description
         nothing = not about.messages and about.state in (SessionState.CUT, SessionState.DAMAGED)
     origin = description.origin if description is not None else {}
@@ -194,7 +202,7 @@ def _say_contents(about: "SessionSummary") -> None:
     click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
     if about.clock_back_s:
         click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
-    click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}")
+    click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}; stops: {about.stops}")
     for mark in about.marks:
         by = name_of(mark.get("by") or "") or "somebody"
         echo_safely(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")

@@ -72,6 +72,8 @@ class SessionInfo:
     """Marks set during recording: `time` (ISO 8601), `text`, `by`."""
     kept: bool = False
     """True if the quota spares the session. The name is part of the file format."""
+    stops: int | None = None
+    """Number of recorded commands that stop cars. None if nobody has counted them."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Source session, tool (`recover`, `cut`) and losses; empty if the session was recorded."""
 
@@ -151,6 +153,7 @@ def _is_valid(values: Mapping[str, Any]) -> bool:
         and all(isinstance(count, int) for name in _COUNTS for count in values.get(name, {}).values())
         and all(isinstance(mark, dict) for mark in values.get("marks", []))
         and isinstance(values.get("ended"), str | None)
+        and isinstance(values.get("stops"), int | None)
     )
 
 

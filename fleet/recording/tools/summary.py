@@ -11,6 +11,7 @@ from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
+from fleet.recording.stop_count import EVENTS, StopCount
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
 
@@ -55,6 +56,8 @@ class SessionSummary:
     lost: int = 0
     """Messages that the recorder dropped, or knew to have missed on the bus."""
     cars: Sequence[str] = ()
+    stops: int | None = None
+    """Commands that stop cars. A stop of several cars counts once. None if they were not counted."""
     marks: Sequence[Mapping[str, Any]] = ()
     kept: bool = False
     """True if the quota spares the session."""
@@ -80,7 +83,9 @@ def overview(path: Path) -> SessionSummary:
     except NoSession as error:
         files = [*path.glob(session_dir.SEGMENTS)] if path.is_dir() else [path]
         return SessionSummary(path.name, str(path), SessionState.UNREADABLE, str(error), bytes=_size(files))
-    return of_session(session)
+    about = of_session(session)
+    about.stops = stops_of(session, about)
+    return about
 
 
 def of_session(session: Session) -> SessionSummary:
@@ -119,6 +124,7 @@ def of_session(session: Session) -> SessionSummary:
         found.lost += missing if isinstance(missing, int) else 0
         found.marks = list(description.marks)
         found.kept = description.kept
+        found.stops = description.stops if description.closed else None  # else the last ones may be uncounted
     found.state, found.words = _state(session, read)
     if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
@@ -162,13 +168,10 @@ def growing(session: Session) -> Callable[[], bool]:
     began, before = time.monotonic(), _size(session.segments)
 
     def has_grown() -> bool:
-        try:
-            lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - RECENT_WRITE_S
-        except OSError:
-            return False
+        lately = _is_written_lately(session)
         while lately and time.monotonic() - began < MAX_GROWTH_WAIT_S and _size(session.segments) == before:
             time.sleep(GROWTH_POLL_INTERVAL_S)
-        return _size(session.segments) != before
+        return lately and _size(session.segments) != before
 
     return has_grown
 
@@ -198,14 +201,28 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
     return found
 
 
+def stops_of(session: Session, about: SessionSummary) -> int:
+    """Return the number of stops of a session from session.json, else from the chunks that have events of commands."""
+    if about.stops is not None:
+        return about.stops
+    found = StopCount()
+    decoder = MessageDecoder()
+    events = tuple(key for key in about.keys if key.endswith(f"/{EVENTS.name}"))
+    # A part: what it finds damaged is not said twice.
+    for info, _, _, _, data in session.part(session.segments).rows(Selection(events)) if events else ():
+        message = decoder.message(info, data)
+        if message is not None:
+            found.add(message)
+    return found.count
+
+
 def _state(session: Session, read: Session) -> tuple[SessionState, str]:
     """Return the state and why. read: the damage of the files that have no usable index, and were read."""
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words
     if description is not None and not description.closed:
-        lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - RECENT_WRITE_S
-        if lately and not description.ended:
+        if _is_written_lately(session) and not description.ended:
             return SessionState.RECORDING, ""
         return (
             SessionState.CUT,
@@ -216,6 +233,13 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
     if read.unended:
         return SessionState.CUT, f"{min(read.unended).name} has no intact end: `fleet sessions recover` repairs it"
     return SessionState.WHOLE, ""
+
+
+def _is_written_lately(session: Session) -> bool:
+    try:
+        return max(segment.stat().st_mtime for segment in session.segments) > time.time() - RECENT_WRITE_S
+    except OSError:
+        return False  # removed meanwhile
 
 
 def _size(paths: Sequence[Path]) -> int:

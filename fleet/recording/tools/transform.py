@@ -164,6 +164,7 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         closed=True,
         messages=count,
         error="",
+        stops=None,  # of the old session
         format=session_dir.FORMAT_VERSION,
         origin=origin,
     ).write(new)

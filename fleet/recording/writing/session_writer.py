@@ -16,12 +16,15 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
+from google.protobuf.message import DecodeError
 
 from fleet.recording import session_dir
 from fleet.recording.sequence_tracker import SequenceTracker
+from fleet.recording.stop_count import EVENTS, StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume, retention
 from fleet.recording.writing.segment_writer import Segment
+from schemas import messages
 from schemas.bus import sequence_of
 
 MB: Final = 1_000_000
@@ -44,6 +47,7 @@ MIN_CLOSE_BYTES: Final = 200_000
 """Minimum free space to write the end of a session: the index of its last file needs it."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
+_EVENT_CLASS: Final = messages.message_class(EVENTS.message)
 SESSIONS_PER_QUOTA: Final = 10
 """Minimum sessions in a quota. The quota removes whole sessions, so each may use at most a tenth."""
 
@@ -102,7 +106,7 @@ def describe_shortage(free_bytes: int, needed_bytes: int) -> str:
 class KeyState:
     """Counters of one key and encoding in one segment."""
 
-    __slots__ = ("channel", "count", "encoding", "final", "first", "key", "tracker")
+    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "tracker")
 
     def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
         self.key = key
@@ -110,6 +114,8 @@ class KeyState:
         self.tracker = tracker
         self.channel = channel
         self.count = self.first = self.final = 0
+        self.has_events = messages.name_in(str(encoding)) == EVENTS.message
+        """True for the events of commands, in which stops are counted."""
 
 
 _BufferedRow = tuple[KeyState, int, bytes, int, int]
@@ -153,6 +159,7 @@ class SessionWriter:
         """Old sessions removed for the quota. The recorder reports and clears them."""
         self._index: list[dict[str, Any]] = []
         self._written = self._closed_bytes = self._buffered_bytes = 0
+        self._stops = StopCount()
         self._unended = 0
         """Rows at the begin of the buffer that are in a segment whose end a full disk did not take."""
         self._unflushed: list[_BufferedRow] = []
@@ -409,9 +416,12 @@ class SessionWriter:
             first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
         self._first_ns = min(self._first_ns or first_ns, first_ns)
         self._last_ns = max(self._last_ns, last_ns)
-        for state, _, _, _, sequence in rows:
+        for state, _, payload, _, sequence in rows:
             if not state.count:
                 state.first = sequence
+            if state.has_events:
+                with contextlib.suppress(DecodeError):  # any program can publish there
+                    self._stops.add(_EVENT_CLASS.FromString(payload))
             state.count += 1
             state.final = sequence
         self._written += len(rows)
@@ -583,7 +593,7 @@ class SessionWriter:
         description = self.description
         if now_ns is not None:
             description.ended, description.closed = format_utc(_utc(now_ns)), closed
-        description.messages = self._written
+        description.messages, description.stops = self._written, self._stops.count
         description.drops, description.missed = dict(self.drops), self.missed
         description.recovered = dict(self.recovered)
         description.write(self.path)

@@ -1,0 +1,36 @@
+"""Counts the commands of a session that stop cars, from the events of commands. Pure.
+
+A stop of several cars is one command with one id, and each gateway publishes several events of it.
+"""
+
+from typing import Any, Final
+
+from schemas.commands import STOPPING_VERBS
+from schemas.topics import TOPICS
+from schemas.words import Phase
+
+EVENTS: Final = TOPICS["event/command"]
+MAX_RECENT_IDS: Final = 1000
+"""Maximum number of remembered ids. The events of one command are seconds apart, and a flood has a budget."""
+
+
+class StopCount:
+    """The number of commands that stop cars (`stop`, `estop`, `pause`), each counted once."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._recent: dict[str, None] = {}
+
+    def add(self, event: Any) -> None:
+        """Take in a message of `EVENTS`. Messages of other types are ignored."""
+        # The schema is that of the recording: another writer's may lack a field.
+        verb, command, phase = (str(getattr(event, name, "")) for name in ("verb", "id", "phase"))
+        if event.DESCRIPTOR.full_name != EVENTS.message or verb not in STOPPING_VERBS:
+            return
+        if not command:  # without an id, each car counts
+            self.count += phase == Phase.ASKED
+        elif command not in self._recent:
+            self.count += 1
+            self._recent[command] = None
+            if len(self._recent) > MAX_RECENT_IDS:
+                del self._recent[next(iter(self._recent))]
