@@ -25,7 +25,20 @@ from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, McapReader, 
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
-from fleet.recording.tools.analysis import arrow_table, data_frame, is_known, join_as_of, no_messages, stray_tables
+from fleet.recording.tools.analysis import (
+    NoTable,
+    add_modes,
+    arrow_table,
+    data_frame,
+    is_known,
+    join_as_of,
+    mode_rows,
+    no_messages,
+    spans_table,
+    stray_tables,
+    warn_of_modes,
+)
+from fleet.recording.tools.mode_spans import MODE, ModeSpan, sensor_of, spans_without
 from fleet.recording.writing.mcap_copy import SESSION_METADATA, McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
@@ -295,8 +308,10 @@ class Session:
     def joined(self, of: str, *others: str, tolerance_s: float | None = None) -> "pd.DataFrame":
         """Return the table of the first topic, with the latest values that the same car had published in the others.
 
-        `session.joined("sensor/range", "state/mode")` adds the columns `mode.inferred`, `mode.verdict`, ... to those of
-        the distances. They are null in rows for which no value is young enough.
+        `session.joined("sensor/range", "state/mode")` adds the columns `mode.asked`, `mode.verdict`, ... to those of
+        the distances. They are null in rows for which no value is young enough. With `state/mode` there are two columns
+        more: `mode` is the mode as commanded, `mode_seen` as the readings of the car show it; null if not known.
+        A warning tells how long cars were in modes in which this reading does not exist: see `times_without`.
         tolerance_s: maximum age of a value, s, by publish_time. The default is the time after which its topic is stale
         (3 s for readings and states); values of topics that are never stale have no limit. Raises as `to_pandas`.
         """
@@ -305,8 +320,31 @@ class Session:
         table = self.to_arrow(of)
         for other in others:
             prefix = re.split(r"[/.]", other)[-1].lower()
-            table = join_as_of(table, self.to_arrow(other), prefix, tolerance_s)
+            right = self.to_arrow(other)
+            table = add_modes(join_as_of(table, right, prefix, tolerance_s))
+            warn_of_modes(sensor_of(of), self._spans_without(of, right))
         return data_frame(table)
+
+    def times_without(self, of: str) -> "pd.DataFrame":
+        """Return when cars were in modes in which a reading does not exist: car, mode, begin and end of each time.
+
+        of: as for `to_pandas`, about one sensor (`sensor/range`, `red/sensor/range`). In obstacle avoidance, a car
+        sends no distance. A plot that marks these times shows why there are no dots. The mode is the commanded one, or
+        the one that the car shows if that contradicts it. Manual mode has all readings.
+        Raises NoTable for another name, and FormatMissing without the extra `analysis`.
+        """
+        if not sensor_of(of):
+            raise NoTable(f"{of} is not about one sensor. Such as sensor/range.")
+        return data_frame(spans_table(self._spans_without(of, self.to_arrow(MODE.name))))
+
+    def _spans_without(self, of: str, modes: "pa.Table") -> list[ModeSpan]:
+        """Return the times without this reading of the cars that `of` names. modes: a table of `state/mode`."""
+        sensor, named = sensor_of(of), self.selection(of)
+        if not sensor:
+            return []
+        fleet = self.description.fleet if self.description is not None else DEFAULT_FLEET
+        spans = spans_without(sensor, mode_rows(modes))
+        return [span for span in spans if named.has_key(f"{fleet}/{span.car}/sensor/{sensor}")]
 
     def selection(
         self, keys: str | Iterable[str] | None, start_ns: int | None = None, end_ns: int | None = None

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.tools.export import OTHER_TABLE, STRAY_PREFIX, arrow_tables, is_stray, own_type
+from fleet.recording.tools.mode_spans import ModeSpan, describe_spans
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from schemas.printable import printable_lines
 from schemas.suggestion import did_you_mean
+from schemas.words import UNKNOWN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,6 +62,12 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
     if rest:
         first = import_pyarrow().concat_tables([first, *rest], promote_options="permissive")
     return first.sort_by(TIME)
+
+
+def warn_of_modes(sensor: str, spans: Iterable[ModeSpan]) -> None:
+    """Warn of readings that do not exist because of the modes of the cars."""
+    if words := describe_spans(sensor, spans):
+        _warn(f"{words}. Session.times_without() has when")
 
 
 def _warn(words: str) -> None:
@@ -145,6 +153,45 @@ def join_as_of(left: "pa.Table", right: "pa.Table", prefix: str, tolerance_s: fl
     for field, column in zip(matched.schema, matched.columns, strict=True):
         left = left.append_column(field.with_name(f"{prefix}.{field.name}"), column)
     return left
+
+
+def add_modes(table: "pa.Table") -> "pa.Table":
+    """Add to a table that was joined with `state/mode` the columns `mode` (as commanded) and `mode_seen`.
+
+    Both are null where they are not known. A column of the table itself keeps its name.
+    """
+    import_pyarrow()
+    import pyarrow.compute as pc  # type: ignore[import-untyped]  # it has no stubs
+
+    for name, source in (("mode", "mode.asked"), ("mode_seen", "mode.inferred")):
+        if source in table.column_names and name not in table.column_names:
+            words = table[source]
+            known = pc.and_(pc.not_equal(words, UNKNOWN), pc.not_equal(words, ""))
+            table = table.append_column(name, pc.if_else(known, words, None))
+    return table
+
+
+def mode_rows(table: "pa.Table") -> list[dict[str, Any]]:
+    """Return the rows of a table of `state/mode`, with publish_time in ns. Empty for another table."""
+    needed = ("car", "asked", "inferred", "verdict")
+    if not {*needed, TIME} <= {*table.column_names}:
+        return []
+    rows: list[dict[str, Any]] = table.select([*needed]).append_column(TIME, table[TIME].cast("int64")).to_pylist()
+    return rows
+
+
+def spans_table(spans: Iterable[ModeSpan]) -> "pa.Table":
+    """Return spans as a table: car, mode, begin and end."""
+    arrow = import_pyarrow()
+    given = list(spans)
+    time = arrow.timestamp("ns", "UTC")
+    columns = {
+        "car": arrow.array([span.car for span in given], "string"),
+        "mode": arrow.array([str(span.mode) for span in given], "string"),
+        "begin": arrow.array([span.begin_ns for span in given], time),
+        "end": arrow.array([span.end_ns for span in given], time),
+    }
+    return arrow.table(columns)
 
 
 def _cars_and_times(table: "pa.Table") -> Iterable[tuple[str, int]]:
