@@ -109,6 +109,7 @@ COMMANDS: Final = {
         "replay": ("fleet.commands.replay:replay", "A session in Rerun."),
         "play": ("fleet.commands.play:play", "Publish a session again, for your own programs."),
         "sessions": ("fleet.commands.sessions:sessions", "List, verify, repair, cut and export."),
+        "find": ("fleet.commands.find:find", "When a condition held, in all sessions."),
     },
 }
 """Subcommands by heading: function and line in `fleet --help`."""

@@ -43,7 +43,7 @@ def explain_impossible(expression: Expression, of: str = "") -> str:
     if is_contradictory(expression):
         return f"{expression} is never true"
     for name in dict.fromkeys(names_in(expression.root)):
-        words, limits = _DOMAINS.get(f"{of}.{name}" if of else str(name), ((), None))
+        words, limits = _DOMAINS.get(f"{of}.{name.name}" if of else name.name, ((), None))
         if words:
             allowed: Node = Or(tuple(Compare(name, Op.EQ, Literal(word)) for word in words))
             domain = f"one of {', '.join(words)}"

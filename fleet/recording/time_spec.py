@@ -10,6 +10,7 @@ from schemas.local_time import clock, clock_begins, clock_length_ns, date, date_
 RULE: Final = "90s (after the start), -5m (before the end), 14:05 (local), yesterday 14:05, or 2026-03-14 15:16"
 PAST_RULE: Final = "30s or 5m (ago), 14:05 (local), yesterday 14:05, or 2026-03-14 15:16"
 _DAYS: Final = {"today": 0, "yesterday": 1}
+_WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 _NS: Final = 1_000_000_000
 _DAY_NS: Final = 86_400 * _NS
 _MAX_DAYS: Final = 3
@@ -44,11 +45,18 @@ def _span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, 
         begin_ns = end_ns - offset_ns if text.startswith("-") else start_ns + offset_ns
         return begin_ns, begin_ns + _NS
     day, _, rest = text.partition(" ")
-    if day in _DAYS:
-        text = f"{date(now_s, _DAYS[day])} {rest}".strip()
+    if (days := _days_before(day, now_s)) is not None:
+        text = f"{date(now_s, days)} {rest}".strip()
     elif (begins := clock_begins(text, start_ns, end_ns)) is not None:
         return _only(text, begins, start_ns, end_ns)
     return _date_ns(text)
+
+
+def _days_before(day: str, now_s: float) -> int | None:
+    """Return how many days ago a named day was: 0 for today, 0 to 6 for a weekday. None if it is no name of a day."""
+    if day in _WEEKDAYS:
+        return (datetime.fromisoformat(date(now_s)).weekday() - _WEEKDAYS.index(day)) % len(_WEEKDAYS)
+    return _DAYS.get(day)
 
 
 def _date_ns(text: str) -> tuple[int, int]:
@@ -65,13 +73,19 @@ def _date_ns(text: str) -> tuple[int, int]:
 
 
 def ago_s(text: str, now_s: float) -> float:
-    """Return how long ago a time was as a person types it, s: a duration (`5m` or `-5m`), a local time, or a date.
+    """Return how long ago a time was, s. The text, the errors and `now_s` are as for `past_ns`."""
+    duration = duration_s(text.removeprefix("-"))
+    return now_s - past_ns(text, now_s) / _NS if duration is None else duration
 
-    A time of day without a day is the last one that has passed. Raises ValueError with the syntax, also for a time that
-    is not over. now_s: the wall clock.
+
+def past_ns(text: str, now_s: float) -> int:
+    """Return a time in the past as a person types it: a duration ago (`5m` or `-5m`), a local time, or a date.
+
+    The result is in ns since the epoch. A time of day without a day is the last one that has passed. Raises ValueError
+    with the syntax, also for a time that is not over. now_s: the wall clock.
     """
     if (duration := duration_s(text.removeprefix("-"))) is not None:
-        return duration
+        return round((now_s - duration) * _NS)
     now_ns = round(now_s * _NS)
     begins = clock_begins(text, now_ns - _DAY_NS, now_ns - 1)
     if begins == []:  # summer time began
@@ -82,7 +96,7 @@ def ago_s(text: str, now_s: float) -> float:
         raise ValueError(f"{error} Write {PAST_RULE}.") from None
     if begin_ns >= now_ns:
         raise ValueError(f"{text} is not over: it is {date_and_clock(now_s)}.")
-    return (now_ns - begin_ns) / _NS
+    return begin_ns
 
 
 def is_within(text: str, start_ns: int, end_ns: int, now_s: float) -> bool:

@@ -60,6 +60,8 @@ OTHER_RESULTS: Final = {
     "fleet doctor": "Type: ",
     "fleet doctor red": "Type: ",
     "fleet doctor latest": "Type: ",
+    "fleet find 'range_m < 0.3'": "was never true",
+    "fleet find 'not (line.left_inner or line.right_inner)' --car red --for 2s --since monday": "was never true",
     "fleet resume": "still emergency-stopped",
     "fleet resume red": "still emergency-stopped",
     "fleet resume red blue --id 5f0c2e": "has no e-stop 5f0c2e",
@@ -137,9 +139,8 @@ def place_in_order(command: str) -> int:
 
 def of_sessions(command: str) -> bool:
     """Return True for a command that reads recordings or needs no fleet."""
-    return command.startswith(
-        ("fleet sessions", "fleet replay", "fleet example", "fleet schema", "fleet --version", "gateway", "fleet init")
-    )
+    words = ("sessions", "find", "replay", "example", "schema", "--version", "init")
+    return command.startswith(("gateway", *(f"fleet {word}" for word in words)))
 
 
 def quick() -> Iterator[str]:

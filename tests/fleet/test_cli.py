@@ -178,6 +178,7 @@ WITHOUT_BUS = (
     "replay",
     "play",
     "record",
+    "find",
 )
 """Subcommands without a bus, with the bus of the file, or with options in their own subcommands."""
 

@@ -47,11 +47,14 @@ def test_a_time_is_local_and_within_the_session(text: str, begins: float, length
         ("12:30", DAY_S - 1800),
         ("12:00", DAY_S),
         ("yesterday 12:00", DAY_S),
+        ("monday", 2.5 * DAY_S),
+        ("wednesday 11:00", HOUR_S),
+        ("thursday", 6.5 * DAY_S),
         ("2026-11-25 11:00", HOUR_S),
         ("2026-11-25T10:00:00Z", HOUR_S),
     ],
 )
-def test_a_time_in_the_past_is_the_last_one(text: str, ago_s: int) -> None:
+def test_a_time_in_the_past_is_the_last_one(text: str, ago_s: float) -> None:
     assert time_spec.ago_s(text, NOON) == ago_s
 
 

@@ -1,0 +1,135 @@
+"""`fleet find`: when a condition held, in all sessions."""
+
+import json
+import shlex
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from fleet.commands.options import cli_errors, json_option
+from fleet.commands.output import echo_safely
+from fleet.commands.params import Duration, car_option
+from fleet.recording import time_spec
+from fleet.recording.session_dir import is_session
+from fleet.recording.session_lookup import sessions_place
+from schemas.local_time import date_and_clock, with_offset
+
+if TYPE_CHECKING:
+    from fleet.conditions import Expression
+    from fleet.recording.tools.find import Hit
+
+MAX_FOR_S: Final = 86_400.0
+"""Maximum of --for: recordings of lessons and demos are no longer than a day."""
+_COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet find 'range_m < 0.3'
+  fleet find 'not (line.left_inner or line.right_inner)' --car red --for 2s --since monday
+  fleet find "mode.verdict == 'contradicted'" /media/disk/sessions --json"""
+)
+@click.argument("condition", metavar="CONDITION")
+@click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
+@car_option
+@click.option("--for", "for_s", type=Duration(MAX_FOR_S), default=None, help="Only if it held for so long.")
+@click.option(
+    "--since", metavar="TIME", help="Only since then: monday, yesterday 14:05, 14:05, a date, or 1h (one hour ago)."
+)
+@json_option
+def find(
+    condition: str,
+    directory: Path | None,
+    cars: tuple[str, ...],
+    for_s: float | None,
+    since: str | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Find when CONDITION held, in every session in DIR (default: sessions).
+
+    CONDITION is as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is unknown.
+    A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none.
+    """
+    from fleet.recording.tools.find import parse_condition
+
+    with cli_errors():
+        expression = parse_condition(condition)
+    try:
+        since_ns = 0 if since is None else time_spec.past_ns(since, time.time())
+    except ValueError as error:
+        raise click.UsageError(f"--since: {error}") from None
+    place = directory or sessions_place()
+    if not place.is_dir():
+        raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")
+    found = list(_hits(place, expression, cars, for_s or 0.0, since_ns))
+    if as_json:
+        for path, hit in found:
+            click.echo(json.dumps(_to_dict(path, hit)))
+    elif found:
+        rows = [_COLUMNS, *(_row(path, hit) for path, hit in found)]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+        for row, command in zip(rows, ("", *(_open_command(path, hit) for path, hit in found)), strict=True):
+            echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+            if command:
+                echo_safely(f"  {command}")
+    if not found:
+        raise click.ClickException(f"{expression} was never true in the sessions of {place}.")
+
+
+def _hits(
+    place: Path, expression: "Expression", cars: tuple[str, ...], for_s: float, since_ns: int
+) -> Iterator[tuple[Path, "Hit"]]:
+    """Yield the hits of all sessions. Sessions that are not whole are named on stderr."""
+    from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.tools.find import find_in
+    from fleet.recording.tools.summary import of_session
+
+    try:
+        paths = sorted(filter(is_session, place.iterdir()))
+    except OSError as error:
+        raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
+    there: set[str] = set()
+    for path in paths:
+        try:
+            session = Session(path)
+        except NoSession as error:
+            echo_safely(f"{path.name}: {error}", err=True)
+            continue
+        about = of_session(session)
+        there |= {*about.cars}
+        if is_searched := about.end_ns >= since_ns:
+            for hit in find_in(session, expression, [*({*about.cars} & {*(cars or about.cars)})], for_s, since_ns):
+                yield path, hit
+        # A file that cannot be read may be younger than the rest.
+        if words := session.damage_words or (about.words if is_searched else ""):
+            echo_safely(f"{path.name}: only what is intact was searched: {words}", err=True)
+    if there and (missing := sorted({*cars} - there)):
+        raise click.UsageError(f"--car: no session has {', '.join(missing)}: there are {', '.join(sorted(there))}")
+
+
+def _row(path: Path, hit: "Hit") -> tuple[str, ...]:
+    times = (date_and_clock(hit.begin_ns / 1e9), date_and_clock(hit.end_ns / 1e9))
+    return path.name, hit.car, *times, time_spec.words(hit.length_s), hit.mode or "-", hit.command or "-"
+
+
+def _to_dict(path: Path, hit: "Hit") -> dict[str, object]:
+    return {
+        "session": path.name,
+        "path": str(path),
+        "car": hit.car,
+        "from": time_spec.iso(hit.begin_ns),
+        "to": time_spec.iso(hit.end_ns),
+        "length_s": round(hit.length_s, 3),
+        "mode": hit.mode or None,
+        "command": hit.command or None,
+        "open": _open_command(path, hit),
+    }
+
+
+def _open_command(path: Path, hit: "Hit") -> str:
+    return f"fleet replay {shlex.quote(str(path))} --car {hit.car} --from {with_offset(hit.begin_ns)}"

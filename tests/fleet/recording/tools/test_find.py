@@ -1,0 +1,173 @@
+"""`fleet find`: the runs of a condition, as `fleet wait --for` sees them live, and the command over all sessions."""
+
+import json
+import random
+import shutil
+import subprocess
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+
+from fleet.client.condition import KeyCondition
+from fleet.client.reading import Reading
+from fleet.client.wait import ConditionWait
+from fleet.conditions import BadExpression
+from fleet.recording.reading.session import Session
+from fleet.recording.tools.find import ConditionRun, find_in, parse_condition
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import TOPICS
+from tests.fleet.replay.make_session import START_NS, Made
+from tests.support import in_process
+
+S = 1_000_000_000
+NEAR = "range_m < 0.3"
+
+
+def spans(condition: str, rows: Iterable[tuple[float, str, dict[str, object]]], for_s: float = 0.0) -> list[Any]:
+    run = ConditionRun(parse_condition(condition), "red", for_s)
+    for at_s, topic, fields in rows:
+        run.add(f"sensor/{topic}", fields, round(at_s * S))
+    return [(hit.begin_ns / S, hit.end_ns / S) for hit in run.close()]
+
+
+def distances(*rows: tuple[float, float | None]) -> list[tuple[float, str, dict[str, object]]]:
+    return [(at_s, "range", {} if value is None else {"range.range_m": value}) for at_s, value in rows]
+
+
+def test_a_hit_lasts_from_its_first_reading_to_its_last() -> None:
+    rows = distances((0, 1.0), (1, 0.2), (2, 0.1), (3, 1.0), (4, 0.2), (5, 1.0))
+    assert spans(NEAR, rows) == [(1, 2), (4, 4)]
+    assert spans(NEAR, rows, for_s=1.0) == [(1, 2)]
+    assert spans(NEAR, rows, for_s=1.1) == []
+
+
+def test_neither_a_gap_nor_what_was_not_measured_is_true() -> None:
+    assert spans(NEAR, distances((0, 0.2), (1, 0.2), (4.5, 0.2), (5, 0.2))) == [(0, 1), (4.5, 5)]
+    assert spans(NEAR, distances((0, 0.2), (3, 0.2))) == [(0, 3)], "at its limit a value is not stale"
+    assert spans(NEAR, distances((0, 0.2), (1, None), (2, 0.2))) == [(0, 0), (2, 2)]
+    assert spans("not range_m < 0.3", distances((0, None), (1, 0.5), (2, None))) == [(1, 1)]
+
+
+def test_one_known_part_decides_until_it_is_stale() -> None:
+    rows: list[tuple[float, str, dict[str, object]]] = [
+        (0.0, "light", {"light.left": True}),
+        (1.0, "range", {}),
+        (2.0, "range", {}),
+        (4.0, "range", {}),
+        (5.0, "light", {"light.left": True}),
+        (6.0, "range", {"range.range_m": 1.0}),
+    ]
+    assert spans("light.left or range_m < 0.3", rows) == [(0, 2), (5, 6)]
+    assert spans("light.left and range_m > 0.3", rows) == [(6, 6)]
+    at_its_limit: list[tuple[float, str, dict[str, object]]] = [rows[0], (3.0, "range", {"range.range_m": 1.0})]
+    assert spans("light.left and range_m > 0.3", at_its_limit) == [(3, 3)]
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_it_is_true_when_a_wait_ends(seed: int) -> None:
+    """Each prefix of random readings with gaps has a hit exactly if `fleet wait --for` would have ended in it."""
+    rng = random.Random(seed)
+    for_s = rng.choice([0.0, 0.5, 2.0, 5.0])
+    run, ended = ConditionRun(parse_condition(NEAR), "red", for_s), False
+    wait = ConditionWait(KeyCondition.of(NEAR, "fleet/red/sensor/range"), for_s)
+    at_ns = START_NS
+    for _ in range(40):
+        at_ns += rng.choice([100, 500, 1000, 1000, 1000, 2900, 3000, 3100, 9000]) * 1_000_000
+        value = rng.choice([0.1, 0.1, 0.1, 0.1, 0.5, None])
+        message = pb.Range(no_echo=True) if value is None else pb.Range(range_m=value)
+        message.stamp.FromNanoseconds(at_ns)
+        reading = Reading.of("fleet/red/sensor/range", message, at_ns)
+        ended = wait.ends(reading, reading.time, at_ns / S) or ended
+        run.add("sensor/range", {} if value is None else {"range.range_m": value}, at_ns)
+        lasting = run._current is not None and run._current.length_s >= for_s
+        assert bool(run.hits or lasting) == ended
+
+
+@pytest.mark.parametrize("text", ["rang_m < 1", "range_m <", "range_m < 'a'", "left", "range_m < 0", "hold.by == 'x'"])
+def test_a_bad_condition_is_refused_before_anything_is_read(text: str) -> None:
+    with pytest.raises(BadExpression):
+        parse_condition(text)
+    assert in_process.fleet("find", text, "/").returncode == 2
+
+
+@pytest.fixture
+def sessions(tmp_path: Path) -> Path:
+    """Make a session: red is near from 3 to 5 s, in mode tracking, after a drive by mia. Blue is never near."""
+    path = tmp_path / "all" / "s 1"
+    path.mkdir(parents=True)
+    made = Made(path / "0001.mcap", Writer)
+    for second in (0, 1, 2, 5, 6, 7, 3, 4, 8):  # 3 and 4 were backfilled
+        made.put("fleet/red/sensor/range", pb.Range(range_m=0.2 if 3 <= second <= 5 else 1.0), second)
+        made.put("fleet/blue/sensor/range", pb.Range(range_m=2.0), second)
+        made.put("fleet/red/state/mode", pb.Mode(asked="tracking" if second >= 2 else "manual"), second)
+    for verb, phase, at_s in (("drive", "sent", 1.5), ("led", "asked", 2.0), ("stop", "sent", 6.0)):
+        made.put("fleet/red/event/command", pb.CommandEvent(verb=verb, phase=phase, sender="mia@host-1"), at_s)
+    made.close()
+    strays = Made(path / "0002.mcap", Writer)
+    strays.put("fleet/red/sensor/range", pb.Battery(voltage_v=0.1), 4.5)  # a message of another type on this key
+    strays.close()
+    return path.parent
+
+
+def find(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return in_process.fleet("find", *arguments)
+
+
+def hits(*arguments: object) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in find(*arguments, "--json").stdout.splitlines()]
+
+
+def test_a_hit_has_the_mode_and_the_last_command_and_opens(sessions: Path, tmp_path: Path) -> None:
+    (hit,) = hits(NEAR, sessions)
+    assert (hit["session"], hit["car"], hit["length_s"]) == ("s 1", "red", 2.0)
+    assert (hit["mode"], hit["command"]) == ("tracking", "drive by mia")
+    assert hit["to"].endswith("Z")
+    assert datetime.fromisoformat(hit["from"]).timestamp() == START_NS // S + 3
+    done = find(NEAR, sessions)
+    assert done.returncode == 0
+    _, row, command = done.stdout.splitlines()
+    assert row.split()[2] == "red"
+    assert command.strip() == hit["open"]
+    time = command.rpartition(" ")[2]
+    cut = in_process.fleet("sessions", "cut", sessions / "s 1", "--from", time, "--out", tmp_path / "part")
+    assert cut.returncode == 0, cut.stderr
+    assert find_in(Session(tmp_path / "part"), parse_condition(NEAR), ["red"])[0].end_ns == START_NS + 5 * S
+
+
+def test_what_is_selected_is_searched(sessions: Path) -> None:
+    assert hits(NEAR, sessions, "--car", "blue") == []
+    assert len(hits(NEAR, sessions, "--for", "2s")) == 1
+    assert len(hits(NEAR, sessions, "--since", "2020-01-01")) == 1
+    since = datetime.fromtimestamp(START_NS / S + 4).astimezone().isoformat()
+    (later,) = hits(NEAR, sessions, "--since", since)
+    assert later["length_s"] == 1.0
+    assert {hit["car"] for hit in hits("range_m > 0.3", sessions)} == {"red", "blue"}
+    never = find("range_m > 5", sessions)
+    assert (never.returncode, never.stdout) == (1, "")
+    assert find(NEAR, sessions, "--car", "pink").returncode == 2
+    assert find(NEAR, sessions / "none").returncode == 1
+    assert find(NEAR, sessions, "--since", "soon").returncode == 2
+
+
+def test_damaged_sessions_are_named_and_the_rest_is_searched(sessions: Path) -> None:
+    for name in ("cut", "empty", "noise"):
+        shutil.copytree(sessions / "s 1", sessions / name)
+    file = sessions / "cut" / "0001.mcap"
+    file.write_bytes(file.read_bytes()[:-100])
+    (sessions / "empty" / "0001.mcap").write_bytes(b"")
+    (sessions / "noise" / "0001.mcap").write_bytes(random.Random(1).randbytes(4000))
+    done = find(NEAR, sessions)
+    assert done.returncode == 0
+    assert {line.partition(":")[0] for line in done.stderr.splitlines()} == {"cut", "empty", "noise"}
+    assert {hit["session"] for hit in hits(NEAR, sessions)} == {"s 1", "cut"}
+    older = find(NEAR, sessions, "--since", "1h")
+    assert older.returncode == 1
+    assert {line.partition(":")[0] for line in older.stderr.splitlines()} == {"empty", "noise", "fleet"}
+
+
+def test_each_topic_of_a_condition_has_a_known_age() -> None:
+    assert all(TOPICS[topic].stale_after_s is not None for topic in ("sensor/range", "state/mode", "state/safety"))
