@@ -5,6 +5,7 @@ So each has a budget, far above what our own page can send, and a page that exce
 never dropped: it has no budget here, and a page that was closed still stops all cars by POST.
 """
 
+from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
@@ -35,7 +36,7 @@ COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
 """Commands of one device that ask gateways, at once and per second. A press is one, also if it changes direction."""
 MAX_OPEN_COMMANDS: Final = 16
-"""Maximum commands of one person without an outcome. One command may be for many cars."""
+"""Maximum commands of one device without an outcome. One command may be for many cars."""
 MAX_BUDGETS: Final = 1024
 """Maximum number of remembered persons, devices and strangers. The one that was idle the longest is forgotten."""
 MERGE_S: Final = 0.1
@@ -64,6 +65,8 @@ class Budgets:
     """The budgets of persons by name, of devices by id (None: this computer), and of strangers by address."""
 
     _all: dict[Hashable, _Budget] = field(default_factory=dict)
+    _open: Counter[Hashable] = field(default_factory=Counter)
+    """The number of commands without an outcome, of each device that has any."""
 
     def may_send(self, device: Hashable, page: TokenBucket, now: float) -> bool:
         """Count a message. Return False if the page has to be closed: it, or its device, has sent too many."""
@@ -88,6 +91,20 @@ class Budgets:
     def may_command(self, device: Hashable, now: float) -> bool:
         """Count a command that asks gateways. Return False if there were too many."""
         return self._of(device).commands.take_one(now)
+
+    def may_open_command(self, device: Hashable) -> bool:
+        """Return False if too many commands of this device have no outcome yet."""
+        return self._open[device] < MAX_OPEN_COMMANDS
+
+    def on_command_begun(self, device: Hashable) -> None:
+        """Count a command that has no outcome yet. `on_command_ended` must follow."""
+        self._open[device] += 1
+
+    def on_command_ended(self, device: Hashable) -> None:
+        """Handle the outcome of a command that was counted."""
+        self._open[device] -= 1
+        if not self._open[device]:
+            del self._open[device]
 
     def _of(self, whose: Hashable) -> _Budget:
         found = self._all.pop(whose, None)

@@ -353,7 +353,7 @@ class Console:
         self._plots.end(page.number)
         for press in self._presses.drop_client(page.number):
             self._end(press, "The page has gone.")
-        page.operator.release_leases(page.number)
+        self._count(page, page.operator.release_leases(page.number))
         del self._pages[page.number]
         self._operators.leave(page.person.name)
 
@@ -471,14 +471,17 @@ class Console:
                     raise BadPageMessage(refused)  # it stops no car, so it ends no press
                 self.stop_all(message.text("id"), page.operator, pause_request(why))
             case Verb.UNPAUSE:
-                page.operator.command(plain_request(Verb.UNPAUSE), None, self._answer_to(page, message))
+                unpause = plain_request(Verb.UNPAUSE)
+                self._count(page, page.operator.command(unpause, None, self._answer_to(page, message)))
             case "take":
-                page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
+                taking = page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
+                self._count(page, taking)
             case "give_back":
                 self._end_all(
                     self._presses.drop_cars_of(set(message.cars()), page.person.name), "The car was given back."
                 )
-                page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+                giving = page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+                self._count(page, giving)
             case "inspect":
                 self._inspections.begin(page.number, message.cars()[0])
             case "inspect_end":
@@ -503,7 +506,7 @@ class Console:
                     if request.verb == Verb.MODE:
                         theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
                         self._end_all(theirs, "The car is in a mode.")
-                    page.operator.command(request, cars, answer)
+                    self._count(page, page.operator.command(request, cars, answer))
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
 
@@ -512,11 +515,18 @@ class Console:
         # A query for a car that nobody knows would wait for an answer in a thread.
         if unknown := set(cars).difference(self._view.names, self._present):
             return f"There is no car {min(unknown)}."
-        if page.operator.is_busy:
+        if not self.budgets.may_open_command(page.device or None):
             return f"{MAX_OPEN_COMMANDS} commands have no result yet. Wait for them."
         if not self.budgets.may_command(page.device or None, now):
             return "Too many commands. Wait a few seconds."
         return ""
+
+    def _count(self, page: PageLink, command: "asyncio.Task[None] | None") -> None:
+        """Count a command (None: nothing was sent) of this page's device until it has an outcome."""
+        if command is not None:
+            device = page.device or None
+            self.budgets.on_command_begun(device)
+            command.add_done_callback(lambda _: self.budgets.on_command_ended(device))
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
         ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
@@ -550,9 +560,10 @@ class Console:
             self._end(other, words, [car for car in other.cars if car not in cars])
         if before is not None:  # another direction: a stop in between only for cars that are no longer driven
             page.operator.end_press(before, [car for car in before.cars if car not in cars])
-        page.operator.begin_press(
+        driving = page.operator.begin_press(
             press, lambda outcome: page.answer(t="refused", press=press_id, outcome=asdict(outcome))
         )
+        self._count(page, driving)
 
     def _answer_to(self, page: PageLink, message: PageMessage) -> Callable[[list[dict[str, Any]]], None]:
         request_id = message.number("id")

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -12,7 +12,6 @@ from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
-from fleet.console.budgets import MAX_OPEN_COMMANDS
 from fleet.console.bus_message import is_shown
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
@@ -41,8 +40,6 @@ class ConsoleOperator:
         """Time of the last drive, number of drives, and cars, by press."""
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
-        self._commands = 0
-        """Number of commands and of begun presses without an outcome, apart from stops of all."""
         self._stops: dict[tuple[str, str], PendingCommand] = {}
         """The newest stop of all cars without an outcome, by sender and verb."""
         self._renewals: set[str] = set()
@@ -55,12 +52,14 @@ class ConsoleOperator:
 
     # ------------------------------------------------------------------ driving
 
-    def begin_press(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
-        """Start the cars of a press. A refusal of a car is reported; the other cars drive."""
+    def begin_press(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> "asyncio.Task[None]":
+        """Start the cars of a press. A refusal of a car is reported; the other cars drive.
+
+        Return the task that waits for the outcomes of the start.
+        """
         self._streams.pop((press.client, press.id), None)
         self.renew_press(press, time.monotonic())
-        self._commands += 1
-        self.spawn(self._ask_first_drive(press, on_refusal))
+        return self.spawn(self._ask_first_drive(press, on_refusal))
 
     def renew_press(self, press: HeldPress, now: float) -> None:
         """Send the next drive of a press, unless the last one is recent."""
@@ -96,10 +95,7 @@ class ConsoleOperator:
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
         # A stream is rejected without words from the second time on, a query never.
-        try:
-            outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
-        finally:
-            self._commands -= 1
+        outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
         for outcome in outcomes:
             if not outcome.ok and outcome.reason != Reason.SUPERSEDED:
                 on_refusal(outcome)
@@ -139,49 +135,45 @@ class ConsoleOperator:
 
     def command(
         self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
-    ) -> None:
-        """Send one command to some cars (None: to all) and report the outcomes."""
-        self._commands += 1
-        self.spawn(self._command(request, cars, on_outcomes))
+    ) -> "asyncio.Task[None]":
+        """Send one command to some cars (None: to all) and report the outcomes. Return the task that waits for them."""
+        return self.spawn(self._command(request, cars, on_outcomes))
 
     async def _command(
         self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> None:
-        try:
-            outcomes = await self._fleet.ask(request, cars)
-        finally:
-            self._commands -= 1
+        outcomes = await self._fleet.ask(request, cars)
         on_outcomes([asdict(outcome) for outcome in outcomes])
-
-    @property
-    def is_busy(self) -> bool:
-        """True if too many commands of this person have no outcome yet."""
-        return self._commands >= MAX_OPEN_COMMANDS
 
     def take_lease(
         self, client: int, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
-    ) -> None:
-        """Take cars over for a page, and keep them until it gives them back or has gone."""
+    ) -> "asyncio.Task[None]":
+        """Take cars over for a page, and keep them until it gives them back or has gone.
+
+        Return the task that waits for the outcomes.
+        """
 
         def keep(outcomes: list[dict[str, Any]]) -> None:
             self._leases.update({outcome["car"]: client for outcome in outcomes if outcome["ok"]})
             on_outcomes(outcomes)
 
-        self.command(lease_request(take=True), cars, keep)
+        return self.command(lease_request(take=True), cars, keep)
 
     def release_leases(
         self,
         client: int,
         cars: Iterable[str] | None = None,
         on_outcomes: Callable[[list[dict[str, Any]]], object] = lambda _: None,
-    ) -> None:
-        """Give cars back (None: all that this page has taken)."""
+    ) -> "asyncio.Task[None] | None":
+        """Give cars back (None: all that this page has taken).
+
+        Return the task that waits for the outcomes, None if there are no such cars.
+        """
         taken = [car for car, by in self._leases.items() if by == client]
         released = taken if cars is None else list(cars)
         for car in released:
             self._leases.pop(car, None)
-        if released:
-            self.command(lease_request(release=True), released, on_outcomes)
+        return self.command(lease_request(release=True), released, on_outcomes) if released else None
 
     def renew_leases(self) -> None:
         """Renew the leases of the pages. A lease that another sender has taken is lost."""
@@ -208,11 +200,12 @@ class ConsoleOperator:
             return None
         return not isinstance(answer, Failure) and answer.status == Phase.SENT, answer.words
 
-    def spawn(self, work: Any) -> None:
+    def spawn(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._on_done)
+        return task
 
     async def close(self) -> None:
         """Wait for the commands that still run."""

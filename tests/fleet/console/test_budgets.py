@@ -12,6 +12,7 @@ from fleet.console.budgets import (
     CHECK_RATE,
     COOLDOWN_S,
     MAX_BUDGETS,
+    MAX_OPEN_COMMANDS,
     MERGE_S,
     Budgets,
     StopMerge,
@@ -69,6 +70,20 @@ def test_checks_of_plans_have_a_budget_of_their_own() -> None:
     assert not budgets.may_check("mia", 1.0 / CHECK_RATE)
     assert budgets.may_check("bob", 0.0)
     assert budgets.may_ask("mia", 0.0)
+
+
+def test_commands_in_flight_are_counted_by_device_and_forgotten_with_the_last() -> None:
+    budgets = Budgets()
+    for _ in range(MAX_OPEN_COMMANDS):
+        assert budgets.may_open_command("phone")
+        budgets.on_command_begun("phone")
+    assert not budgets.may_open_command("phone")
+    assert budgets.may_open_command("tablet")
+    budgets.on_command_ended("phone")
+    assert budgets.may_open_command("phone")
+    for _ in range(MAX_OPEN_COMMANDS - 1):
+        budgets.on_command_ended("phone")
+    assert not budgets._open
 
 
 @given(st.lists(st.floats(0.0, 0.3), min_size=1, max_size=200))

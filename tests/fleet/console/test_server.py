@@ -31,6 +31,7 @@ from fleet.console.budgets import (
     CHECK_RATE,
     COMMAND_BURST,
     COMMAND_RATE,
+    MAX_OPEN_COMMANDS,
     PAGE_BURST,
     PAGE_RATE,
     REQUEST_BURST,
@@ -46,7 +47,7 @@ from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LAT
 from fleet.console.waiting_room import ADDRESS_BURST
 from schemas.bus import Sample, reply_message
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.keys import person_of
+from schemas.keys import car_token, command_key, person_of
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
@@ -60,7 +61,7 @@ GUESTS = (
     *("calm", "echo", "eva", "bad", "large", "late", "old", "owner", "stop"),
     *("hasty", "bomber", "merger", "nervous", "greedy"),
     *("giver", *(f"giver_{kind}" for kind in ("take", "give_back", "unpause", "do"))),
-    *("presser", "plotter", "pinger", "lister", "twotab", "tworeq", "viewer"),
+    *("presser", "plotter", "pinger", "lister", "twotab", "tworeq", "viewer", "twoways"),
     *(f"pupil{number}" for number in range(30)),
 )
 """The people who drive other cars."""
@@ -654,6 +655,41 @@ def test_commands_in_a_flood_reach_gateways_at_a_devices_rate(stage: ServerStage
     assert answers["done"] <= allowed_commands(since)
     assert begun.count(giver) <= allowed_commands(since)
     assert threads < threads_before + COMMAND_BURST / 2
+
+
+def test_a_device_with_all_its_commands_in_flight_takes_none_from_another_one(stage: ServerStage) -> None:
+    """Neither from another device of the same person, nor from another person."""
+    held: list[Any] = []
+    declared: Any = stage.fleet.bus.queryable(command_key("fleet", "holder", "whistle"), held.append)
+    token: Any = stage.fleet.bus.token(car_token("fleet", "holder"))
+    to_red = json.dumps({"t": "do", "id": 99, "verb": "whistle", "cars": ["red"]})
+    devices = [stage.device(name) for name in ("twoways", "twoways", "calm")]
+    with devices[0].socket() as full, devices[1].socket() as tablet, devices[2].socket() as other:
+        wait_for(lambda: "holder" in cars_of(full), "the console knows the car")
+        for number in range(MAX_OPEN_COMMANDS):
+            full.send(json.dumps({"t": "do", "id": number, "verb": "whistle", "cars": ["holder"]}))
+        wait_for(lambda: len(held) == MAX_OPEN_COMMANDS, "all are in flight")
+        full.send(to_red)
+        assert answers_until(full, "bad")["done"] == 0
+        for page in (tablet, other):
+            page.send(to_red)
+            assert answers_until(page, "done")["bad"] == 0
+        assert len(held) == MAX_OPEN_COMMANDS
+        while held:
+            held.pop().drop()
+        declared.undeclare()
+        token.undeclare()
+        for _ in range(MAX_OPEN_COMMANDS):
+            answers_until(full, "done")
+        full.send(to_red)
+        assert answers_until(full, "done")["bad"] == 0, "what has an outcome is in flight no more"
+
+
+def cars_of(page: ClientConnection) -> set[str]:
+    """Return the cars of the next state that a page gets."""
+    while (message := json.loads(page.recv(30)))["t"] != "state":
+        pass
+    return {car["name"] for car in message["cars"]}
 
 
 @pytest.mark.parametrize("kind", ["take", "give_back", "do"])
