@@ -1,8 +1,10 @@
 """The state of each car as the pages show it, from messages of the bus. Pure: time is an argument (s, monotonic)."""
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Final
 
 from fleet.client.claims import CarClaims, GatewayStarts, claims_of
@@ -10,6 +12,7 @@ from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnos
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
+from fleet.console.requests import MAX_CARS
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import keys, messages, topics
 from schemas.authority import Authority, People
@@ -26,6 +29,12 @@ MAX_LEDGER_ENTRIES: Final = 60
 """Maximum commands and log records of a car that a page can show."""
 SILENT_AFTER_S: Final = topics.TOPICS["state/safety"].stale_after_s or 0.0
 """Time without any message of a car, after which its card says how old it is: its gateway repeats this state."""
+MAX_LISTED_CARS: Final = MAX_CARS
+"""Maximum number of cars of the running fleet: as many as one message of a page may name."""
+# Without `fleet up` nobody lists the cars. Fifty gateways are the most that were measured on one bus. A place costs a
+# card ten times a second, and some 0.1 MB when its lists are full: anybody on the bus may take one.
+MAX_OTHER_CARS: Final = 64
+"""Maximum number of cars that the running fleet does not list."""
 _LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
 _SIDES: Final = ("left", "right")
 
@@ -60,8 +69,9 @@ class BatteryTrend:
 class CarView:
     """The newest messages of one car."""
 
-    def __init__(self, name: str, color: str) -> None:
+    def __init__(self, name: str, color: str, now: float = 0.0) -> None:
         self.name = name
+        self._since = now
         self.color = color
         self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Commands and log records, the newest last."""
@@ -80,6 +90,11 @@ class CarView:
         self._starts = GatewayStarts()
         self._changed_at: float | None = None
         """When the gateway joined or left the bus."""
+
+    @property
+    def last_sign_at(self) -> float:
+        """When the newest message came; before the first one, since when the car is in view."""
+        return self._since if self._heard_at is None else self._heard_at
 
     def on_message(self, topic: str, value: Any, now: float) -> None:
         """Handle a message of this car. topic: such as `sensor/range`."""
@@ -295,17 +310,50 @@ class CarView:
 
 
 class FleetView:
-    """The cars that the console knows: all that were on the bus since it started."""
+    """The cars that the console knows: all that were on the bus since it started, up to a bound.
+
+    Anybody on the bus may invent a name. A car that the running fleet lists always has a place. Any other takes a free
+    one, or that of the car that has been silent the longest. A car that is heard gives way to none.
+    """
 
     def __init__(self, color_of: Any) -> None:
         self._color_of = color_of
         self._cars: dict[str, CarView] = {}
+        self._listed: frozenset[str] = frozenset()
+        self.left_out = ""
+        """The car that had no place first, or gave its place up. Empty: none."""
 
-    def car(self, name: str) -> CarView:
-        """Return the view of a car. A new one is added."""
+    def list_cars(self, names: Iterable[str]) -> None:
+        """Set the cars that the running fleet lists. Those over the maximum are as any other."""
+        self._listed = frozenset(islice(filter(keys.is_name, names), MAX_LISTED_CARS))
+
+    def on_message(self, name: str, topic: str, value: Any, now: float) -> None:
+        """Handle a message of a car. topic: such as `sensor/range`. Without a place for the car, nothing is kept."""
+        if (car := self._placed(name, now)) is not None:
+            car.on_message(topic, value, now)
+
+    def _placed(self, name: str, now: float) -> CarView | None:
+        """Return the view of a car. A new one is added, if there is a place."""
         if name not in self._cars:
-            self._cars[name] = CarView(name, self._color_of(name, len(self._cars)))
+            if name not in self._listed and not self._make_room(MAX_OTHER_CARS - 1, now - SILENT_AFTER_S):
+                self.left_out = self.left_out or name
+                return None
+            self._cars[name] = CarView(name, self._color_of(name, len(self._cars)), now)
         return self._cars[name]
+
+    def _make_room(self, most: int, silent_since: float) -> bool:
+        """Forget cars that are not listed until these are left at most. Return False if one is heard since then."""
+        others = [car for name, car in self._cars.items() if name not in self._listed]
+        for car in sorted(others, key=lambda car: car.last_sign_at)[: max(0, len(others) - most)]:
+            if car.last_sign_at >= silent_since:
+                return False
+            self.left_out = self.left_out or car.name
+            del self._cars[car.name]
+        return True
+
+    def has_place(self, name: str) -> bool:
+        """Return True if a page may be told of this car."""
+        return name in self._cars or name in self._listed
 
     def look_up(self, name: str) -> CarView:
         """Return the view of a car, an empty one if there is no such car. None is added: a page may name any car."""
@@ -324,8 +372,12 @@ class FleetView:
     def on_presence(self, present: Iterable[str], now: float) -> None:
         """Handle the names of the cars whose gateways are on the bus."""
         there = set(present)
-        for name in there | set(self._cars):
-            self.car(name).on_presence(now, present=name in there)
+        for name in sorted(there - set(self._cars), key=lambda name: name not in self._listed):
+            if self._placed(name, now) is None:
+                break  # nor is there a place for those that follow
+        self._make_room(MAX_OTHER_CARS, math.inf)  # some may not be listed any more
+        for name, car in self._cars.items():
+            car.on_presence(now, present=name in there)
         for name in [each for each in self._cars if each.startswith(TEMPORARY_PREFIX) and each not in there]:
             del self._cars[name]  # nobody misses it: its car blinked, and got a name of its own
 

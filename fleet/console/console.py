@@ -19,7 +19,7 @@ from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
 from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import is_shown, message_in
-from fleet.console.car_view import FleetView
+from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
@@ -89,6 +89,7 @@ class Console:
         """The colors of the cars, as the running fleet says. `fleet reload` changes them."""
         self._unrecorded = ""
         """Why not everything is recorded, as the running fleet says."""
+        self._said_left_out = False
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
         """The course of the last STOP."""
@@ -127,6 +128,7 @@ class Console:
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
         # Before any message comes: a car keeps the color that it has first.
         self._colors = await self._fleet.call(ask_colors, bus, name)
+        self._view.list_cars(self._colors)
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
@@ -154,6 +156,7 @@ class Console:
         self._unrecorded = found[1].unrecorded
         if colors := colors_of(found[1]):
             self._colors = colors
+            self._view.list_cars(colors)
             self._view.update_colors()
 
     async def _renew_leases(self) -> None:
@@ -237,11 +240,18 @@ class Console:
         for sample in self._readings.take().values():
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
-                self._view.car(key.car).on_message(key.topic, message, now)
+                self._view.on_message(key.car, key.topic, message, now)
                 if key.topic == "state/safety" and self._report is not None:
                     self._report.on_safety(key.car, message, now)
         present = self._present
         self._view.on_presence(present, now)
+        if self._view.left_out and not self._said_left_out:
+            self._said_left_out = True
+            log.warning(
+                "the pages do not show %s and further cars: more than %d that the running fleet does not list are on "
+                "the bus. Each of them is stopped by STOP",
+                self._view.left_out, MAX_OTHER_CARS,
+            )  # fmt: skip
         if self._report is not None:
             self._report.on_presence(present)
         token = f"{self._fleet.sync.name}/{keys.COORDINATOR}"
@@ -266,7 +276,7 @@ class Console:
         if (found := message_in(sample, logging.WARNING)) is None:
             return
         (key, event), now = found, time.monotonic()
-        self._view.car(key.car).on_message(key.topic, event, now)
+        self._view.on_message(key.car, key.topic, event, now)
         if key.topic != "event/command":
             return
         if self._report is not None:
@@ -413,10 +423,10 @@ class Console:
         for press in self._presses.on_stop(now):
             self._end(press, "All cars were paused." if request.verb == Verb.PAUSE else "All cars were stopped.")
         self._stops += 1
-        present = {*self._present, *self._view.names}
+        self._view.on_presence(self._present, now)
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
-        self._report = StopReport(self._stops, request.verb, sender, present, now, at_ms)
-        self._newest_stop = operator.stop(request, self._report)
+        self._report = StopReport(self._stops, request.verb, sender, self._view.names, now, at_ms)
+        self._newest_stop = operator.stop(request, self._report, self._view.has_place)
 
     async def is_stop_taken(self) -> bool:
         """Wait until a gateway has answered the newest STOP of all cars. Return False if none does in time.

@@ -12,7 +12,6 @@ from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
-from fleet.console.bus_message import is_shown
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from schemas import keys, messages
@@ -109,14 +108,16 @@ class ConsoleOperator:
 
     # ------------------------------------------------------------------ STOP
 
-    def stop(self, request: CommandRequest, report: StopReport) -> PendingCommand:
-        """Stop every car, and return the command. The report gets the outcomes."""
+    def stop(self, request: CommandRequest, report: StopReport, is_shown: Callable[[str], bool]) -> PendingCommand:
+        """Stop every car, and return the command. The report gets the outcomes of the cars that pages show."""
         command = self._fleet.sync.send(request)
         report.command_id = command.id
-        self.spawn(self._report_stop(request, command, report))
+        self.spawn(self._report_stop(request, command, report, is_shown))
         return command
 
-    async def _report_stop(self, request: CommandRequest, command: PendingCommand, report: StopReport) -> None:
+    async def _report_stop(
+        self, request: CommandRequest, command: PendingCommand, report: StopReport, is_shown: Callable[[str], bool]
+    ) -> None:
         # A person who stops again asks for the outcome of the newest stop, which concerns the same cars. A wait takes a
         # thread, for as long as the slowest car needs to stand: ten stops a second would take 60 of them.
         who = (report.sender, request.verb)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.console.car_view import SILENT_AFTER_S, BatteryTrend, FleetView
+from fleet.console.car_view import MAX_LISTED_CARS, MAX_OTHER_CARS, SILENT_AFTER_S, BatteryTrend, FleetView
 from gateway.protocol.platforms import parse_platform
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -10,14 +10,14 @@ from schemas.gen import fleet_v1_pb2 as pb
 def view_of(platform: str = "arduino", capabilities: tuple[str, ...] | None = None) -> FleetView:
     view = FleetView(lambda *_: "#ff0000")
     known = sorted(parse_platform(platform).capabilities) if capabilities is None else capabilities
-    view.car("red").on_message("state/health", pb.Health(platform=platform, capabilities=known), 0.0)
+    view.on_message("red", "state/health", pb.Health(platform=platform, capabilities=known), 0.0)
     return view
 
 
 def test_a_reading_that_is_stale_is_left_out() -> None:
     view = view_of()
-    view.car("red").on_message("sensor/range", pb.Range(range_m=1.234), 10.0)
-    view.car("red").on_message("sensor/line", pb.Line(left_inner=True), 12.0)
+    view.on_message("red", "sensor/range", pb.Range(range_m=1.234), 10.0)
+    view.on_message("red", "sensor/line", pb.Line(left_inner=True), 12.0)
     (car,) = view.as_list(13.0)
     assert car["range_m"] == 1.23
     (car,) = view.as_list(13.1)
@@ -27,14 +27,14 @@ def test_a_reading_that_is_stale_is_left_out() -> None:
 
 def test_no_echo_is_no_distance() -> None:
     view = view_of()
-    view.car("red").on_message("sensor/range", pb.Range(no_echo=True), 10.0)
+    view.on_message("red", "sensor/range", pb.Range(no_echo=True), 10.0)
     assert view.as_list(10.0)[0]["range_m"] is None
 
 
 def test_the_motors_rest_on_what_their_gateway_says() -> None:
     view = view_of()
     assert view.as_list(0.0)[0]["motors"] == {"state": "unknown", "basis": ""}
-    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="sent"), 10.0)
+    view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="sent"), 10.0)
     assert view.as_list(10.0)[0]["motors"] == {"state": "off", "basis": "sent"}
 
 
@@ -42,7 +42,7 @@ def test_each_sender_has_its_name() -> None:
     view = view_of()
     safety = pb.Safety(hold=pb.Hold(by="us"), lease=pb.Lease(holder="mia", kind="person"))
     safety.estops.add(id="e1", by="us", why="smoke", scope="fleet")
-    view.car("red").on_message("state/safety", safety, 10.0)
+    view.on_message("red", "state/safety", safety, 10.0)
     (car,) = view.as_list(10.0)
     assert (car["hold"], car["lease"], car["estops"][0]["by"]) == (
         "us",
@@ -54,8 +54,8 @@ def test_each_sender_has_its_name() -> None:
 def test_a_gateway_that_has_gone_says_for_how_long() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
-    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
-    view.car("red").on_message("state/mode", pb.Mode(asked="manual", verdict="confirmed"), 10.0)
+    view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
+    view.on_message("red", "state/mode", pb.Mode(asked="manual", verdict="confirmed"), 10.0)
     (car,) = view.as_list(11.0)
     assert (car["gateway"], car["motors"]["basis"], car["mode"]["verdict"]) == (True, "shown", "confirmed")
     view.on_presence([], 20.0)
@@ -71,11 +71,11 @@ def test_a_gateway_that_has_gone_says_for_how_long() -> None:
 def test_a_link_without_a_gateway_is_not_online() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
-    view.car("red").on_message("state/link", pb.Link(state="online"), 10.0)
+    view.on_message("red", "state/link", pb.Link(state="online"), 10.0)
     assert view.as_list(10.5)[0]["link"]["state"] == "online"
     view.on_presence([], 11.0)
     assert view.as_list(11.5)[0]["link"]["state"] == "no gateway"
-    assert view.car("red").describe_gateway() == []
+    assert view.look_up("red").describe_gateway() == []
 
 
 def test_a_returning_gateway_does_not_bring_the_last_ones_claims_back() -> None:
@@ -92,24 +92,24 @@ def test_a_returning_gateway_does_not_bring_the_last_ones_claims_back() -> None:
         return car["link"]["state"], car["mode"]["verdict"], car["motors"]["basis"]
 
     for topic, state in states.items():
-        view.car("red").on_message(topic, state, 20.0)
+        view.on_message("red", topic, state, 20.0)
     assert told() == ("online", "confirmed", "shown")
     view.on_presence([], 20.2)
     view.on_presence(["red"], 20.9)
     assert told() == ("unknown", "assumed", ""), "nobody has said anything yet"
     for topic, state in states.items():
-        view.car("red").on_message(topic, state, 21.0)
-    view.car("red").on_message("state/link", pb.Link(state="lost", boot_id="b"), 21.0)
+        view.on_message("red", topic, state, 21.0)
+    view.on_message("red", "state/link", pb.Link(state="lost", boot_id="b"), 21.0)
     assert told() == ("lost", "assumed", ""), "the new one speaks: all else was said by the last one"
     for topic, state in states.items():
-        view.car("red").on_message(topic, state, 21.0)
+        view.on_message("red", topic, state, 21.0)
     assert told() == ("lost", "assumed", ""), "late messages of the last one"
 
 
 def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
-    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
+    view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
     assert view.as_list(10.0)[0]["motors"]["basis"] == "shown"
     (car,) = view.as_list(60.0)
     assert car["motors"] == {"state": "unknown", "basis": "", "past": "off (shown)", "past_s": 50}
@@ -119,12 +119,12 @@ def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
 def test_a_card_without_news_says_its_age_and_claims_no_link(after_s: float, silent_s: int | None) -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
-    view.car("red").on_message("state/link", pb.Link(state="online"), 9.0)
-    view.car("red").on_message("sensor/range", pb.Range(range_m=0.5), 10.0)
+    view.on_message("red", "state/link", pb.Link(state="online"), 9.0)
+    view.on_message("red", "sensor/range", pb.Range(range_m=0.5), 10.0)
     (car,) = view.as_list(10.0 + after_s)
     assert car.get("silent_s") == silent_s
     assert car["link"]["state"] == "unknown"
-    view.car("red").on_message("state/link", pb.Link(state="online"), 10.0 + after_s)
+    view.on_message("red", "state/link", pb.Link(state="online"), 10.0 + after_s)
     (car,) = view.as_list(10.0 + after_s)
     assert ("silent_s" in car, car["link"]["state"]) == (False, "online")
 
@@ -132,7 +132,7 @@ def test_a_card_without_news_says_its_age_and_claims_no_link(after_s: float, sil
 def test_a_car_that_cannot_show_its_stops_says_so() -> None:
     view = view_of()
     health = pb.Health(platform="arduino", shows_stops="no", shows_stops_words="its reports do not react to frames")
-    view.car("red").on_message("state/health", health, 1.0)
+    view.on_message("red", "state/health", health, 1.0)
     (car,) = view.as_list(1.0)
     assert (car["shows"], car["shows_words"]) == ("no", "its reports do not react to frames")
 
@@ -162,7 +162,7 @@ def test_a_trend_needs_half_a_minute_and_ignores_noise() -> None:
 
 def test_the_last_event_and_the_ledger() -> None:
     view = view_of()
-    car = view.car("red")
+    car = view.look_up("red")
     for number in range(100):
         car.on_message(
             "event/command", pb.CommandEvent(verb="drive", phase="rejected", sender="mia", words=f"no {number}"), 1.0
@@ -175,8 +175,58 @@ def test_the_last_event_and_the_ledger() -> None:
 def test_a_car_that_a_page_names_is_not_added_and_a_temporary_one_leaves_nothing() -> None:
     view = view_of()
     assert view.look_up("ghost").as_dict(0.0)["gateway"] is False
-    assert view.look_up("red") is view.car("red")
+    assert view.names == ["red"]
     view.on_presence(["red", "temporary-setup-1"], 1.0)
     assert view.names == ["red", "temporary-setup-1"]
     view.on_presence([], 2.0)
     assert view.names == ["red"], "red has gone, too, but somebody looks for it"
+
+
+def invent(view: FleetView, count: int, now: float, prefix: str = "junk") -> None:
+    """Hear a message of each of many cars that nobody knows."""
+    for number in range(count):
+        view.on_message(f"{prefix}{number}", "state/safety", pb.Safety(motors="on"), now)
+
+
+def test_cars_that_nobody_lists_have_places_up_to_a_bound() -> None:
+    view = view_of()
+    invent(view, MAX_OTHER_CARS - 1, 1.0)
+    assert view.left_out == ""
+    invent(view, 10 * MAX_OTHER_CARS, 1.0)
+    assert len(view.names) == MAX_OTHER_CARS
+    assert view.left_out == f"junk{MAX_OTHER_CARS - 1}"
+    assert "red" in view.names, "it was heard 1 s ago"
+    view.on_presence([f"token{number}" for number in range(1000)], 1.0)
+    assert len(view.names) == MAX_OTHER_CARS
+
+
+def test_the_car_that_is_silent_the_longest_gives_way_and_one_that_is_heard_to_none() -> None:
+    view = view_of()
+    invent(view, MAX_OTHER_CARS - 1, 1.0)
+    now = 1.0
+    for _ in range(20):
+        now += SILENT_AFTER_S / 2
+        view.on_message("red", "state/safety", pb.Safety(motors="off"), now)
+        invent(view, MAX_OTHER_CARS, now, f"more{now:.0f}_")
+        view.on_presence([f"token{now:.0f}_{number}" for number in range(100)], now)
+        assert "red" in view.names
+        assert len(view.names) == MAX_OTHER_CARS
+    assert "junk0" not in view.names
+
+
+def test_a_car_that_the_fleet_lists_always_has_a_place() -> None:
+    view = view_of()
+    invent(view, MAX_OTHER_CARS, 1.0)
+    view.list_cars(["red", "black", "not a name"])
+    view.on_message("black", "sensor/range", pb.Range(range_m=1.0), 1.0)
+    later = 1.0 + 10 * SILENT_AFTER_S
+    invent(view, MAX_OTHER_CARS, later, "more")
+    assert {"red", "black"} < set(view.names), "they are silent, and somebody looks for them"
+    assert len(view.names) == MAX_OTHER_CARS + 2
+    assert [view.has_place(name) for name in ("black", "more0", "ghost")] == [True, True, False]
+    # Whoever says what the fleet lists, and says it again and again, gains no more.
+    for number in range(10):
+        names = [f"list{number}_{each}" for each in range(2 * MAX_LISTED_CARS)]
+        view.list_cars(names)
+        view.on_presence(names, later)
+    assert len(view.names) <= MAX_OTHER_CARS + MAX_LISTED_CARS

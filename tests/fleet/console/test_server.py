@@ -25,7 +25,7 @@ from websockets.typing import Origin
 
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
-from fleet.client.commands import drive_request
+from fleet.client.commands import drive_request, resume_request
 from fleet.console.budgets import (
     CHECK_BURST,
     CHECK_RATE,
@@ -36,6 +36,7 @@ from fleet.console.budgets import (
     PAGE_RATE,
     REQUEST_BURST,
 )
+from fleet.console.car_view import MAX_OTHER_CARS
 from fleet.console.connection_limit import MAX_PER_DEVICE
 from fleet.console.console import MAX_PAGES_OF_DEVICE
 from fleet.console.log_rate import LOG_BURST
@@ -45,9 +46,11 @@ from fleet.console.plot_buffer import MAX_SERIES
 from fleet.console.request_body import BODY_TIMEOUT_S
 from fleet.console.server import MAX_MESSAGE_BYTES, SENT_TOO_MUCH, TRY_AGAIN_LATER
 from fleet.console.waiting_room import ADDRESS_BURST
-from schemas.bus import Sample, reply_message
+from schemas.bus import Bus, Sample, reply_message
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.keys import car_token, command_key, person_of
+from schemas.keys import car_token, command_key, person_of, topic_key
+from schemas.messages import encoding_of
+from schemas.topics import Qos
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
@@ -603,6 +606,48 @@ def note_stop(sample: Sample, begun: list[str]) -> None:
     event: Any = sample.message()
     if (event.verb, event.phase) == ("stop", "asked"):
         begun.append(person_of(event.sender))
+
+
+JUNK_TICKS = 60
+JUNK_PER_TICK = 100
+"""Names that nobody knows, invented at each tick of the console, of 0.1 s."""
+MAX_JUNK_MB = 8.0
+"""Maximum growth while five sixths of the names come. It was 1.6 MB."""
+
+
+def test_invented_cars_on_the_bus_cost_a_real_one_nothing(stage: ServerStage) -> None:
+    server, payload = psutil.Process(stage.console.process.pid), pb.Safety(motors="on").SerializeToString()
+    encoding, most = encoding_of("fleet.v1.Safety"), 0
+    stage.person.ask(resume_request(), ["red"])
+    with Bus.open(stage.fleet.endpoint) as bus, stage.device("mia").socket() as page:
+        press: dict[str, Any] = {"press": 1, "cars": ["red"], "motion": "forward"}
+        ticks, rss_mb, lost = 0, 0.0, []
+        while ticks < JUNK_TICKS:
+            message = json.loads(page.recv(30))
+            if message["t"] == "state":
+                red = next(car for car in message["cars"] if car["name"] == "red")
+                lost += [red] if not red["gateway"] or "silent_s" in red else []
+                most = max(most, len(message["cars"]))
+            assert message["t"] not in ("over", "refused"), message
+            if message["t"] != "tick":
+                continue
+            page.send(json.dumps({"t": "echo" if ticks else "press", **press, "n": message["n"]}))
+            ticks += 1
+            if ticks == JUNK_TICKS // 6:
+                rss_mb = server.memory_info().rss / 1e6
+                wait_for(lambda: stage.judge.driving, "red drives")
+            for number in range(JUNK_PER_TICK):
+                name = f"junk{ticks}_{number}"
+                bus.put_again(topic_key("fleet", name, "state/safety"), payload, encoding, 0, Qos.STATE)
+                if number < JUNK_PER_TICK // 10:
+                    bus.token(car_token("fleet", name))
+        assert not lost
+        assert most == MAX_OTHER_CARS
+        assert server.memory_info().rss / 1e6 < rss_mb + MAX_JUNK_MB
+        assert stage.judge.driving, "it has driven all the time"
+        page.send(json.dumps({"t": "stop", "id": "junk"}))
+        wait_for(lambda: not stage.judge.driving, "red stands")
+    assert stage.log().count("further cars") == 1
 
 
 def test_a_person_who_stops_again_and_again_takes_no_thread_for_each(stage: ServerStage) -> None:
