@@ -41,6 +41,7 @@ from schemas.platform_name import AUTO
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
+from schemas.running_cars import RunningMark
 from schemas.words import FrameVerdict, Level, LinkState, Motors
 
 CHECK_INTERVAL_S: Final = 0.2
@@ -129,6 +130,8 @@ class CarGateway:
             now_ns=now_ns,
         )
         self._state_damage, self._not_taken = state_file.damage, state_file.not_taken
+        self._mark = RunningMark(settings.state_dir, settings.fleet, settings.car)
+        self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = self._new_decoder()
@@ -217,6 +220,7 @@ class CarGateway:
             if self._link is not None:
                 await self._link.close()
             self._save_learned(self._loop.time(), at_once=True)
+            self._mark.end()
             self._flush()
             self._publisher.on_bus_connected(self._loop.time(), at_once=True)
             self._publish_states(self._loop.time(), force=True)
@@ -537,6 +541,7 @@ class CarGateway:
                 self._publish_states(now)
             if now >= next_health:
                 self._save_learned(now)
+                self._mark.renew()
                 next_health = now + HEALTH_INTERVAL_S
                 self._publish_health(now)
                 self._worst_lag_s = 0.0

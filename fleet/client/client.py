@@ -41,12 +41,13 @@ from fleet.client.commands import (
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.job_threads import JobThreads
 from fleet.client.lease import Lease
+from fleet.client.lost_hub import explained
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.reading import Reading, Watch, reading_of
 from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
-from schemas.bus import Bus, BusError, Failure, Sample, canon
+from schemas.bus import Bus, BusError, Failure, NoFleet, Sample, canon
 from schemas.commands import COMMANDS
 from schemas.topics import Qos
 from schemas.words import ProcessKind, Rank, RunState, Scope, Verb
@@ -102,7 +103,10 @@ class Fleet:
         self.sender = sender or default_sender(person)
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
-        self.bus = Bus.open(endpoint, start_hub=start_hub)
+        try:
+            self.bus = Bus.open(endpoint, start_hub=start_hub)
+        except NoFleet as error:
+            raise explained(error) from None
         self._closed = False
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()

@@ -17,6 +17,7 @@ from fleet.client.commands import (
     resume_request,
     stop_request,
 )
+from fleet.client.lost_hub import LostHub
 from fleet.client.outcome import Outcome
 from fleet.commands.fleets import client_in, in_all_fleets
 from fleet.commands.options import (
@@ -122,6 +123,8 @@ def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
         return client_in(connect, fleet)
     except NoFleet:  # nothing is running, which is no fault
         raise
+    except LostHub as error:
+        raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
     except BusError as error:
         words = f"{NOT_STOPPED}: the fleet's bus does not answer. If a car moves, go to the car."
         raise BusError(f"{words} ({error})") from None

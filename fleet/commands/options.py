@@ -12,12 +12,13 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
+from fleet.client.lost_hub import explained
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.commands.fleets import open_client
 from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
-from schemas.bus import BadEndpoint, BusError
+from schemas.bus import BadEndpoint, BusError, NoFleet
 from schemas.words import Reason
 
 _Function = Callable[..., Any]
@@ -86,7 +87,8 @@ def cli_errors() -> Iterator[None]:
             raise WrongFile(str(error)) from None
         raise click.UsageError(complete_hints(str(error), hint_options())) from None
     except BusError as error:
-        raise click.ClickException(complete_hints(str(error), hint_options())) from None
+        words = str(explained(error) if isinstance(error, NoFleet) else error)
+        raise click.ClickException(complete_hints(words, hint_options())) from None
 
 
 take_option = click.option("--take", is_flag=True, help="Take the car over from another person.")

@@ -109,7 +109,8 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     if not is_loopback(endpoint):
         raise NoFleet(
             f"Nothing listens at {endpoint}, and a hub starts by itself on loopback only. Start a Zenoh router there "
-            "(or `fleet up --insecure-lan`), or name another place with --connect."
+            "(or `fleet up --insecure-lan`), or name another place with --connect.",
+            endpoint,
         )
     import subprocess
 

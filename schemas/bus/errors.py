@@ -8,6 +8,10 @@ class BusError(Exception):
 class NoFleet(BusError):
     """Nothing listens at the endpoint."""
 
+    def __init__(self, words: str, endpoint: str) -> None:
+        super().__init__(words)
+        self.endpoint = endpoint
+
 
 class BadEndpoint(BusError):
     """An endpoint that is invalid for Zenoh, or at which no hub may listen."""

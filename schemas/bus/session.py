@@ -59,7 +59,8 @@ class Bus:
         elif not accepts(where):
             raise NoFleet(
                 "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
-                f"(Looked at {where}; --connect names another place.)"
+                f"(Looked at {where}; --connect names another place.)",
+                where,
             )
         with signals.held_back():
             try:

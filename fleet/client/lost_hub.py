@@ -1,0 +1,25 @@
+"""Tells a hub that has ended from a fleet that does not run: gateways go on without a hub, and so may their cars."""
+
+from typing import Final
+
+from schemas.bus import BusError, NoFleet
+from schemas.running_cars import running_cars
+
+_MAX_CARS_NAMED: Final = 3
+
+
+class LostHub(BusError):
+    """Nothing listens at the endpoint, but gateways of this user run on this computer."""
+
+
+def explained(error: NoFleet) -> BusError:
+    """Return the error itself, or a LostHub if gateways run without a hub."""
+    cars = running_cars(error.endpoint)
+    if not cars:
+        return error
+    more = f" and {len(cars) - _MAX_CARS_NAMED} more" if len(cars) > _MAX_CARS_NAMED else ""
+    listed = ", ".join(cars[:_MAX_CARS_NAMED]) + more
+    return LostHub(
+        f"The hub at {error.endpoint} does not answer, but gateways run here ({listed}): "
+        "cars may move. It is started again: repeat this in some seconds. Else go to the cars, and restart `fleet up`."
+    )
