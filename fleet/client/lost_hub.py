@@ -12,14 +12,19 @@ class LostHub(BusError):
     """Nothing listens at the endpoint, but gateways of this user run on this computer."""
 
 
+def describe_running(endpoint: str) -> str:
+    """Return words that gateways of this bus run on this computer. Empty: none does."""
+    cars = running_cars(endpoint)
+    more = f" and {len(cars) - _MAX_CARS_NAMED} more" if len(cars) > _MAX_CARS_NAMED else ""
+    return f"gateways run here ({', '.join(cars[:_MAX_CARS_NAMED])}{more}): cars may move" if cars else ""
+
+
 def explained(error: NoFleet) -> BusError:
     """Return the error itself, or a LostHub if gateways run without a hub."""
-    cars = running_cars(error.endpoint)
-    if not cars:
+    running = describe_running(error.endpoint)
+    if not running:
         return error
-    more = f" and {len(cars) - _MAX_CARS_NAMED} more" if len(cars) > _MAX_CARS_NAMED else ""
-    listed = ", ".join(cars[:_MAX_CARS_NAMED]) + more
     return LostHub(
-        f"The hub at {error.endpoint} does not answer, but gateways run here ({listed}): "
-        "cars may move. It is started again: repeat this in some seconds. Else go to the cars, and restart `fleet up`."
+        f"The hub at {error.endpoint} does not answer, but {running}. It is started again: repeat this in some "
+        "seconds. Else go to the cars, and restart `fleet up`."
     )

@@ -48,7 +48,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
         fleet = the_fleet(bus, fleet)
         found = ask_status(bus, fleet)
         if not found:
-            raise not_running(fleet)
+            raise not_running(fleet, connect)
     for each in found:
         if as_json:
             click.echo(messages.to_json(each))
@@ -93,7 +93,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
         sender = default_sender(chosen_person())
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
-            raise not_running(fleet)
+            raise not_running(fleet, connect)
         if answer.status == Phase.REJECTED:
             raise click.ClickException(answer.words)
         last, gone = _until_ended(bus, fleet, received)
@@ -148,7 +148,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
         fleet = the_fleet(bus, fleet)
         answer = ask_service(bus, fleet, "reload", default_sender(chosen_person()))
         if answer is None:
-            raise not_running(fleet)
+            raise not_running(fleet, connect)
     if as_json:
         click.echo(messages.to_json(answer))
     else:

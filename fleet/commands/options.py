@@ -12,13 +12,13 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
-from fleet.client.lost_hub import explained
+from fleet.client.lost_hub import describe_running, explained
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.commands.fleets import open_client
 from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
-from schemas.bus import BadEndpoint, BusError, NoFleet
+from schemas.bus import BadEndpoint, BusError, NoFleet, resolve_endpoint
 from schemas.words import Reason
 
 _Function = Callable[..., Any]
@@ -61,8 +61,11 @@ def with_client(function: _Function) -> _Function:
     return command
 
 
-def not_running(fleet: str) -> click.ClickException:
-    """Return the error that no supervisor answers."""
+def not_running(fleet: str, connect: str | None) -> click.ClickException:
+    """Return the error that no supervisor answers. Gateways may run all the same, and their cars may move."""
+    if running := describe_running(resolve_endpoint(connect)):
+        words = f"No `fleet up` of {keys.describe_fleet(fleet)} answers, but {running}. Repeat this in some seconds."
+        return click.ClickException(f"{words} `fleet list` shows the cars.")
     return click.ClickException(f"{keys.describe_fleet(fleet).capitalize()} is not running. Start it with `fleet up`.")
 
 

@@ -52,7 +52,7 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
     if as_json:
         click.echo(json.dumps({"ready": ok, "cars": wanted, "missing": missing}))
     elif not wanted:
-        raise not_running(fleet)
+        raise not_running(fleet, connect)
     else:
         click.echo(describe_start(wanted, missing, ""), err=not ok)
     raise SystemExit(0 if ok else 1)
