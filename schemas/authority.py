@@ -233,6 +233,14 @@ class LeaseState:
 Mark = Hold | Estop | FleetPause | Loan | LeaseState
 
 
+def binding_pause(pauses: Iterable[Any]) -> Any:
+    """Return the pause that binds: the newest of the highest rank. None: there is no pause.
+
+    pauses: FleetPause, or those of a fleet.v1.Safety; oldest first.
+    """
+    return max(reversed(list(pauses)), key=lambda pause: strength(rank_of(pause.rank)), default=None)
+
+
 # ---------------------------------------------------------------------- rights
 
 
@@ -391,7 +399,7 @@ class Authority:
         denial = self.may_drive(sender)
         if denial is not None or not self.pauses or sender.kind is Rank.LEAD:
             return denial
-        return Denial(Bar.PAUSED, self.pauses[-1])
+        return Denial(Bar.PAUSED, binding_pause(self.pauses))
 
     def _held(self, sender: Sender) -> Denial | None:
         hold = self.hold

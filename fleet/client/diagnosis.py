@@ -10,6 +10,7 @@ from typing import Any, Final
 from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
+from schemas.authority import binding_pause
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import name_of
 from schemas.local_time import clock
@@ -236,7 +237,8 @@ def _paused(e: CarEvidence) -> str:
     safety = e.of("state/safety")
     if safety is None or not safety.pauses:
         return ""
-    return f"The fleet is paused by {_who(safety.pauses[-1], safety.pauses[-1].stamp)}."
+    pause = binding_pause(safety.pauses)
+    return f"The fleet is paused by {_who(pause, pause.stamp)}."
 
 
 def _lent(e: CarEvidence) -> str:

@@ -36,6 +36,7 @@ from fleet.commands.params import (
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
+from schemas.authority import binding_pause
 from schemas.bus import Sample, intersects
 from schemas.colors import car_color, hex_color
 from schemas.suggestion import did_you_mean
@@ -147,7 +148,7 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
         "driver": safety.lease.holder if safety and safety.HasField("lease") else None,
         "driver_kind": safety.lease.kind if safety and safety.HasField("lease") else None,
         "hold": safety.hold.by if safety and safety.HasField("hold") else None,
-        "paused": safety.pauses[-1].by if safety and safety.pauses else None,
+        "paused": binding_pause(safety.pauses).by if safety and safety.pauses else None,
         "lent": safety.loan.to if safety and safety.HasField("loan") else None,
         "estops": [estop.id for estop in safety.estops] if safety else [],
         "motors": claimed.motors.what if safety else None,

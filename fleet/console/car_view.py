@@ -15,7 +15,7 @@ from fleet.console.frame_log import describe_gateway
 from fleet.console.requests import MAX_CARS
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import keys, messages, topics
-from schemas.authority import Authority, People
+from schemas.authority import Authority, People, binding_pause
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0
@@ -254,8 +254,8 @@ class CarView:
         if safety.HasField("loan"):
             until_s = round(safety.stamp.seconds + safety.loan.expires_in_s, -1)
             shown["loan"] = {"to": safety.loan.to, "by": safety.loan.by, "until_s": until_s}
-        if safety.pauses:
-            shown["pause"] = {"by": safety.pauses[-1].by, "why": safety.pauses[-1].why}
+        if (pause := binding_pause(safety.pauses)) is not None:
+            shown["pause"] = {"by": pause.by, "why": pause.why}
         shown["people"] = [*safety.people.drivers, *safety.people.others]
         shown["estops"] = [
             {

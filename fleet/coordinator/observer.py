@@ -9,7 +9,7 @@ from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import PersonRank
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation, Refusal
 from schemas import keys, messages, topics
-from schemas.authority import NO_PEOPLE, People, PersonRole
+from schemas.authority import NO_PEOPLE, People, PersonRole, binding_pause
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.platform_name import AUTO
@@ -167,7 +167,7 @@ class FleetObserver:
             doubted=health is not None and bool(health.fields["doubted"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
             estopped_by=estops[0].by if estops else None,
-            paused_by=pauses[-1].by if pauses else None,
+            paused_by=binding_pause(pauses).by if pauses else None,
             lent_to=loan.to if isinstance(loan, pb.Loan) else None,
             driven_by=str(driver) or None,
         )

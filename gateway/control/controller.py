@@ -41,7 +41,7 @@ from gateway.control.stops import sequences
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.platforms import Profile
-from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender
+from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
 from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
@@ -399,7 +399,7 @@ class Controller:
             fix = f": `fleet resume {self.car}`" if ends else " (a lead)"
             parts.append(f"still on hold by {safety.hold.by}{fix}")
         if safety.pauses and not resume.ids:
-            parts.append(f"still paused by {safety.pauses[-1].by}: `fleet unpause`")
+            parts.append(f"still paused by {binding_pause(safety.pauses).by}: `fleet unpause`")
         stays = Reason.ESTOPPED if safety.estops else Reason.HELD if safety.hold else None
         return self._done(pending, "; ".join(parts), now, None if resume.ids else stays)
 

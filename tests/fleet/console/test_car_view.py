@@ -4,7 +4,9 @@ import pytest
 
 from fleet.console.car_view import MAX_LISTED_CARS, MAX_OTHER_CARS, SILENT_AFTER_S, BatteryTrend, FleetView
 from gateway.protocol.platforms import parse_platform
+from schemas.authority import Right, Sender
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import Rank
 
 
 def view_of(platform: str = "arduino", capabilities: tuple[str, ...] | None = None) -> FleetView:
@@ -230,3 +232,26 @@ def test_a_car_that_the_fleet_lists_always_has_a_place() -> None:
         view.list_cars(names)
         view.on_presence(names, later)
     assert len(view.names) <= MAX_OTHER_CARS + MAX_LISTED_CARS
+
+
+@pytest.mark.parametrize("ranks", [("lead", "person"), ("person", "lead"), ("lead", "person", "person")])
+def test_the_pause_that_is_shown_is_the_one_that_binds(ranks: tuple[str, ...]) -> None:
+    """Only a lead ends a lead's pause, whoever has paused after it."""
+    view, safety = view_of(), pb.Safety(motors="off")
+    for number, rank in enumerate(ranks):
+        safety.pauses.add(id=str(number), by=f"{rank}@x-{number}", why=f"{rank} {number}", rank=rank)
+    view.on_message("red", "state/safety", safety, 1.0)
+    (car,) = view.as_list(1.0)
+    at = ranks.index("lead")
+    assert car["pause"] == {"by": f"lead@x-{at}", "why": f"lead {at}"}
+    denied = view.authority["red"].may(Sender("mia", Rank.PERSON), Right.MOVE)
+    assert denied is not None
+    assert denied.mark == view.authority["red"].pauses[at]
+
+
+def test_of_pauses_of_one_rank_the_newest_is_shown() -> None:
+    view, safety = view_of(), pb.Safety(motors="off")
+    for by in ("ann", "bob"):
+        safety.pauses.add(id=by, by=by, rank="person")
+    view.on_message("red", "state/safety", safety, 1.0)
+    assert view.as_list(1.0)[0]["pause"]["by"] == "bob"
