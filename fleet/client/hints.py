@@ -10,7 +10,21 @@ from typing import Final
 from schemas.keys import DEFAULT_FLEET
 
 WITHOUT_BUS: Final = frozenset(
-    ("bind", "check", "demo", "example", "init", "plan try", "play", "replay", "scan", "schema", "sessions", "sim")
+    (
+        "bind",
+        "check",
+        "demo",
+        "example",
+        "find",
+        "init",
+        "plan try",
+        "play",
+        "replay",
+        "scan",
+        "schema",
+        "sessions",
+        "sim",
+    )
 )
 """Commands that take no --fleet."""
 _PROPOSED: Final = re.compile(r"`(fleet [a-z][^`]*)`")
