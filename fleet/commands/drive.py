@@ -18,7 +18,7 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.lost_hub import LostHub
-from fleet.client.outcome import Outcome
+from fleet.client.outcome import Outcome, bus_lost_words
 from fleet.commands.fleets import client_in, in_all_fleets
 from fleet.commands.options import (
     bus_options,
@@ -126,8 +126,7 @@ def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
     except LostHub as error:
         raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
     except BusError as error:
-        words = f"{NOT_STOPPED}: the fleet's bus does not answer. If a car moves, go to the car."
-        raise BusError(f"{words} ({error})") from None
+        raise BusError(f"{bus_lost_words('a car')} ({error})") from None
 
 
 def _stop(

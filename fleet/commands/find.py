@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from fleet.commands.options import cli_errors, json_option
-from fleet.commands.output import echo_safely
+from fleet.commands.output import aligned, echo_safely
 from fleet.commands.params import Duration, car_option
 from fleet.recording import time_spec
-from fleet.recording.session_dir import is_session
-from fleet.recording.session_lookup import sessions_place
+from fleet.recording.session_lookup import sessions_in, sessions_place
 from schemas.local_time import date_and_clock, with_offset
 
 if TYPE_CHECKING:
@@ -71,12 +70,10 @@ def find(
         for path, hit in found:
             click.echo(json.dumps(_to_dict(path, hit)))
     elif found:
-        rows = [_COLUMNS, *(_row(path, hit) for path, hit in found)]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
-        for row, command in zip(rows, ("", *(_open_command(path, hit) for path, hit in found)), strict=True):
-            echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-            if command:
-                echo_safely(f"  {command}")
+        header, *lines = aligned([_COLUMNS, *(_row(path, hit) for path, hit in found)])
+        echo_safely(header)
+        for line, (path, hit) in zip(lines, found, strict=True):
+            echo_safely(f"{line}\n  {_open_command(path, hit)}")
     if not found:
         raise click.ClickException(f"{expression} was never true in the sessions of {place}.")
 
@@ -90,7 +87,7 @@ def _hits(
     from fleet.recording.tools.summary import of_session
 
     try:
-        paths = sorted(filter(is_session, place.iterdir()))
+        paths = sorted(sessions_in(place))
     except OSError as error:
         raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
     there: set[str] = set()

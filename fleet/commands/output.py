@@ -69,6 +69,12 @@ def show_table(
         click.echo(f"{dot}{cells.rstrip()}")
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return one line for each row, with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
 def echo_safely(text: str, *, err: bool = False) -> None:
     """Print text that may have names and words of strangers in it, with control characters as escapes."""
     click.echo(printable_lines(text), err=err)

@@ -11,7 +11,7 @@ import click
 
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import echo_safely, watched
+from fleet.commands.output import aligned, echo_safely, watched
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.commands.session_part import part_of
@@ -136,10 +136,8 @@ def _show(found: list["SessionSummary"], *, as_json: bool) -> None:
         return
     if not found:
         return
-    rows = [_COLUMNS, *map(_row, found)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        echo_safely("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for line in aligned([_COLUMNS, *map(_row, found)]):
+        echo_safely(line)
     for one in found:
         if one.words:
             echo_safely(f"{one.name}: {one.words}", err=True)

@@ -191,13 +191,9 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
     if about.marks:
         return list(about.marks)
     found: list[Mapping[str, Any]] = []
-    decoder = MessageDecoder()
-    marked = [key for key in about.keys if key.endswith(f"/{MARK_TOPIC_NAME}")]
-    for info, _, log_ns, _, data in session.rows(Selection(tuple(marked))) if marked else ():
-        message: Any = decoder.message(info, data)
-        if message is not None:
-            text, by = getattr(message, "message", ""), getattr(message, "name", "")
-            found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})
+    for log_ns, message in _messages(session, about, MARK_TOPIC_NAME):
+        text, by = getattr(message, "message", ""), getattr(message, "name", "")
+        found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})
     return found
 
 
@@ -206,14 +202,19 @@ def stops_of(session: Session, about: SessionSummary) -> int:
     if about.stops is not None:
         return about.stops
     found = StopCount()
-    decoder = MessageDecoder()
-    events = tuple(key for key in about.keys if key.endswith(f"/{EVENTS.name}"))
     # A part: what it finds damaged is not said twice.
-    for info, _, _, _, data in session.part(session.segments).rows(Selection(events)) if events else ():
-        message = decoder.message(info, data)
-        if message is not None:
-            found.add(message)
+    for _, event in _messages(session.part(session.segments), about, EVENTS.name):
+        found.add(event)
     return found.count
+
+
+def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[tuple[int, Any]]:
+    """Yield the messages on the keys of a topic, with their times, ns. Only the chunks that have one are read."""
+    decoder = MessageDecoder()
+    selected = tuple(key for key in about.keys if key.endswith(f"/{topic}"))
+    for info, _, log_ns, _, data in session.rows(Selection(selected)) if selected else ():
+        if (message := decoder.message(info, data)) is not None:
+            yield log_ns, message
 
 
 def _state(session: Session, read: Session) -> tuple[SessionState, str]:
