@@ -22,9 +22,9 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 """A car in an unknown state may be avoiding obstacles; assume the worst."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
-EVIDENCE_INTERVALS: Final = 4
-"""Minimum of that timeout, in intervals with a pause: two pauses, the report before, and the silence after them. Its
-maximum is `MAX_EVIDENCE_TIMEOUT_S`."""
+EVIDENCE_INTERVALS: Final = 5
+"""Minimum of that timeout, in intervals with a pause: three pauses (one may be in doubt), the report before, and the
+silence after them. Its maximum is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer, 23 s at the slowest
 car."""
