@@ -12,32 +12,31 @@ import random
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import zenoh
 
+from gateway import drivers
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import BUS_LOSS_GAP_S, RAW_PER_S, CarPublisher
 from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
+from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
-from gateway.control.estimate.battery import BatteryPolicy
-from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.driver import Echo, Event, Rejected, TextLine
 from gateway.control.events import OutgoingFrame
+from gateway.control.link_health import LinkHealth
 from gateway.control.safety import PersistedSafety
 from gateway.learned_file import LearnedFile
 from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import Echo, Event, Rejected, TextLine
-from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
 from schemas.authority import People
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
-from schemas.platform_name import AUTO
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
@@ -82,9 +81,8 @@ class Settings:
 
     car: str
     url: LinkUrl
-    profile: Profile
-    auto: bool
-    """True to detect the platform of the car; `profile` is the unknown one."""
+    platform: str
+    """As in the fleet file: `arduino+arm`, or `auto` to find it out."""
     fleet: str
     state_dir: Path
     retry: bool
@@ -113,28 +111,25 @@ class CarGateway:
         now = self._loop.time()
         holds_of = settings.holds_of or car_link(settings.url)
         state_file = SafetyStateFile(settings.state_dir, settings.fleet, settings.car, holds_of)
-        platform = AUTO if settings.auto else settings.profile.name
         self._learned_file = LearnedFile(
-            settings.state_dir, settings.fleet, settings.car, link=car_link(settings.url), platform=platform
+            settings.state_dir, settings.fleet, settings.car, link=car_link(settings.url), platform=settings.platform
         )
         self._control = Controller(
             settings.car,
-            settings.profile,
-            auto=settings.auto,
+            self._learned_file.load(partial(drivers.driver_of, settings.platform)),
             persisted=state_file.load(now_ns := time.time_ns()),
-            learned=self._learned_file.load(),
             battery_policy=settings.battery,
             speed_max=settings.speed_max,
             people=settings.people,
             now=now,
             now_ns=now_ns,
         )
+        self._driver = self._control.driver
         self._state_damage, self._not_taken = state_file.damage, state_file.not_taken
         self._mark = RunningMark(settings.state_dir, settings.fleet, settings.car)
         self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
-        self._health = LinkHealth(since=now)
-        self._decoder = self._new_decoder()
+        self._health = LinkHealth(since=now, bytes_per_s=self._driver.bytes_per_s)
         self._baud = BaudWatch(settings.url)
         self._flood_until = now
         self._link: Link | None = None
@@ -224,7 +219,7 @@ class CarGateway:
             self._flush()
             self._publisher.on_bus_connected(self._loop.time(), at_once=True)
             self._publish_states(self._loop.time(), force=True)
-        return not self._control.stops.not_stopped
+        return not self._driver.not_stopped
 
     def stop(self) -> None:
         """Stop the car, then end. A second call ends at once."""
@@ -233,7 +228,7 @@ class CarGateway:
             self._control.link_down("the gateway was ended twice", self._loop.time())
         self._ending = True
         self._control.shut_down(self._loop.time())
-        if not self._control.stops.finished:
+        if not self._driver.finished:
             words = "%s: stopping. It takes up to %g s until the car confirms it. A second Ctrl-C ends at once."
             log.info(words, self._settings.car, SHUTDOWN_S)
         self._wake.set()
@@ -273,7 +268,6 @@ class CarGateway:
             may_fail = True
             now = self._loop.time()
             self._link = link
-            self._decoder = self._new_decoder()
             self._baud = BaudWatch(self._settings.url)
             self._health.on_open(now)
             self._control.link_up(now)
@@ -283,7 +277,7 @@ class CarGateway:
             try:
                 await self._read(link)
             except LinkLost as error:
-                self._on_events(self._decoder.end())
+                self._on_events(self._driver.drop_bytes())
                 if self._link is link:
                     self._on_link_lost(str(error))
             await link.close()
@@ -292,7 +286,7 @@ class CarGateway:
     @property
     def _may_move(self) -> bool:
         """True if the car may be moving while its link is down."""
-        return self._control.was_open and self._control.model.motors is not Motors.OFF
+        return self._control.was_open and self._driver.model.motors is not Motors.OFF
 
     def _check_link(self) -> None:
         """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
@@ -327,10 +321,10 @@ class CarGateway:
                     await asyncio.sleep(0)
                     now = self._loop.time()
                 if now > read_at + MAX_BYTES_AGE_S:
-                    self._on_events(self._decoder.end())
+                    self._on_events(self._driver.drop_bytes())
                     self._on_flood("flood_bytes", len(data) - start, now)
                     break
-                self._on_events(self._decoder.feed(data[start : start + SLICE_BYTES], now))
+                self._on_events(self._driver.feed(data[start : start + SLICE_BYTES], now))
             if (doubt := self._baud.on_bytes(data)) is not None:
                 self._health.on_rejected(doubt.cause, 1)
                 self._commands.log(Level.WARNING, "no_frames", doubt.words)
@@ -349,23 +343,12 @@ class CarGateway:
             self._commands.log(Level.WARNING, "flood", words)
         self._flood_until = now + FLOOD_LOG_PAUSE_S
 
-    def _new_decoder(self) -> Decoder:
-        return Decoder(head=self._control.model.profile.dialect.head)
-
-    def _use_profile(self, profile: Profile) -> None:
-        """Read and publish by the profile in force: the car's readings may have shown another one."""
-        if profile is not self._publisher.profile:
-            self._publisher.profile = profile
-            self._decoder.use_head(profile.dialect.head)
-
     def _on_events(self, events: list[Event]) -> None:
         """Publish the measurements of the events, then update the state of the car with them."""
         for event in events:
-            confirmed = self._control.model.mode.confirmed
-            if not self._publisher.publish_event(event, confirmed, loaded=self._control.model.motors is not Motors.OFF):
+            if not self._publisher.publish_event(event):
                 self._on_flood("raw_not_published", 1, event.at)
             self._control.on_event(event, self._loop.time())
-            self._use_profile(self._control.model.profile)
             if isinstance(event, TextLine):
                 self._health.on_rejected(FrameVerdict.TEXT)  # it shows a program, but not that of a car
                 continue
@@ -397,7 +380,7 @@ class CarGateway:
             self._wake.clear()
             await self._write_due()
             self._flush()
-            if self._control.stops.finished:
+            if self._driver.finished:
                 self._stopped.set()
             now = self._loop.time()
             self._wake_at = self._due_at(now)
@@ -408,14 +391,14 @@ class CarGateway:
     @property
     def _shown_state(self) -> tuple[object, ...]:
         """Return the part of the published states that readings or silence may change."""
-        model = self._control.model
+        model = self._driver.model
         return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *self._findings
 
     @property
     def _findings(self) -> tuple[object, ...]:
         """Return what was found out about the car itself."""
-        model = self._control.model
-        return model.profile.name, model.learned.shows, model.learned.doubted
+        model = self._driver.model
+        return model.profile.name, model.shows, model.doubted
 
     def _wake_if_due(self, now: float) -> None:
         """Wake the writer only if it has work. Waking it for every reading costs a third more CPU."""
@@ -424,16 +407,15 @@ class CarGateway:
 
     def _due_at(self, now: float) -> float:
         """Return when control or the decoder needs the loop next, if nothing else happens."""
-        deadline = self._decoder.deadline()
-        return min(self._control.next_at(now), float("inf") if deadline is None else deadline)
+        return min(self._control.next_at(now), self._driver.flush_at())
 
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
         self._on_gap(now)  # before the decoder: reports that are read late may look like a pause
-        self._on_events(self._decoder.tick(now))
+        self._on_events(self._driver.flush(now))
         while (link := self._link) is not None and (write := self._next_frame()) is not None:
-            self._decoder.sent(write.data, self._loop.time())  # an echo may arrive before the write returns
+            self._driver.sends(write.data, self._loop.time())  # an echo may arrive before the write returns
             try:
                 await link.write(write.data)
             except LinkLost as error:
@@ -446,9 +428,9 @@ class CarGateway:
                 await link.close()  # `_connect` wakes and reopens it
                 return
             now = self._loop.time()
-            opened_as = self._control.model.learned.opened_as
+            opened_as = self._driver.opened_as
             self._control.on_written(write, now)
-            if self._control.model.learned.opened_as != opened_as:  # the next gateway needs it to stop the car
+            if self._driver.opened_as != opened_as:  # the next gateway needs it to stop the car
                 self._save_learned(now, at_once=True)
             self._health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
@@ -529,13 +511,13 @@ class CarGateway:
             before = self._shown_state
             self._control.tick(now)
             self._wake_if_due(now)
-            mode = self._control.model.mode
+            model = self._driver.model
             changed = self._health.update(
                 now=now,
-                limit_s=mode.silence_limit(fan=bool(self._control.model.believed.fan)),
-                unheard_s=mode.unheard_s(now),
-                why_quiet=mode.why_quiet,
-                is_heard=self._control.model.is_heard,
+                limit_s=model.silence_limit_s,
+                unheard_s=model.unheard_s(now),
+                why_quiet=model.why_quiet,
+                is_heard=model.is_heard,
             )
             if changed or self._shown_state != before or now >= next_health:
                 self._publish_states(now)
@@ -565,7 +547,7 @@ class CarGateway:
             return
         self._learned_due_at = now + LEARNED_INTERVAL_S
         try:
-            self._learned_file.save(self._control.model.learned)
+            self._learned_file.save(self._driver.kept())
         except OSError as error:
             log.debug("what was learned of %s is not kept: %s", self._settings.car, error)
 
@@ -578,7 +560,7 @@ class CarGateway:
     def _publish_health(self, now: float) -> None:
         self._published_findings = self._findings
         drops = self._service.dropped + self._publisher.dropped
-        self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops, model=self._control.model)
+        self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops)
 
     async def _keep_hub(self) -> None:
         """Restart a lost hub. Jitter keeps a hundred gateways from trying at once."""

@@ -181,13 +181,13 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
 def _run(arguments: argparse.Namespace) -> int:
     parent = watched_pid(arguments.parent)
     from gateway.bus.service import AlreadyServed, CarService
+    from gateway.drivers import check_platform
     from gateway.link import BadUrl, LinkError, parse_url
     from schemas.bus import BadEndpoint, Bus, BusError
-    from schemas.platform_name import parse_option
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
-        url, (platform, auto) = parse_url(arguments.link), parse_option(arguments.platform)
+        url, platform = parse_url(arguments.link), check_platform(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
     speed_max = arguments.speed_max
@@ -217,8 +217,7 @@ def _run(arguments: argparse.Namespace) -> int:
             from pathlib import Path
 
             from gateway.car import Settings, serve
-            from gateway.control.estimate.battery import BatteryPolicy
-            from gateway.protocol.platforms import parse_platform
+            from gateway.control.battery import BatteryPolicy
             from schemas.state_dir import directory_of
 
             logging.basicConfig(
@@ -231,8 +230,7 @@ def _run(arguments: argparse.Namespace) -> int:
             settings = Settings(
                 car,
                 url,
-                parse_platform(platform),
-                auto,
+                platform,
                 fleet,
                 state_dir,
                 arguments.retry,

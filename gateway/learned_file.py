@@ -5,11 +5,13 @@ file is no more than a car of which nothing is known yet.
 """
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
-from gateway.control.estimate.learned import Learned
 from schemas.atomic_file import write_atomically
+
+T = TypeVar("T")
 
 MAX_BYTES: Final = 65536
 """Maximum size of the file. It has some hundred bytes."""
@@ -25,24 +27,24 @@ class LearnedFile:
         self.trouble = ""
         """Why nothing was taken from a file that exists, for a person; empty if all is well."""
 
-    def load(self) -> Learned:
-        """Return what was learned, or nothing."""
+    def load(self, use: Callable[[Mapping[str, Any]], T]) -> T:
+        """Return what `use` makes of what was learned, or of nothing. `use` raises ValueError for damage."""
         self.trouble = ""
         try:
             content = json.loads(self.path.read_text(encoding="utf-8")[:MAX_BYTES])
             if {key: content[key] for key in self._owner} != self._owner:
                 self.trouble = f"{self.path} is of {content['platform']} at {content['link']}, so it does not count"
-                return Learned()
-            return Learned.restore(content["learned"])
+                return use({})
+            return use(dict(content["learned"]))
         except FileNotFoundError:
-            return Learned()
+            return use({})
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             self.trouble = f"{self.path} is damaged ({type(error).__name__}), so it does not count"
-            return Learned()
+            return use({})
 
-    def save(self, learned: Learned) -> None:
+    def save(self, learned: Mapping[str, Any]) -> None:
         """Replace the file if anything has changed. Raises OSError."""
-        text = json.dumps(self._owner | {"learned": learned.kept()})
+        text = json.dumps(self._owner | {"learned": learned})
         if text == self._saved:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)

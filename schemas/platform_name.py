@@ -18,6 +18,8 @@ HEAD: Final = "head"
 """The option with a value: the first word of the frames."""
 HEAD_PATTERN: Final = "[A-Za-z0-9]{2,8}"
 AUTO: Final = "auto"
+AUTO_PLATFORMS: Final = tuple(str(kind) for kind in Platform if kind is not Platform.UNKNOWN)
+"""The platforms that a gateway finds out by itself."""
 
 _KNOWN: Final = OPTIONS | frozenset(VARIANTS)
 OPTION_WORDS: Final = ", ".join(f"+{option}" for option in (*sorted(OPTIONS), *VARIANTS, f"{HEAD}=WORD"))
@@ -27,6 +29,11 @@ OPTION_WORDS: Final = ", ".join(f"+{option}" for option in (*sorted(OPTIONS), *V
 def normalize_name(text: str) -> str:
     """Return a name in small letters, without a change of the head's value."""
     return "+".join(_normalize_part(part) for part in text.split("+"))
+
+
+def kind_of(name: str) -> str:
+    """Return a name without its options."""
+    return name.partition("+")[0]
 
 
 def parse_name(text: str) -> tuple[Platform, frozenset[str]]:
@@ -62,10 +69,7 @@ def parse_option(text: str) -> tuple[str, bool]:
     auto = name.partition("+")[0] == AUTO
     if auto:
         name = name.replace(AUTO, Platform.UNKNOWN, 1)
-    try:
-        parse_name(name)
-    except ValueError as error:
-        raise ValueError(f"{error} Leave it out to detect it.") from None
+    parse_name(name)
     return name, auto
 
 

@@ -1,7 +1,7 @@
 """The closed sets of words: whatever a field of a message, a key or a file names by one of a few words. Pure.
 
 A word has the same spelling in messages, files, commands and code. What a word is on a car's wire is in
-`gateway.protocol`. Messages hold words as text, so another version's word never breaks a reader.
+`gateway.drivers.yahboom.protocol`. Messages hold words as text, so another version's word never breaks a reader.
 """
 
 from enum import StrEnum
@@ -121,6 +121,13 @@ class Verb(StrEnum):
     LEND = "lend"
     LEASE = "lease"
     FIND = "find"
+
+
+CAPABILITIES: Final = (
+    *("mode", "led", "servo_deg", "arm", "servo_vertical", "servo_horizontal"),
+    *("drive", "whistle", "speed", "servo", "fan", "light"),
+)
+"""What a car may be able to do, as `state/health` lists it. First those that some cars lack."""
 
 
 class Rank(StrEnum):

@@ -43,11 +43,11 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
     from fleet.recording.reading.session import NoSession
     from fleet.replay.analysis.redecode import NoPlatform
     from fleet.replay.analysis.vector_file import ENDING, BadVector
-    from gateway.protocol.platforms import parse_platform
+    from gateway import drivers
 
     if platform is not None:
         try:
-            parse_platform(platform)
+            drivers.profile_of(platform)
         except ValueError as error:
             raise click.UsageError(f"--platform: {error}") from None
     try:

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from gateway.protocol.platforms import SPECIAL_CAPABILITIES, Profile, parse_platform
-from schemas.words import Light, Mode
-
-_CAPABILITIES: Final = (*SPECIAL_CAPABILITIES, "drive", "whistle", "speed", "servo", "fan", "light")
+from gateway import drivers
+from schemas.car_profile import CarProfile
+from schemas.words import CAPABILITIES, Light, Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +32,17 @@ UNKNOWN_ABILITIES: Final = Abilities(cannot=(("drive", "No gateway has said yet 
 def abilities_of(platform: str, capabilities: tuple[str, ...]) -> Abilities:
     """Return the abilities of a platform whose gateway lists these capabilities."""
     try:
-        profile = parse_platform(platform)
+        profile = drivers.profile_of(platform)
     except ValueError:
         return UNKNOWN_ABILITIES
-    can = tuple(name for name in _CAPABILITIES if name in capabilities)
-    cannot = tuple((name, _reason(profile, name)) for name in _CAPABILITIES if name not in capabilities)
+    can = tuple(name for name in CAPABILITIES if name in capabilities)
+    cannot = tuple((name, _reason(profile, name)) for name in CAPABILITIES if name not in capabilities)
     modes = _in_order(Mode, profile.modes if "mode" in can else ())
     lights = _in_order(Light, profile.lights if "light" in can else ())
     return Abilities(modes, lights, can, cannot)
 
 
-def _reason(profile: Profile, name: str) -> str:
+def _reason(profile: CarProfile, name: str) -> str:
     words = profile.why_lacking(name) or f"the fleet file leaves out {name}"
     return f"{words[0].upper()}{words[1:]}."
 

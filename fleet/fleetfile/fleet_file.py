@@ -20,11 +20,11 @@ from fleet.fleetfile.models import (
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
-from gateway.protocol.platforms import parse_platform
+from gateway import drivers
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, LOW_V
 from schemas.links import BadLink
-from schemas.platform_name import AUTO, normalize_name, parse_option
+from schemas.platform_name import AUTO, normalize_name
 from schemas.words import BatteryAction, Platform
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
@@ -168,10 +168,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 def profile_capabilities(platform: str) -> frozenset[str]:
     """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
-    name, auto = parse_option(platform)
-    kind, plus, options = name.partition("+")
-    kinds = [each for each in Platform if each is not Platform.UNKNOWN] if auto else [kind]
-    profiles = [parse_platform(f"{each}{plus}{options}") for each in kinds]
+    profiles = drivers.profiles_of(platform)
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 
 

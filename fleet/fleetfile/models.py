@@ -10,13 +10,13 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from fleet.links import parse_fleet_link
-from gateway.protocol.platforms import parse_platform
+from gateway import drivers
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V
 from schemas.links import BadLink
-from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS, parse_option
-from schemas.words import BatteryAction, Mode, Platform
+from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS
+from schemas.words import BatteryAction, Mode
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
 
@@ -56,7 +56,7 @@ def validate_link(text: str) -> str:
 
 def validate_platform(text: str) -> str:
     """Return a platform (or auto) if it is valid; raises ValueError."""
-    parse_option(text)
+    drivers.check_platform(text)
     return text
 
 
@@ -90,12 +90,12 @@ def validate_path(text: str) -> str:
     return text
 
 
-PARTS: Final = frozenset().union(*(parse_platform(f"{kind}+arm+imu").capabilities for kind in Platform))
+PARTS: Final = frozenset().union(*(each.capabilities for each in drivers.built_in_profiles()))
 CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
 _SIZE: Final = re.compile("^([1-9][0-9]{0,5} ?[MG]|[1-9][0-9]{0,2} ?T)B$")
 _OPTIONS: Final = "|".join((*sorted(OPTIONS), *VARIANTS, f"{HEAD}={HEAD_PATTERN}"))
-_PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({_OPTIONS}))*$"
+_PLATFORMS: Final = f"^({'|'.join((AUTO, *drivers.built_in_platforms()))})([+]({_OPTIONS}))*$"
 
 _Name = Annotated[
     str, AfterValidator(validate_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})

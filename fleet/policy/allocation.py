@@ -13,6 +13,7 @@ from fleet.policy.assignment import assign
 from fleet.policy.debounce import Settled, settle
 from fleet.policy.plan.plan import Plan, Role
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
+from schemas.platform_name import kind_of
 from schemas.words import LinkState, Reason, Verdict
 
 REFUSED_MODE_RETRY_S: Final = 10.0
@@ -103,7 +104,9 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
         )
     if known.listed and role.mode not in known.capabilities:
         return Barrier(f"the fleet file does not let it do mode {role.mode}", "the fleet file lets it")
-    if role.platforms is not None and (profile is None or not {profile.kind, profile.name} & set(role.platforms)):
+    if role.platforms is not None and (
+        profile is None or not {kind_of(profile.name), profile.name} & set(role.platforms)
+    ):
         return Barrier(
             f"it wants platform {' or '.join(role.platforms)}, this is {known.platform or 'not known'}",
             "the car has such a platform",

@@ -13,8 +13,9 @@ from typing import Any, Final
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions import Expression, aliases_of
-from gateway.protocol.platforms import Profile, parse_platform
+from gateway import drivers
 from schemas import messages, topics
+from schemas.car_profile import CarProfile
 
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
@@ -107,7 +108,7 @@ class CarSnapshot:
         return self.estopped_by or self.paused_by or self.lent_to or self.held_by
 
     @property
-    def profile(self) -> Profile | None:
+    def profile(self) -> CarProfile | None:
         """The profile of its platform; None if that is not known."""
         return _profile(self.platform)
 
@@ -118,9 +119,9 @@ class CarSnapshot:
 
 
 @cache
-def _profile(platform: str) -> Profile | None:
+def _profile(platform: str) -> CarProfile | None:
     try:
-        return parse_platform(platform) if platform else None
+        return drivers.profile_of(platform) if platform else None
     except ValueError:  # from a gateway that is newer than this coordinator
         return None
 

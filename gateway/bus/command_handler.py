@@ -16,6 +16,7 @@ from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.controller import Controller
+from gateway.control.driver import Driver
 from gateway.control.events import LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
@@ -50,7 +51,7 @@ class CommandHandler:
         self,
         fleet: str,
         car: str,
-        control: Controller,
+        control: Controller[Driver],
         publisher: CarPublisher,
         estop_sync: EstopSync,
         *,

@@ -1,12 +1,12 @@
 """Publishes one car's readings, frames, states and records as messages, and answers queries of values.
 
-`Profile` decides which measurements are published, control decides the states. This module fills the messages.
+The driver decides which measurements are published, and what is claimed of the car. This module fills the messages.
 """
 
 import socket
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import zenoh
@@ -14,17 +14,15 @@ import zenoh
 from gateway.bus.history import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
-from gateway.control.car_model import CarModel
+from gateway.control import battery
 from gateway.control.controller import Controller
-from gateway.control.estimate import battery
-from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.driver import Claims, Driver, Event, Fields
 from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
-from gateway.protocol.events import Event
-from gateway.protocol.measurements import measured, verdict_of
+from gateway.control.link_health import LinkHealth
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.token_bucket import TokenBucket
-from schemas.words import UNKNOWN, BatteryLevel, LinkState, Mode, MotionSource, Phase, Scope
+from schemas.words import UNKNOWN, BatteryLevel, LinkState, MotionSource, Motors, Phase, Scope
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
@@ -54,12 +52,10 @@ _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
 class CarPublisher:
     """The publishers and history buffers of one car."""
 
-    def __init__(self, opened: bus.Bus, fleet: str, car: str, control: Controller, url: str) -> None:
+    def __init__(self, opened: bus.Bus, fleet: str, car: str, control: Controller[Driver], url: str) -> None:
         self._fleet = fleet
         self._car = car
-        self.profile = control.model.profile
-        """The profile in force; it decides which measurements are real."""
-        self._battery = control.model.battery
+        self._driver = control.driver
         self._url = url
         self._publishers: dict[str, bus.Publisher] = {}
         self._histories: dict[str, HistoryBuffer] = {}
@@ -83,33 +79,31 @@ class CarPublisher:
 
     # ------------------------------------------------------------------ readings
 
-    def publish_event(self, event: Event, confirmed: Mode | None, *, loaded: bool) -> bool:
+    def publish_event(self, event: Event) -> bool:
         """Publish the measurements of an event, then its raw frame. Return False if raw frames exceed their rate limit.
 
-        `loaded`: motors may lower the battery voltage.
+        The driver decides what is a measurement.
         """
+        model = self._driver.model
         stamp_ns = self._wall.ns(event.at)
         published: list[str] = []
-        for name, fields in measured(event, self.profile, confirmed).items():
+        for name, fields in self._driver.measured(event).items():
             message = _CLASSES[name]()
-            for field, value in fields.items():
-                if isinstance(value, tuple):
-                    getattr(message, field).extend(value)
-                else:
-                    setattr(message, field, value)
+            _fill(message, fields)
             if name == "sensor/battery":
                 voltage_v = message.voltage_v
+                loaded = model.motors is not Motors.OFF
                 message.charge, message.charge_error = battery.charge(
-                    voltage_v, loaded=loaded, cells=self.profile.cells
+                    voltage_v, loaded=loaded, cells=model.profile.cells
                 )
-                message.level = self._battery.level or BatteryLevel.OK
+                message.level = model.battery.level or BatteryLevel.OK
             self._put_kept(name, message, event.at, stamp_ns)
             published.append(name)
         if not self._raw.take(1, event.at):
             return False
         frame = _CLASSES["frame/rx"]()
         frame.data = event.raw
-        frame.verdict = verdict_of(event)
+        frame.verdict = self._driver.verdict(event)
         frame.published.extend(published)
         self._publishers["frame/rx"].put(frame, stamp_ns)
         return True
@@ -183,20 +177,23 @@ class CarPublisher:
 
     # ------------------------------------------------------------------ states
 
-    def publish_states(self, control: Controller, health: LinkHealth, now: float, *, force: bool = False) -> None:
+    def publish_states(
+        self, control: Controller[Driver], health: LinkHealth, now: float, *, force: bool = False
+    ) -> None:
         """Publish each state that changed, and all of them once a second."""
-        mode, believed, safety = control.model.mode, control.model.believed, control.safety
+        model, safety = control.driver.model, control.safety
+        mode = model.mode
         lease = safety.lease_at(now)
         changes: dict[str, tuple[object, ...]] = {
             "state/link": (health.state, health.reconnects, health.state is LinkState.LOST and health.reason),
             "state/mode": (mode.asked, mode.inferred, mode.verdict),
-            "state/motion": (control.model.motion, control.owner, believed.fan, believed.servo_deg, believed.speed),
+            "state/motion": (model.motion, control.owner, model.outputs),
             "state/safety": (
                 safety.persisted,
                 lease and lease.holder,
-                control.model.motors,
-                control.model.basis,
-                control.model.trust.state,
+                model.motors,
+                model.basis,
+                model.trust.state,
                 control.is_free(now),
             ),
         }
@@ -206,13 +203,13 @@ class CarPublisher:
                 self._published_states[name] = state
                 self._publish_state(name, control, health, now)
 
-    def _publish_state(self, name: str, control: Controller, health: LinkHealth, now: float) -> None:
+    def _publish_state(self, name: str, control: Controller[Driver], health: LinkHealth, now: float) -> None:
         message = _CLASSES[name]()
         match name:
             case "state/link":
                 _fill_link(message, health, self._url, now)
-                if control.lost_frames:
-                    message.rejects["not_obeyed"] = control.lost_frames
+                if control.driver.lost_frames:
+                    message.rejects["not_obeyed"] = control.driver.lost_frames
             case "state/mode":
                 _fill_mode(message, control, now)
             case "state/motion":
@@ -221,20 +218,19 @@ class CarPublisher:
                 _fill_safety(message, control, now)
         self._put_state(name, message, now)
 
-    def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int, model: CarModel) -> None:
+    def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
         """Publish the health of the process, and the profile in force."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
         message.host = socket.gethostname()
         message.link = self._url
         message.version = VERSION
-        message.platform = self.profile.name
-        message.platform_evidence.extend(model.platform.evidence)
-        message.platform_contradictions.extend(model.platform.contradictions)
-        message.capabilities.extend(sorted(self.profile.capabilities))
+        model = self._driver.model
+        message.platform = model.profile.name
+        message.capabilities.extend(sorted(model.profile.capabilities))
         message.loop_lag_s = loop_lag_s
         message.bus_drops = bus_drops
-        _fill_learned(message, model)
+        _fill_findings(message, model)
         self._put_state("state/health", message, now)
 
     def _put_state(self, name: str, message: Any, now: float) -> None:
@@ -283,17 +279,24 @@ class CarPublisher:
                     yield
 
 
-def _fill_learned(message: pb.Health, model: CarModel) -> None:
-    learned = model.learned
+def _fill_findings(message: pb.Health, model: Claims) -> None:
+    findings = model.findings
+    message.platform_evidence.extend(findings.platform_evidence)
+    message.platform_contradictions.extend(findings.platform_contradictions)
     message.shows_stops, message.shows_stops_words = model.shows_stops
-    message.doubted = learned.doubted
-    if learned.echo.is_known:
-        message.interval_s, message.interval_spread_s = learned.echo.median_s, learned.echo.spread_s
-    if learned.no_echo.is_known:
-        message.interval_no_echo_s = learned.no_echo.median_s
-    message.blocks_s.update({str(kind): block_s for kind, block_s in learned.blocks.items()})
-    message.reporting_modes.extend(sorted(learned.reporting))
-    message.out_of_range.extend(sorted(learned.always_rejected))
+    message.doubted = model.doubted
+    _fill(message, findings.numbers)
+
+
+def _fill(message: Any, fields: Fields) -> None:
+    """Set fields of a message: a tuple fills a repeated field, a mapping a map."""
+    for name, value in fields.items():
+        if isinstance(value, tuple):
+            getattr(message, name).extend(value)
+        elif isinstance(value, Mapping):
+            getattr(message, name).update(value)
+        else:
+            setattr(message, name, value)
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:
@@ -312,8 +315,8 @@ def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> No
         message.last_rx_s = max(0.0, now - health.last_rx_at)
 
 
-def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
-    mode = control.model.mode
+def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> None:
+    mode = control.driver.model.mode
     message.asked = mode.asked or UNKNOWN
     message.inferred = mode.inferred or UNKNOWN
     message.verdict = mode.verdict
@@ -325,21 +328,22 @@ def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
     message.candidates.extend(mode.candidates)
 
 
-def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
-    message.motion = control.model.motion or UNKNOWN
+def _fill_motion(message: pb.Motion, control: Controller[Driver], now: float) -> None:
+    model = control.driver.model
+    message.motion = model.motion or UNKNOWN
     known = MotionSource.COMMANDED if control.owner else MotionSource.ASSUMED
-    message.source = MotionSource.UNKNOWN if control.model.motion is None else known
-    message.speed = control.model.profile.speed.fraction(control.model.believed.speed)
+    message.source = MotionSource.UNKNOWN if model.motion is None else known
+    message.speed = model.outputs.speed
     message.owner = control.owner
     expires_in_s = control.expires_in_s(now)
     if expires_in_s is not None:
         message.expires_in_s = expires_in_s
-    message.fan = bool(control.model.believed.fan)
-    if control.model.believed.servo_deg is not None:
-        message.servo_deg = control.model.believed.servo_deg
+    message.fan = bool(model.outputs.fan)
+    if model.outputs.servo_deg is not None:
+        message.servo_deg = model.outputs.servo_deg
 
 
-def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
+def _fill_safety(message: pb.Safety, control: Controller[Driver], now: float) -> None:
     safety = control.safety
     for estop in safety.estops:
         scope = Scope.FLEET if estop.fleet_wide else Scope.CAR
@@ -364,16 +368,17 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     if lease is not None:
         message.lease.holder, message.lease.kind = lease.holder.name, lease.holder.kind
         message.lease.expires_in_s = lease.until - now
-    message.motors = control.model.motors
-    message.motors_basis = control.model.basis or ""
-    trust = control.model.trust
+    model = control.driver.model
+    message.motors = model.motors
+    message.motors_basis = model.basis or ""
+    trust = model.trust
     message.trust = trust.state
     message.trust_evidence = trust.evidence
     if trust.since > float("-inf"):
         message.trust_since_s = max(0.0, now - trust.since)
     if trust.shown_at is not None:
         message.shown_age_s = max(0.0, now - trust.shown_at)
-    message.worst_stop_s = control.stops.worst_s(now)
+    message.worst_stop_s = control.driver.worst_s(now)
     message.waits_for = control.waits_for(now)
 
 

@@ -14,20 +14,24 @@ from typing import Any, Final, TypeVar
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,
+    AimServo,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     EndLoan,
     Fan,
+    Led,
     Lend,
-    OneShot,
+    MoveArm,
+    MoveServo,
     Pause,
     Resume,
+    SetLight,
     SetMode,
     Stop,
+    Whistle,
 )
-from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
 from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS
@@ -39,6 +43,10 @@ from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Se
 
 W = TypeVar("W", bound=str)
 
+COLOR_MAX: Final = 255
+DEG_MAX: Final = 180
+ARM_JOINTS: Final = 6
+"""Maximum of a color and of an angle, degrees, and the number of joints (docs/reference/keys.md#command-keys)."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
@@ -152,7 +160,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _action(verb, message, request)
-    except (ValueError, EncodeError) as error:
+    except ValueError as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
     return replace(
         command,
@@ -163,7 +171,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
 
 
 def _action(verb: str, message: Any, request: ParsedRequest) -> Action:
-    """Return the action of a message. Raises ValueError or EncodeError for a wrong field."""
+    """Return the action of a message. Raises ValueError for a wrong field."""
     if verb == Verb.DRIVE:
         return _drive(message, request.longest_drive_s, request.car)
     if verb in _WHAT:
@@ -250,7 +258,7 @@ def _led(message: Any) -> Action:
     missing = [name for name in "rgb" if not message.HasField(name)]
     if missing:
         raise ValueError(f"{', '.join(missing)} is missing: r, g and b are needed, 0..255 each")
-    return _checked(ColorLed(message.r, message.g, message.b))
+    return Led(*(_whole(name, getattr(message, name), COLOR_MAX) for name in "rgb"))
 
 
 def _servo(message: Any) -> Action:
@@ -260,13 +268,13 @@ def _servo(message: Any) -> Action:
     if message.HasField("deg"):
         if servo is not Servo.FRONT or message.action:
             raise ValueError("deg: only the front servo takes degrees, and then no action")
-        return _checked(Ptz(message.deg))
+        return AimServo(_whole("deg", message.deg, DEG_MAX))
     if message.action not in servo.moves:
         raise ValueError(
             f"action {message.action!r} of servo {servo}: allowed are {', '.join(servo.moves)}"
             + (", or deg 0..180" if servo is Servo.FRONT else "")
         )
-    return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
+    return MoveServo(ServoAction(f"{servo}_{message.action}"))
 
 
 def _fan(message: Any) -> Action:
@@ -285,18 +293,26 @@ def _why(text: str) -> str:
     return printable(text, " ")[:MAX_REASON_LENGTH]
 
 
-def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:
-    encode(frame)  # raises EncodeError with the field and its range
-    return OneShot(frame)
+def _arm(message: Any) -> Action:
+    joints = tuple(message.joint_deg)
+    if len(joints) != ARM_JOINTS:
+        raise ValueError(f"joint_deg: {len(joints)} values, allowed are {ARM_JOINTS}, each 0..{DEG_MAX}")
+    return MoveArm(tuple(_whole(f"joint_deg[{index}]", each, DEG_MAX) for index, each in enumerate(joints)))
+
+
+def _whole(field: str, value: int, top: int) -> int:
+    if not 0 <= value <= top:
+        raise ValueError(f"{field}: {value!r}, allowed are whole numbers 0..{top}")
+    return value
 
 
 _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     Verb.MODE: lambda message: SetMode(_word("mode", message.mode, Mode)),
     Verb.LED: _led,
-    Verb.LIGHT: lambda message: OneShot(General(Motion.STOP, light=_word("light", message.light, Light))),
+    Verb.LIGHT: lambda message: SetLight(_word("light", message.light, Light)),
     Verb.SERVO: _servo,
-    Verb.ARM: lambda message: _checked(ArmSet(tuple(message.joint_deg))),
-    Verb.WHISTLE: lambda _: OneShot(General(Motion.STOP, whistle=True)),
+    Verb.ARM: _arm,
+    Verb.WHISTLE: lambda _: Whistle(),
     Verb.SPEED: lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     Verb.FAN: _fan,
     Verb.ESTOP: _estop,

@@ -1,6 +1,5 @@
-"""Control of one car. Pure: time is an argument.
+"""Control of one car of any family. Pure: time is an argument.
 
-Read `controller` first. It takes commands, and holds four objects. `car_model` has the estimates of the car. `executor`
-sends frames, and `stop_executor` carries out stops. `car_monitor` handles readings and silence. `arbiter` and `safety`
-decide which sender may command. The packages `estimate` and `stops` have the parts of the model and of a stop.
+Read `controller` first: it takes commands. `arbiter` and `safety` decide which sender may command, `command_queue` holds
+what waits for the car, `command_log` the records. `driver` is what the driver of a family must say and do.
 """

@@ -8,15 +8,13 @@ from typing import Final
 
 from gateway.control.commands import (
     Action,
-    ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     EndLoan,
-    Fan,
     Find,
-    FrameAction,
     Lend,
+    PartAction,
     Pause,
     Resume,
     SetMode,
@@ -24,11 +22,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.protocol.frames import General
-from gateway.protocol.platforms import Profile
 from schemas.authority import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
 from schemas.suggestion import did_you_mean
-from schemas.words import Mode, Motion, Platform, Rank, Reason, SpeedStep
+from schemas.words import Mode, Motion, Rank, Reason
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""
@@ -45,7 +41,6 @@ class CommandContext:
     """The state of the car and the gateway that decides about a command."""
 
     car: str
-    profile: Profile
     now: float
     link_open: bool
     link_reason: str
@@ -57,12 +52,9 @@ class CommandContext:
     """Ids of ended e-stops."""
     battery: str
     """Why the battery allows no new drive; empty if it does."""
-    fan: bool | None
     queued: int
-    speed: float = 0.0
-    """Estimated speed, in the unit of the profile's speed model."""
-    speed_max: float = 1.0
-    """Maximum share of full speed, 0..1, after a speed step."""
+    unsupported: str | None = None
+    """Why this car cannot do it in any state, by its driver; None if it can."""
     loan_until: float = 0.0
     """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")
@@ -109,7 +101,7 @@ TABLE: Final[dict[type[Action], Needs]] = {
     SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is no `FrameAction`. Who may end which e-stop and hold: `_resume`."""
+"""Needs of each action that is no `PartAction`. Who may end which e-stop and hold: `_resume`."""
 
 Refusal = tuple[Reason, str]
 
@@ -123,7 +115,7 @@ def needs(what: Action) -> Needs:
             return CLOSE
         case TakeLease(release=True):
             return _ANYTIME
-        case FrameAction():
+        case PartAction():
             return _ADJUSTS if what.needs_lease else _ACTS
         case _:
             return TABLE[type(what)]
@@ -137,9 +129,8 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
     # A late pause is better than none, as is a late stop.
     if not isinstance(what, Pause) and (words := _out_of_time(command, context)) is not None:
         return Reason.STALE, words
-    unknown = _unknown(what, context)
-    if unknown is not None:
-        return Reason.UNSUPPORTED, unknown
+    if context.unsupported is not None:
+        return Reason.UNSUPPORTED, context.unsupported
     if isinstance(what, Resume):
         return _resume(what, sender, context)
     refusal = _unmet(command, needs(what), context)
@@ -160,48 +151,6 @@ def _out_of_time(command: Command, context: CommandContext) -> str | None:
         return None
     words = f"the command arrived {age_s:.1f} s late (maximum {command.ttl_s:g} s). Send it again."
     return words if age_s < CLOCK_DOUBT_S else f"{words} If that does not help: {clocks.lower()[0]}{clocks[1:]}"
-
-
-def _unknown(what: Action, context: CommandContext) -> str | None:
-    """Return why this car cannot do it in any state; None if it can."""
-    profile = context.profile
-    match what:
-        case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
-            if profile.kind is Platform.UNKNOWN:
-                return (
-                    f"the platform of {context.car} is not known, and a mode frame ends the program of some cars. "
-                    f"Name it: `platform:` in the fleet file, or `gateway run --platform`."
-                )
-            known = ", ".join(sorted(profile.modes))
-            return f"{context.car} ({profile.name}) has no mode {mode}. It has: {known}."
-        case ChangeSpeed(step) if (words := _too_fast(step, context)) is not None:
-            return words
-        case FrameAction():
-            words = next((refusal for frame in what.frames if (refusal := profile.refusal(frame))), None)
-            is_unknown = context.fan is None and not profile.fan_is_level
-            if words is None and isinstance(what, Fan) and what.on is not None and is_unknown:
-                return (
-                    f"{context.car}'s fan state is unknown, so on/off is not possible. "
-                    f"Toggle it: `fleet fan {context.car}`."
-                )
-            return words
-        case Drive(motion):
-            return profile.refusal(General(motion))
-        case _:
-            return None
-
-
-def _too_fast(step: SpeedStep, context: CommandContext) -> str | None:
-    """Return why the car must not become as fast as after this step; None if it may."""
-    speed = context.profile.speed
-    after = speed.step(context.speed, step)
-    share = speed.fraction(after)
-    if after <= context.speed or share <= context.speed_max:
-        return None
-    return (
-        f"{context.car} would drive at about {share:.0%} of full speed. "
-        f"Its maximum is {context.speed_max:.0%} (speed_max)."
-    )
 
 
 def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:

@@ -2,11 +2,10 @@
 
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gateway.control.commands import Command
 from gateway.control.events import CommandRecord, LogRecord, Record
-from gateway.protocol.frames import Frame
 from schemas.words import Level, Phase, Reason
 
 MAX_COMMAND_IDS: Final = 256
@@ -19,7 +18,7 @@ class Pending:
 
     command: Command
     received_at: float
-    frames: deque[Frame] = field(default_factory=deque)
+    frames: deque[Any] = field(default_factory=deque)
     sent: bool = False
     count: int = 1
     """Number of merged commands of a stream."""

@@ -1,13 +1,11 @@
 """The commands that control takes, after parsing and range checks, and their answers. Values only."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
-from gateway.protocol.frames import ArmSet, Frame, General, Ptz
 from schemas.authority import Sender
-from schemas.words import Mode, Motion, Phase, Reason, SpeedStep, Verb
+from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep, Verb
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,62 +25,74 @@ class SetMode:
     mode: Mode
 
 
-class FrameAction(ABC):
-    """An action that sends frames in mode 0, one after the other. A general frame gets the current motion."""
+@dataclass(frozen=True, slots=True)
+class PartAction:
+    """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue of a car in mode 0.
 
-    __slots__ = ()
+    `needs_lease`: only the driver of a car may do it. It moves a part of the car, or changes how the car moves.
+    """
 
-    @property
-    @abstractmethod
-    def frames(self) -> tuple[Frame, ...]:
-        """The frames to send."""
-
-    @property
-    def needs_lease(self) -> bool:
-        """True if only the driver of a car may do it: it moves a part of the car, or changes how the car moves."""
-        return True
+    needs_lease: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, slots=True)
-class OneShot(FrameAction):
-    """Send a frame that acts once: light, servo, whistle, arm."""
+class Led(PartAction):
+    """Set the color LED, 0..255 each."""
 
-    frame: Frame
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """The frame."""
-        return (self.frame,)
-
-    @property
-    def needs_lease(self) -> bool:
-        """True for a servo and the arm."""
-        frame = self.frame
-        return isinstance(frame, Ptz | ArmSet) or (isinstance(frame, General) and frame.servo is not None)
+    r: int
+    g: int
+    b: int
+    needs_lease: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, slots=True)
-class ChangeSpeed(FrameAction):
+class SetLight(PartAction):
+    """Switch the light."""
+
+    light: Light
+    needs_lease: ClassVar[bool] = False
+
+
+@dataclass(frozen=True, slots=True)
+class Whistle(PartAction):
+    """Beep once."""
+
+    needs_lease: ClassVar[bool] = False
+
+
+@dataclass(frozen=True, slots=True)
+class MoveServo(PartAction):
+    """Move a servo by one step, or to its middle."""
+
+    action: ServoAction
+
+
+@dataclass(frozen=True, slots=True)
+class AimServo(PartAction):
+    """Turn the front servo to an angle, 0..180 degrees, as the car counts them."""
+
+    deg: int
+
+
+@dataclass(frozen=True, slots=True)
+class MoveArm(PartAction):
+    """Move the six joints of an arm, 0..180 degrees each."""
+
+    joint_deg: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeSpeed(PartAction):
     """Change the car's relative speed by one step."""
 
     step: SpeedStep
 
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """The frame of one step."""
-        return (General(Motion.STOP, speed=self.step),)
-
 
 @dataclass(frozen=True, slots=True)
-class Fan(FrameAction):
+class Fan(PartAction):
     """Toggle the fan, or bring it to a state. For that its current state must be known."""
 
     on: bool | None = None
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """The frame that toggles the fan."""
-        return (General(Motion.STOP, fan=True),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,20 +154,7 @@ class Find:
 
 
 Action = (
-    Drive
-    | SetMode
-    | OneShot
-    | ChangeSpeed
-    | Fan
-    | Stop
-    | EmergencyStop
-    | Resume
-    | TakeLease
-    | Find
-    | Pause
-    | Unpause
-    | Lend
-    | EndLoan
+    Drive | SetMode | PartAction | Stop | EmergencyStop | Resume | TakeLease | Find | Pause | Unpause | Lend | EndLoan
 )
 
 PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {

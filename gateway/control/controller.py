@@ -5,15 +5,14 @@ writes the returned frame, and calls `on_written` or `on_write_failed` before th
 than one frame in flight.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Final, assert_never
+from typing import Final, Generic, TypeVar, assert_never
 
 from gateway.control import arbiter
-from gateway.control.car_model import CarModel
-from gateway.control.car_monitor import CarMonitor
+from gateway.control.battery import BatteryPolicy
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.command_queue import HeldMotion
+from gateway.control.command_queue import CommandQueue, HeldMotion
 from gateway.control.commands import (
     Action,
     Answer,
@@ -23,8 +22,8 @@ from gateway.control.commands import (
     EndLoan,
     Fan,
     Find,
-    FrameAction,
     Lend,
+    PartAction,
     Pause,
     Resume,
     SetMode,
@@ -32,38 +31,33 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.estimate.battery import BatteryPolicy
-from gateway.control.estimate.learned import Learned
+from gateway.control.driver import LATE_DRIVE_S, Desk, Driver, Event
 from gateway.control.events import OutgoingFrame, Record
-from gateway.control.executor import LATE_DRIVE_S, Executor
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
-from gateway.control.stops import sequences
-from gateway.protocol.events import Event
-from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
-from gateway.protocol.platforms import Profile
+from gateway.control.senders import Senders
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
 from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
+
+D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
 """How much longer than announced, and than its own duration, a drive waits for the car before it expires."""
 
 
-class Controller:
+class Controller(Generic[D_co]):
     """One car's control. See the module's docstring for how it is driven.
 
-    It holds small objects that share one `CarModel`: `CarMonitor` takes readings, `Executor` sends frames,
-    `StopExecutor` carries out stops, `CommandLog` keeps the records. The controller itself takes commands.
+    It takes the commands and decides who may command the car. Its `driver` knows the car: what it takes, how it is
+    stopped, and what may be claimed of it. They share the queue of commands and the log.
     """
 
     def __init__(
         self,
         car: str,
-        profile: Profile,
+        driver: Callable[[Desk], D_co],
         *,
-        auto: bool = False,
         persisted: PersistedSafety | None = None,
-        learned: Learned | None = None,
         battery_policy: BatteryPolicy | None = None,
         speed_max: float = 1.0,
         people: People = NO_PEOPLE,
@@ -75,13 +69,9 @@ class Controller:
         self.people = people
         self.safety = Safety.restore(persisted or PersistedSafety(), now, now_ns)
         self._log = CommandLog()
-        self.model = CarModel(car, profile, auto, self._log, battery_policy or BatteryPolicy(), learned or Learned())
-        self._executor = Executor(self.model, self._log, self.safety)
-        self._monitor = CarMonitor(self.model, self._executor, self._log)
-        self.stops = self._executor.stops
-        self._senders = self._executor.senders
-        self._queue = self._executor.queue
-        self._speed_max = speed_max
+        self._senders = Senders()
+        self._queue = CommandQueue(self._log, self._senders, self.safety)
+        self.driver = driver(Desk(car, self._log, self._queue, battery_policy or BatteryPolicy(), speed_max))
         self._mover = ""
         """The person who moved the car last, by a drive or a mode."""
         self._slept_at = float("-inf")
@@ -90,11 +80,6 @@ class Controller:
         """True if the link was open at least once, so the car may have been driven."""
 
     # ------------------------------------------------------------------ state
-
-    @property
-    def lost_frames(self) -> int:
-        """Return the number of frames that did not arrive, by the car's reports."""
-        return self._monitor.lost_frames
 
     @property
     def owner(self) -> str:
@@ -111,7 +96,7 @@ class Controller:
         pending = self._queue.mode_change
         if pending is not None and isinstance(pending.command.what, SetMode):
             return pending.command.what.mode
-        return self.model.mode.asked
+        return self.driver.model.mode.asked
 
     @property
     def has_records(self) -> bool:
@@ -127,26 +112,22 @@ class Controller:
     def link_up(self, now: float) -> None:
         """Bring the car to a known state: the link is open."""
         self.was_open = True
-        self._monitor.link_up()
-        self._executor.link_up(now)
+        self.driver.link_up(now)
 
     def link_down(self, reason: str, now: float) -> None:
         """Fail all commands: the link is down."""
-        self._monitor.link_down()
-        self._executor.link_down(reason, now, cause=Reason.LINK_DOWN)
+        self.driver.link_down(reason, now, cause=Reason.LINK_DOWN)
 
     def on_write_failed(self, reason: str, now: float) -> None:
         """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
-        self.model.cut_write = True
-        self._monitor.link_down()
-        self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
+        self.driver.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
     def waits_for(self, now: float) -> str:
         """Return what a command would wait for now, in words; empty if the car is ready."""
-        model, running = self.model, self.stops.running
+        model = self.driver.model
         if not model.link_open:
             return f"its link: {model.link_reason}"
-        if running is None or self._executor.accepts_commands(now):
+        if self.is_free(now):
             return ""
         left_s = self._busy_s(now)
         what = "its first stop" if not model.known else "a stop"
@@ -154,38 +135,38 @@ class Controller:
 
     def is_free(self, now: float) -> bool:
         """Return True if a command of somebody who may command the car would be sent now."""
-        return self.model.link_open and self._executor.accepts_commands(now)
+        return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
         """Return how long a drive or a mode would wait for its frame at most, as far as that is known, s."""
         busy_s = self._busy_s(now)
-        return self._executor.opening_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
+        return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
     def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
-        return self._executor.poll(now)
+        return self.driver.poll(now)
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
         """Update the state: the link has taken the frame that `poll` returned."""
-        self._executor.on_written(write, now)
+        self.driver.on_written(write, now)
 
     def next_at(self, now: float) -> float:
         """Return when `poll` may have something to do if nothing happens before; inf if never."""
-        return self._executor.next_at(now)
+        return self.driver.next_at(now)
 
     def on_event(self, event: Event, now: float) -> None:
         """Update the state with an event of the decoder."""
-        self._monitor.on_event(event, now)
+        self.driver.on_event(event, now)
 
     def tick(self, now: float) -> None:
         """Check for silence. Call it a few times a second."""
         if self.safety.loan is not None and self.safety.loan_at(now) is None:
             self._end_loan(f"the loan of {self.car} to {self.safety.loan.to} is over", now)
-        self._monitor.tick(now)
+        self.driver.tick(now)
 
     def on_stall(self, gap_s: float, now: float) -> None:
         """Stop a driven car after a gap of the loop."""
-        self._monitor.on_stall(gap_s, now)
+        self.driver.on_stall(gap_s, now)
 
     def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
         """Stop the car first after a sleep of the computer, and end the lease. `counted`: `now` went on meanwhile."""
@@ -195,11 +176,11 @@ class Controller:
             self._senders.skip(slept_s)
         else:
             self.safety.loan_until -= slept_s
-        self._monitor.on_sleep(slept_s, now)
+        self.driver.on_sleep(slept_s, now)
 
     def shut_down(self, now: float) -> None:
         """Stop the car and reject all later commands: the gateway ends."""
-        self._executor.shut_down(now)
+        self.driver.shut_down(now)
 
     # ------------------------------------------------------------------ commands
 
@@ -219,7 +200,7 @@ class Controller:
             return self._stop(pending, now)
         # Track a drive even if it is refused: after a stop the end of a lease must not start it.
         halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
-        refusal = arbiter.refuse(command, self._context(now))
+        refusal = arbiter.refuse(command, self._context(now, self.driver.refusal(what)))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         if halted:
@@ -259,26 +240,14 @@ class Controller:
                 return self._take_back(pending, now)
             case TakeLease(release):
                 return self._take_lease(pending, now, release=release)
-            case Fan(bool() as on) if on == self.model.believed.fan:
+            case Fan(bool() as on) if on == self.driver.model.outputs.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
-            case Fan(on) if self.model.profile.fan_is_level:
-                pending.frames.append(General(Motion.STOP, fan=not self.model.believed.fan if on is None else on))
-            case FrameAction():
-                pending.frames.extend(what.frames)
-            case Find():
-                pending.frames.extend(frame for frame in self._blinks() if self.model.profile.refusal(frame) is None)
+            case PartAction() | Find():
+                pending.frames.extend(self.driver.frames(what))
             case _:
                 assert_never(what)
         self._queue.one_shots.append(pending)
         return self._queued(pending, now)
-
-    def _blinks(self) -> tuple[Frame, ...]:
-        """Return the frames of `find`. The last one sets the LED color that the queued commands will leave."""
-        waiting = [each for act in self._queue.one_shots for each in act.frames if isinstance(each, ColorLed)]
-        led = waiting[-1] if waiting else self.model.believed.led
-        other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)
-        whistle = General(Motion.STOP, whistle=True)
-        return whistle, other, whistle, led
 
     def record_rejection(self, command: Command, reason: Reason, words: str, now: float) -> Answer:
         """Record a command that its parser has rejected."""
@@ -344,24 +313,24 @@ class Controller:
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Rank.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
-        self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
-        if not self.model.link_open or self.stops.shutting_down:
+        self.driver.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
+        if not self.driver.model.link_open or self.driver.shutting_down:
             words = self._not_stopped("emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped")
             words = f"{words} ({command.note})" if command.note else words
             return self._reject(pending, Reason.LINK_DOWN, words, now)
-        if not self.model.is_heard:
-            silent_s = self.model.mode.unheard_s(now)
+        if not self.driver.model.is_heard:
+            silent_s = self.driver.model.unheard_s(now)
             silent = f"{self.car} may not get this stop: it has been silent for {silent_s:.0f} s. Look at the car."
             latched = f"{silent} ({latched})" if latched else silent
-        worst = self.stops.worst_s(now)
+        worst = self.driver.worst_s(now)
         self._log.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
-        self.stops.begin(self.stops.full(now), FrameOrigin.STOP, now, pending)
+        self.driver.stop(FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
     def _not_stopped(self, later: str) -> str:
         """Return what a stop that cannot be sent means for the car, and what happens to it later."""
-        car, ending = self.car, self.stops.shutting_down
-        if self.model.link_open:
+        car, ending = self.car, self.driver.shutting_down
+        if self.driver.model.link_open:
             return f"NOT CONFIRMED: the gateway of {car} is shutting down and stops {car} itself. Look at the car."
         when = "by its next gateway" if ending else "when its link is back"
         return (
@@ -375,8 +344,8 @@ class Controller:
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
         """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
         sender, safety, authority = pending.command.sender, self.safety, self.authority_at(now)
-        if not resume.ids and self.model.learned.doubted:  # a person says that the car is fine
-            self.stops.end_doubt(now)
+        if not resume.ids and self.driver.model.doubted:  # a person says that the car is fine
+            self.driver.end_doubt(now)
         named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
         mine = [each for each in safety.estops if authority.may_end_estop(each, sender)]
         if ended := safety.end(each.id for each in mine if each.id in named):
@@ -450,13 +419,13 @@ class Controller:
         """End the lease of the driver, and stop the car unless it is at rest: somebody else drives it from now on."""
         self.safety.lease = None
         waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
-        if waiting or not self.model.at_rest:
+        if waiting or not self.driver.model.at_rest:
             self._halt(words, now)
 
     def _halt(self, words: str, now: float) -> None:
         """End what the car does or waits to do, and stop it."""
-        self._executor.halt(words, now)
-        self.stops.begin_full(now)
+        self.driver.halt(words, now)
+        self.driver.stop_if_open(now)
 
     def _still_estopped(self, sender: Sender, now: float) -> str:
         """Return which e-stops are in force, with their ids if there are several, and who can release them."""
@@ -478,7 +447,7 @@ class Controller:
             case Drive(duration_s=duration_s):
                 lasts_s = self._busy_s(now) + duration_s
             case SetMode(mode):  # until the mode is open
-                opening_s = 0.0 if mode is Mode.MANUAL else self.model.profile.block_s(ModeOpen(mode))
+                opening_s = 0.0 if mode is Mode.MANUAL else self.driver.opening_s(mode)
                 lasts_s = self._busy_s(now) + opening_s
             case _:  # other commands do not shorten the lease of a drive
                 lasts_s = (self.expires_in_s(now) or 0.0) if self.owner == sender.name else 0.0
@@ -492,7 +461,7 @@ class Controller:
             and self._queue.held.sender != sender
             and not isinstance(command.what, Drive | SetMode)
         ):
-            self._executor.release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+            self.driver.release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
 
     def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
         sender = pending.command.sender
@@ -501,12 +470,12 @@ class Controller:
         if not self.safety.release(sender):
             return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
         if self._queue.held is not None and self._queue.held.sender == sender:
-            self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
+            self.driver.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
     def _busy_s(self, now: float) -> float:
         """Return how long a motion would wait for the car, as far as that is known, s."""
-        return max(self.stops.free_at(now) - now, 0.0)
+        return max(self.driver.free_at(now) - now, 0.0)
 
     def _too_busy(self, command: Command, now: float) -> str:
         """Return why a sample of a stream would expire before its frame could go out; empty if it would not.
@@ -541,15 +510,10 @@ class Controller:
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.held = HeldMotion(drive.motion, pending, *self._times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
-            self._queue.held.begin(now, self.model.range_cm)
+            self._queue.held.begin(now, self.driver.model.range_cm)
             self._log.record_sent(pending, now, "the running drive was extended")
             return Answer(Phase.SENT, words="the running drive was extended")
-        running = self.stops.running
-        if running is not None and running.sequence.rank == sequences.SOFT.rank:
-            # The car moves again: the rest of the soft stop would only jerk it.
-            self.stops.running = None
-            for other in running.commands:
-                self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+        self.driver.resume_motion(words, now)
         return self._queued(pending, now, self._wait(pending, now))
 
     def _times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
@@ -566,7 +530,7 @@ class Controller:
             return ""
         if isinstance(command.what, SetMode):
             return f"opens in {wait_s:.1f} s at most: {self.car} is stopped first"
-        what = "a stop" if self.stops.running is not None else "a command"
+        what = "a stop" if self.driver.is_stopping else "a command"
         return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
@@ -593,31 +557,30 @@ class Controller:
 
     def _release(self, pending: Pending, now: float) -> Answer:
         sender = pending.command.sender.name
-        self._executor.end_drive(f"released by {sender}", now)
+        self.driver.end_drive(f"released by {sender}", now)
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
-        if self.stops.running is None and self.model.at_rest:
+        if not self.driver.is_stopping and self.driver.model.at_rest:
             return self._done(pending, f"{self.car} is at rest", now)
-        worst = self.stops.worst_s(now)
+        worst = self.driver.worst_s(now)
         if not pending.command.streamed:
             self._log.record(pending, Phase.QUEUED, now, worst_case_s=worst)
-        self.stops.begin(self.stops.soft(now), FrameOrigin.STOP, now, None if pending.command.streamed else pending)
+        self.driver.end_motion(now, None if pending.command.streamed else pending)
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
         self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
         answer = self._queued(pending, now)
-        self.stops.begin(self.stops.full(now), FrameOrigin.COMMAND, now, pending)
+        self.driver.stop(FrameOrigin.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
         words = f"mode {mode} by {pending.command.sender.name}"
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        settled = (
-            self.model.known and self.stops.running is None and self.model.mode.verdict is not Verdict.CONTRADICTED
-        )
-        if settled and self.model.mode.asked is mode:
-            return self._done(pending, f"{self.car} is in mode {mode} already ({self.model.mode.verdict})", now)
+        model = self.driver.model
+        settled = model.known and not self.driver.is_stopping and model.mode.verdict is not Verdict.CONTRADICTED
+        if settled and self.driver.model.mode.asked is mode:
+            return self._done(pending, f"{self.car} is in mode {mode} already ({self.driver.model.mode.verdict})", now)
         wait = self._wait(pending, now)
         self._queue.mode_change = pending
         return self._queued(pending, now, wait)
@@ -631,12 +594,12 @@ class Controller:
         return Answer(Phase.SENT, reason, words)
 
     def _queued(self, pending: Pending, now: float, wait: str = "") -> Answer:
-        words = wait if self.model.is_heard else "; ".join(filter(None, (wait, self._silent(now))))
+        words = wait if self.driver.model.is_heard else "; ".join(filter(None, (wait, self._silent(now))))
         self._log.record(pending, Phase.QUEUED, now, words=words)
         return Answer(Phase.QUEUED, words=words)
 
     def _silent(self, now: float) -> str:
-        silent_s = self.model.mode.unheard_s(now)
+        silent_s = self.driver.model.unheard_s(now)
         return f"{self.car} has been silent for {silent_s:.0f} s: nothing shows that it hears this"
 
     def _reject(self, pending: Pending, reason: Reason, words: str, now: float) -> Answer:
@@ -656,22 +619,19 @@ class Controller:
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)
         )
 
-    def _context(self, now: float) -> arbiter.CommandContext:
+    def _context(self, now: float, unsupported: str | None = None) -> arbiter.CommandContext:
         return arbiter.CommandContext(
             car=self.car,
-            profile=self.model.profile,
             now=now,
-            link_open=self.model.link_open,
-            link_reason=self.model.link_reason,
-            closing=self.stops.shutting_down,
-            asked=Mode.MANUAL if self.model.mode.is_left and self._queue.mode_change is None else self.asked,
+            unsupported=unsupported,
+            link_open=self.driver.model.link_open,
+            link_reason=self.driver.model.link_reason,
+            closing=self.driver.shutting_down,
+            asked=Mode.MANUAL if self.driver.model.mode.is_left and self._queue.mode_change is None else self.asked,
             authority=self.authority_at(now),
             ended=self.safety.ended,
-            battery=self.model.battery.refusal,
-            fan=self.model.believed.fan,
+            battery=self.driver.model.battery.refusal,
             queued=len(self._queue.one_shots),
-            speed=self.model.believed.speed,
-            speed_max=self._speed_max,
             loan_until=self.safety.loan_until,
             slept_at=self._slept_at,
         )

@@ -1,9 +1,9 @@
 """The output of control: records of commands, log records, and frames to write. Values only."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from gateway.control.commands import Command
-from gateway.protocol.frames import Frame
 from schemas.words import FrameOrigin, Level, Phase, Reason
 
 
@@ -41,7 +41,8 @@ Record = CommandRecord | LogRecord
 class OutgoingFrame:
     """One frame to write now, in a single write."""
 
-    frame: Frame
+    frame: Any
+    """The driver's own value."""
     data: bytes
     why: FrameOrigin
     command_id: str = ""

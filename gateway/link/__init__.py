@@ -1,4 +1,4 @@
-"""Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.protocol` gives the bytes their meaning.
+"""Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
 `base` has the interface and its errors. `serial`, `tcp` and `ble` implement it, two of them with the buffer of
 `buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a USB device,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Coroutine, Iterable
 from typing import IO, Any, Final
 
 from gateway.capture import BadCapture
+from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.link import BadUrl, LinkError, LinkUrl
-from gateway.protocol.platforms import Profile, parse_platform
 from schemas.duration import parse_duration
 from schemas.links import TcpUrl
 from schemas.process import startup, stdio

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from gateway import capture
+from gateway.control.driver import Rejected
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.events import Event
+from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import Event, Rejected
-from gateway.protocol.platforms import Profile
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics, describe
 from schemas.words import FrameVerdict, Platform

@@ -5,14 +5,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.events import Event
+from gateway.drivers.yahboom.protocol.frames import encode
+from gateway.drivers.yahboom.protocol.modes import candidate_modes
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import Event
-from gateway.protocol.frames import encode
-from gateway.protocol.modes import candidate_modes
-from gateway.protocol.platforms import Profile
-from gateway.protocol.sensors import Sensors
 from gateway.tools import cli_support
 from gateway.tools.discovery import SerialPort
 from gateway.tools.statistics import LinkStatistics

@@ -12,9 +12,9 @@ from collections.abc import Coroutine, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from gateway.control.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
+from gateway.drivers.yahboom.protocol.frames import encode
+from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import parse_url
-from gateway.protocol.frames import encode
 from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
 from gateway.tools.probe import LinkProbe

@@ -9,8 +9,7 @@ import re
 import shlex
 from typing import Final
 
-from gateway.link import LinkUrl, open_link, parse_url
-from gateway.protocol.frames import (
+from gateway.drivers.yahboom.protocol.frames import (
     ArmSet,
     ColorLed,
     Frame,
@@ -22,9 +21,10 @@ from gateway.protocol.frames import (
     encode,
     parse_sent,
 )
-from gateway.protocol.modes import MODES
-from gateway.protocol.platforms import Profile, StopStyle
-from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
+from gateway.drivers.yahboom.protocol.modes import MODES
+from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
+from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
+from gateway.link import LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
 from schemas.links import TcpUrl
 from schemas.words import Mode, Motion, Platform

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.control.estimate.platform import PlatformDetector
-from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Rejected, TextLine
-from gateway.protocol.measurements import measured
-from gateway.protocol.modes import candidate_modes
-from gateway.protocol.platforms import Profile, parse_platform
-from gateway.protocol.sensors import Reject, Sensors
+from gateway.control.driver import Echo, Rejected, TextLine
+from gateway.drivers.yahboom.estimate.platform import PlatformDetector
+from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
+from gateway.drivers.yahboom.protocol.measurements import measured
+from gateway.drivers.yahboom.protocol.modes import candidate_modes
+from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
+from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
 from schemas.words import FrameVerdict, Platform
 
 

@@ -3,7 +3,8 @@
 import re
 from time import perf_counter
 
-from gateway.protocol.decoder import Decoder, Sensors
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.sensors import Sensors
 from tests.bench.measured import Measured, Scale, in_turns
 
 FRAMES = [

@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from gateway.protocol.frames import General, encode
+from gateway.drivers.yahboom.protocol.frames import General, encode
 from schemas.limits import STREAM_PAUSE_S
 from schemas.words import Light, Motion, ServoAction
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids

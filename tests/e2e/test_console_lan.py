@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from fleet.cli import cli
 from fleet.client.client import Fleet as Client
-from gateway.protocol.frames import General, encode
+from gateway.drivers.yahboom.protocol.frames import General, encode
 from schemas.words import Motion
 from tests.support.console import DESKTOP, ConsoleProcess, find_chromium, hold_until_driving
 from tests.support.judge import Judge

@@ -9,7 +9,7 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from playwright.sync_api import Dialog, Page, expect
 
-from gateway.protocol.frames import General, encode
+from gateway.drivers.yahboom.protocol.frames import General, encode
 from schemas.topics import TOPICS
 from schemas.words import Motion
 from tests.support.console import CARS, ConsoleStage

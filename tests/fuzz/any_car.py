@@ -8,9 +8,9 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gateway.control.commands import Action, Drive, OneShot, SetMode, Stop
-from gateway.protocol.frames import General, ModeOpen
-from gateway.protocol.platforms import parse_platform
+from gateway.control.commands import Action, Drive, SetLight, SetMode, Stop
+from gateway.drivers.yahboom.protocol.frames import ModeOpen
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
 from schemas.words import Light, Mode, Motion, Phase, Verdict
 from tests.support.stops import WORLDS
@@ -114,13 +114,15 @@ class UseEpisode:
     @property
     def _acts(self) -> list[Callable[[], None]]:
         acts = [self._drive, self._drive, self._stop, self._light]
-        return [*acts, self._mode, self._mode] if "mode" in self.pair.control.model.profile.capabilities else acts
+        return (
+            [*acts, self._mode, self._mode] if "mode" in self.pair.control.driver.model.profile.capabilities else acts
+        )
 
     def _ask(self, what: Action) -> float | None:
         """Send a command. Return when its first frame was written, None if it was refused."""
         pair, control = self.pair, self.pair.control
         asked_at, count = pair.now, len(pair.records)
-        free_at = max(asked_at, control.stops.free_at(asked_at))
+        free_at = max(asked_at, control.driver.stops.free_at(asked_at))
         wait_s = control.wait_s(what, asked_at)
         if free_at - asked_at > LONGEST_FIRST_FRAMES_S + self._longest_block_s:
             self._violate(f"(5) {what} would wait for {free_at - asked_at:.1f} s")
@@ -142,7 +144,7 @@ class UseEpisode:
     @property
     def _longest_block_s(self) -> float:
         """Return the longest block that the gateway must assume: of a car with modes, if readings deny the name."""
-        model = self.pair.control.model
+        model = self.pair.control.driver.model
         profile = parse_platform("arduino") if model.platform.doubted else model.profile
         return profile.block_s(ModeOpen(Mode.FOLLOWING))
 
@@ -198,19 +200,19 @@ class UseEpisode:
         self._run(2.2 + MODE_STAYS_S * self._moments.random())
         if pair.car.truth.mode is not mode and self._is_right:
             self._violate(f"(5) mode {mode} was opened, {pair.car.truth.mode} is true")
-        if pair.control.model.mode.verdict is Verdict.CONTRADICTED and self._is_right:
-            self._violate(f"(3) mode {mode} is contradicted: {pair.control.model.mode.evidence}")
+        if pair.control.driver.model.mode.verdict is Verdict.CONTRADICTED and self._is_right:
+            self._violate(f"(3) mode {mode} is contradicted: {pair.control.driver.model.mode.evidence}")
         self._stop()
 
     def _light(self) -> None:
-        self._ask(OneShot(General(Motion.STOP, light=Light.RED)))
+        self._ask(SetLight(Light.RED))
 
     def _stop(self) -> None:
         pair = self.pair
         answer = pair.ask(Stop(), verb="stop")
         self.use.commands.append(f"{pair.now:.2f} stop")
         # Without an echo no report shows by how much longer this car blocks than expected.
-        unlearned_s = max(0.0, self.car.traits.close_s - pair.control.model.evidence.close_s)
+        unlearned_s = max(0.0, self.car.traits.close_s - pair.control.driver.model.evidence.close_s)
         within_s = answer.worst_case_s + unlearned_s + SHARP_S
         self._run(within_s)
         if self._is_right and (pair.car.truth.driving or pair.car.truth.mode is not Mode.MANUAL):
@@ -222,7 +224,7 @@ class UseEpisode:
         end = pair.now + seconds
         while pair.now < end - 1e-9:
             pair.run(min(0.05, end - pair.now))
-            model = pair.control.model
+            model = pair.control.driver.model
             false = pair.car.truth.driving and model.motors == "off" and model.basis == "shown"
             self._false_since = (self._false_since or pair.now) if false else None
             if self._false_since is not None and pair.now - self._false_since > FALSE_S:

@@ -11,6 +11,7 @@ from typing import Any
 
 from gateway.control.commands import (
     Action,
+    AimServo,
     ChangeSpeed,
     Command,
     Drive,
@@ -18,22 +19,26 @@ from gateway.control.commands import (
     EndLoan,
     Fan,
     Find,
+    Led,
     Lend,
-    OneShot,
+    MoveArm,
+    MoveServo,
     Pause,
     Resume,
+    SetLight,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
+    Whistle,
 )
-from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, OutgoingFrame
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.authority import NO_PEOPLE, Estop, FleetPause, People, Sender
 from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Platform, Rank, Reason, ServoAction, SpeedStep
+from tests.support.controls import Control, control
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in Rank for number in range(3)]
@@ -71,13 +76,14 @@ def anything(moments: random.Random) -> Action:
         case 0:
             return SetMode(moments.choice(list(Mode)))
         case 1:
-            return OneShot(General(Motion.STOP, whistle=True))
+            return Whistle()
         case 2:
-            return OneShot(General(Motion.STOP, light=moments.choice(list(Light))))
+            return SetLight(moments.choice(list(Light)))
         case 3:
-            return OneShot(General(Motion.STOP, servo=moments.choice(list(ServoAction))))
+            return MoveServo(moments.choice(list(ServoAction)))
         case 4:
-            return OneShot(moments.choice([Ptz(moments.randrange(181)), ColorLed(255, 0, 7), ArmSet((90,) * 6)]))  # type: ignore[arg-type]  # joined to object
+            named: list[Action] = [AimServo(moments.randrange(181)), Led(255, 0, 7), MoveArm((90,) * 6)]
+            return moments.choice(named)
         case 5:
             return ChangeSpeed(moments.choice(list(SpeedStep)))
         case 6:
@@ -113,7 +119,7 @@ def noise(moments: random.Random) -> bytes:
 class Wild:
     """A controller with random events. `step` does one random thing and checks the rules."""
 
-    control: Controller
+    control: Control
 
     def __init__(self, seed: int) -> None:
         self.moments = random.Random(seed)
@@ -124,8 +130,7 @@ class Wild:
 
     def _restart(self) -> None:
         kept = self.control.safety.persisted if hasattr(self, "control") else None
-        self.control = Controller(
-            "red",
+        self.control = control(
             parse_platform(self.moments.choice(PLATFORMS)),
             persisted=kept,
             people=self.moments.choice(TABLES),
@@ -175,7 +180,7 @@ class Wild:
             self.control.shut_down(self.now)
             self.ending = True
         self._pump()
-        if self.ending and (self.control.stops.finished or moments.random() < 0.01):
+        if self.ending and (self.control.driver.stops.finished or moments.random() < 0.01):
             self._restart()
 
     def _command(self, what: Action) -> Command:
@@ -209,10 +214,11 @@ class Wild:
 
     def _owe(self, what: Action) -> None:
         match what:
-            case OneShot(General() as frame):
-                self.owed["whistle"] += frame.whistle
-                self.owed["servo"] += frame.servo is not None
-            case OneShot():
+            case Whistle():
+                self.owed["whistle"] += 1
+            case MoveServo():
+                self.owed["servo"] += 1
+            case AimServo() | Led() | MoveArm():
                 self.owed["named"] += 1
             case ChangeSpeed():
                 self.owed["speed"] += 1
@@ -263,7 +269,7 @@ class Wild:
             else:
                 self.control.on_written(write, self.now)
                 self.decoder.sent(write.data, self.now)
-                self.free_at = self.now + self.control.model.profile.block_s(write.frame)
+                self.free_at = self.now + self.control.driver.model.profile.block_s(write.frame)
             assert self.control.poll(self.now) is None, "one frame in flight"
         self.control.take_records()
 
@@ -272,8 +278,8 @@ class Wild:
     def _check_write(self, write: OutgoingFrame) -> None:
         frame, control = write.frame, self.control
         assert self.linked, "nothing is written without a link"
-        self.doubted = self.doubted or control.model.platform.doubted or control.model.platform.open_mode
-        known = control.model.profile.refusal(frame) is None
+        self.doubted = self.doubted or control.driver.model.platform.doubted or control.driver.model.platform.open_mode
+        known = control.driver.model.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
             stopping = isinstance(frame, Reset) or frame == General(Motion.STOP)
@@ -290,7 +296,7 @@ class Wild:
             assert not self.ending
             self._check_mover(write)
             # What the car has not shown forbids nothing. But the first frames of a stop always go out before.
-            running = self.control.stops.running
+            running = self.control.driver.stops.running
             assert running is None or running.sent_all
 
     def _check_mover(self, write: OutgoingFrame) -> None:
@@ -316,7 +322,7 @@ class Wild:
                 "servo": frame.servo is not None,
             }
         elif not isinstance(frame, ModeOpen | ModeClose | Reset):
-            clears = why is not FrameOrigin.COMMAND and frame == self.control.model.believed.led
+            clears = why is not FrameOrigin.COMMAND and frame == self.control.driver.model.believed.led
             acts = {"named": not clears}  # a stop may send the color that the car has
         for name, done in acts.items():
             if done:
@@ -348,24 +354,24 @@ class Wild:
         last = until_off(control, now)
         assert last is not None, "it has no end"
         # A command may fail if it joined a stop that got no answer for long. The stop itself goes on until it ends.
-        assert last.phase is Phase.FAILED or last.basis == control.model.basis, last
+        assert last.phase is Phase.FAILED or last.basis == control.driver.model.basis, last
         assert last.phase is not Phase.FAILED or last.reason is Reason.NOT_SHOWN, last
         assert (last.phase is Phase.COMPLETE) == (last.basis == Basis.SHOWN), last
-        assert control.model.motors == "off"
+        assert control.driver.model.motors == "off"
 
 
-def until_off(control: Controller, now: float) -> CommandRecord | None:
+def until_off(control: Control, now: float) -> CommandRecord | None:
     """Return the record that ends the stop. None if the stop does not end in time.
 
     The link loses nothing, and the car reports once a second while it is not blocked.
     """
     end, report_at, last = now + STOP_WITHIN_S, now + 1.0, None
-    pi = control.model.profile.kind is Platform.RASPBERRY_PI
-    while now < end and (last is None or control.model.motors != "off"):
+    pi = control.driver.model.profile.kind is Platform.RASPBERRY_PI
+    while now < end and (last is None or control.driver.model.motors != "off"):
         while (write := control.poll(now)) is not None:
             frame = write.frame
             # The color clears a string that begins with `4WD,`. It is the one that the car has.
-            clears = frame == control.model.believed.led
+            clears = frame == control.driver.model.believed.led
             assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP) or clears, frame
             control.on_written(write, now)
             report_at += 1.0 if isinstance(frame, ModeClose) and not pi else 0.0
@@ -412,6 +418,6 @@ def run(seed: int, steps: int, *, stop_every: int = 500) -> tuple[int, int]:
                 wild.check_stop()
                 wild.check_memory()
         except Exception as error:
-            error.add_note(f"seed {seed}, step {number}, {wild.control.model.profile.name}")
+            error.add_note(f"seed {seed}, step {number}, {wild.control.driver.model.profile.name}")
             raise
     return wild.writes, wild.stops

@@ -2,8 +2,9 @@
 
 import random
 
-from gateway.protocol.decoder import Decoder, Echo, Rejected
-from gateway.protocol.sensors import Sensors
+from gateway.control.driver import Echo, Rejected
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.sensors import Sensors
 from tests.fuzz.controller import MANUAL, READINGS
 
 FRESH = 2_000

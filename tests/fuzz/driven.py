@@ -3,7 +3,7 @@
 import random
 from dataclasses import dataclass
 
-from gateway.control.commands import EmergencyStop, Find, OneShot, Resume, SetMode, Stop
+from gateway.control.commands import EmergencyStop, Find, PartAction, Resume, SetMode, Stop
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from schemas.authority import Sender
@@ -101,7 +101,7 @@ class Driven:
             return  # without an echo this car never reads a frame again
         if isinstance(what, Resume | EmergencyStop):
             what = Resume(tuple(estop.id for estop in self.pair.control.safety.estops))
-        if isinstance(what, Find | OneShot) and not self.named:
+        if isinstance(what, Find | PartAction) and not self.named:
             return
         self.asked += 1
         self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")
@@ -149,7 +149,7 @@ def wedged(pair: Pair) -> bool:
 
 def pair_lost(pair: Pair) -> bool:
     """Return True if control knows that the link is down."""
-    return not pair.control.model.link_open
+    return not pair.control.driver.model.link_open
 
 
 def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
@@ -166,7 +166,7 @@ def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
                     states.add(state)
                 driven.pair.ask(Resume(), sender=sender)
         except Exception as error:
-            name = driven.pair.control.model.profile.name
+            name = driven.pair.control.driver.model.profile.name
             error.add_note(f"seed {seed}, step {number}, {name}, {driven.world}: {driven.pair.sent[-8:]}")
             raise
         if number % LIFE == LIFE - 1:

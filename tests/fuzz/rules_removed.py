@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
-from gateway.control.estimate.mode import ModeEstimator
-from gateway.control.stop_executor import StopExecutor
-from gateway.control.stop_renewal import StopRenewal
-from gateway.control.stops import evidence
-from gateway.control.stops.evidence import StopCase, StopEvidence
-from gateway.control.stops.stopping import StopInProgress
-from gateway.protocol import decoder
-from gateway.protocol.platforms import Profile
+from gateway.drivers.yahboom.estimate.mode import ModeEstimator
+from gateway.drivers.yahboom.protocol import decoder
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.stop_executor import StopExecutor
+from gateway.drivers.yahboom.stop_renewal import StopRenewal
+from gateway.drivers.yahboom.stops import evidence
+from gateway.drivers.yahboom.stops.evidence import StopCase, StopEvidence
+from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.words import Basis
 
 Patch = Callable[[object, str, Any], None]

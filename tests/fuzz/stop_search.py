@@ -15,14 +15,12 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from gateway.control.commands import Action, Command, Drive, EmergencyStop, OneShot, SetMode, Stop
-from gateway.control.controller import Controller
-from gateway.control.estimate.learned import KEPT_INTERVALS, Learned
+from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Stop, Whistle
 from gateway.control.events import CommandRecord
-from gateway.control.stops.stopping import evidence_s
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.frames import ColorLed, General, Ptz
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.stops.stopping import evidence_s
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
@@ -30,6 +28,7 @@ from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
 from schemas.authority import Sender
 from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
+from tests.support.controls import control
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 
 BYTES_PER_S = 960
@@ -491,7 +490,7 @@ class Episode:
         )
         is_known = plan.kept and plan.platform == "arduino" and plan.traits.readings
         learned = learned_of(plan.traits, random.Random(f"learned {plan.seed}")) if is_known else None
-        self.control = Controller("red", parse_platform(plan.told), learned=learned)
+        self.control = control(parse_platform(plan.told), learned=learned)
         self.decoder = Decoder()
         self.now = 0.0
         self.zero = float("inf")
@@ -529,7 +528,7 @@ class Episode:
         if not self.control.is_free(self.now):
             self._violate(f"(5) takes no command {USABLE_S:g} s after the connect")
         self._until(
-            lambda: self.control.model.motors == "off",
+            lambda: self.control.driver.model.motors == "off",
             READY_S,
             fails=plan.traits.close_s == 1.0 and plan.traits.interval_s < 1.5,
         )
@@ -571,9 +570,9 @@ class Episode:
                     self._run(0.05 + 0.2 * moments.random())
             case "acts":
                 self._ask(Drive(Motion.FORWARD, 10.0))
-                acts: list[Action] = [OneShot(General(Motion.STOP, whistle=True))]
+                acts: list[Action] = [Whistle()]
                 if plan.platform == "arduino" and plan.told != "unknown":
-                    acts += [OneShot(Ptz(moments.randrange(181))), OneShot(ColorLed(255, 2, 3))]
+                    acts += [AimServo(moments.randrange(181)), Led(255, 2, 3)]
                 for what in acts:
                     self._ask(what)
             case mode:
@@ -585,7 +584,7 @@ class Episode:
                     self._run(EARLY_S)
                 self._ask(SetMode(Mode(mode)))
                 if plan.opening:
-                    self._until(lambda: self.control.model.trust.state is CarTrust.IN_MODE, 12.0, fails=False)
+                    self._until(lambda: self.control.driver.model.trust.state is CarTrust.IN_MODE, 12.0, fails=False)
                 else:
                     self._until(lambda: self.car.truth.mode is Mode(mode), 15.0, fails=False)
                 self.zero = self.now + plan.load_s
@@ -625,19 +624,19 @@ class Episode:
         """Shut the gateway down. If its car is not stopped, start another gateway, as `fleet up` does."""
         for _ in range(6):
             self.control.shut_down(self.now)
-            self._until(lambda: self.control.stops.finished, 18.0)
+            self._until(lambda: self.control.driver.stops.finished, 18.0)
             ended, self._claim_since = self.control, None
-            self._note(f"ended: not stopped {ended.stops.not_stopped!r}, {ended.model.basis}")
-            if not ended.stops.not_stopped:
-                self.report.ends[f"shutdown {ended.model.basis}"] += 1
-                self._complete = ended.model.basis == "shown"
-                self._ended_as_sent = ended.model.basis == "sent"
+            self._note(f"ended: not stopped {ended.driver.stops.not_stopped!r}, {ended.driver.model.basis}")
+            if not ended.driver.stops.not_stopped:
+                self.report.ends[f"shutdown {ended.driver.model.basis}"] += 1
+                self._complete = ended.driver.model.basis == "shown"
+                self._ended_as_sent = ended.driver.model.basis == "sent"
                 self.report.sent["shutdown"] += self._ended_as_sent
                 self._complete_since = self.now
                 self._linked = False
                 return
             self.report.ends["shutdown not_stopped"] += 1
-            self.control = Controller("red", parse_platform(self.plan.told))
+            self.control = control(parse_platform(self.plan.told))
             self._connect()
             self._run(0.1)
 
@@ -722,7 +721,7 @@ class Episode:
         if self._linked:
             for event in self.decoder.feed(data, max(at, 0.0)):
                 self.control.on_event(event, self.now)
-                self.decoder.use_head(self.control.model.profile.dialect.head)
+                self.decoder.use_head(self.control.driver.model.profile.dialect.head)
 
     def _pump(self) -> None:
         if not self._linked:
@@ -791,7 +790,7 @@ class Episode:
         The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block. On a link that loses
         reports it learns a slower rhythm than the car has.
         """
-        traits, model = self.plan.traits, self.control.model
+        traits, model = self.plan.traits, self.control.driver.model
         true_s = 4 * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1)
         return 5.5 + max(true_s, evidence_s(model.profile, model.learned))
 
@@ -802,7 +801,7 @@ class Episode:
         return (
             (plan.platform, plan.told) == ("arduino", "arduino")
             and plan.world == "echo"
-            and self.control.model.learned.shows is Shows.YES
+            and self.control.driver.model.learned.shows is Shows.YES
             and not (self.car.truth.fan or self._platform_doubted)
         )
 
@@ -811,20 +810,20 @@ class Episode:
         if self.zero == float("inf"):
             return
         control, truth, now = self.control, self.car.truth, self.now
-        self._platform_doubted = self._platform_doubted or control.model.platform.doubted
+        self._platform_doubted = self._platform_doubted or control.driver.model.platform.doubted
         driving = truth.driving
         if not driving:
             self._on_since = None
         elif self._on_since is None:
             self._on_since = now
-        shown = self._linked and control.model.motors == "off" and control.model.basis == "shown"
+        shown = self._linked and control.driver.model.motors == "off" and control.driver.model.basis == "shown"
         if not shown:
             self._claim_since = None
         elif self._claim_since is None:
             self._claim_since = now
         if self._on_since is not None:
             if self._claim_since is not None and now - max(self._on_since, self._claim_since) > FALSE_S:
-                self._violate(f"(1) off, shown ({control.model.trust.evidence}), while the motors run")
+                self._violate(f"(1) off, shown ({control.driver.model.trust.evidence}), while the motors run")
             # A true claim that control has withdrawn no longer counts: a damaged frame can start the motors later.
             claimed = self._complete and (shown or self._on_since <= self._complete_since)
             if claimed and now - max(self._on_since, self._complete_since) > FALSE_S:
@@ -835,8 +834,8 @@ class Episode:
     def _judge_sent(self, *, driving: bool) -> None:
         control = self.control
         case = (
-            control.model.rest.value
-            if self._linked and control.model.motors == "off" and control.model.basis == "sent"
+            control.driver.model.rest.value
+            if self._linked and control.driver.model.motors == "off" and control.driver.model.basis == "sent"
             else ""
         )
         if case and not self._case:
@@ -851,7 +850,7 @@ class Episode:
             self.report.false_sent[case] += 1
 
     def _judge_verdict(self, true: Mode) -> None:
-        mode = self.control.model.mode
+        mode = self.control.driver.model.mode
         if not self._linked:
             self._verdict_since = None
             return
@@ -872,9 +871,9 @@ class Episode:
         end = self.now + seconds
         while self.now < end:
             if self.car.truth.driving and self.car.alive:
-                if _is_wedged(self.car) and self.control.model.basis == "sent":
+                if _is_wedged(self.car) and self.control.driver.model.basis == "sent":
                     self.report.wedged = True
-                elif not self.control.model.is_heard or not self.plan.traits.readings:
+                elif not self.control.driver.model.is_heard or not self.plan.traits.readings:
                     self.report.false_sent["no readings"] += 1  # nothing shows it, and the words say so
                 elif self._ended_as_sent:
                     self.report.false_sent["shutdown"] += 1  # nothing showed the stop, and no gateway is left

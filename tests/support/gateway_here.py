@@ -8,9 +8,7 @@ from pathlib import Path
 from gateway.bus.service import CarService
 from gateway.car import CarGateway, Settings
 from gateway.link import parse_url
-from gateway.protocol.platforms import parse_platform
 from schemas import bus
-from schemas.platform_name import parse_option
 from schemas.process.suspend import SleepWatch
 from tests.support.processes import FleetProcesses
 
@@ -20,11 +18,8 @@ async def served(
     fleet: FleetProcesses, link: str, state_dir: Path, *, platform: str = "arduino", watch: SleepWatch | None = None
 ) -> AsyncIterator[tuple[CarGateway, "asyncio.Future[bool]"]]:
     """Serve the car `red` of this fleet. Yield its gateway and what ends with it."""
-    name, auto = parse_option(platform)
     with bus.Bus.open(fleet.endpoint) as opened:
-        settings = Settings(
-            "red", parse_url(link), parse_platform(name), auto=auto, fleet="fleet", state_dir=state_dir, retry=True
-        )
+        settings = Settings("red", parse_url(link), platform, fleet="fleet", state_dir=state_dir, retry=True)
         gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"), watch)
         serving = asyncio.ensure_future(gateway.run())
         try:

@@ -3,11 +3,23 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Action, ChangeSpeed, Drive, Fan, Find, OneShot, SetMode, Stop
-from gateway.control.estimate.link_health import LinkHealth
-from gateway.protocol.events import Event
-from gateway.protocol.frames import ColorLed, General, Ptz
-from gateway.protocol.sensors import Sensors
+from gateway.control.commands import (
+    Action,
+    AimServo,
+    ChangeSpeed,
+    Drive,
+    Fan,
+    Find,
+    Led,
+    MoveServo,
+    SetLight,
+    SetMode,
+    Stop,
+    Whistle,
+)
+from gateway.control.driver import Event
+from gateway.control.link_health import LinkHealth
+from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.sim.model.raspberry_pi import Transport
 from schemas.words import Light, LinkState, Mode, Motion, Phase, Reason, ServoAction, SpeedStep, Verdict
 from tests.support.truth import WORLDS
@@ -74,13 +86,13 @@ class NormalRun:
 
     def look(self) -> None:
         """Note the alarms."""
-        pair, mode = self.pair, self.pair.control.model.mode
+        pair, mode = self.pair, self.pair.control.driver.model.mode
         self.health.update(
             now=pair.now,
-            limit_s=mode.silence_limit(fan=bool(pair.control.model.believed.fan)),
+            limit_s=mode.silence_limit(fan=bool(pair.control.driver.model.believed.fan)),
             unheard_s=mode.unheard_s(pair.now),
             why_quiet="silent",
-            is_heard=pair.control.model.is_heard,
+            is_heard=pair.control.driver.model.is_heard,
         )
         if self.health.state in (LinkState.STALE, LinkState.LOST):
             self._alarm(f"link {self.health.state}: {self.health.reason}")
@@ -136,11 +148,11 @@ def _joystick(run: NormalRun) -> None:
 def _acts(run: NormalRun) -> None:
     """Send one-shots of each kind, as fast as the queue takes them or slower."""
     one_shots: tuple[Action, ...] = (
-        OneShot(General(Motion.STOP, whistle=True)),
-        OneShot(Ptz(run.moments.randint(0, 180))),
-        OneShot(General(Motion.STOP, servo=run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET)))),
-        OneShot(ColorLed(*(run.moments.randint(0, 255) for _ in range(3)))),
-        OneShot(General(Motion.STOP, light=run.moments.choice((Light.RED, Light.GREEN, Light.BLUE)))),
+        Whistle(),
+        AimServo(run.moments.randint(0, 180)),
+        MoveServo(run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET))),
+        Led(*(run.moments.randint(0, 255) for _ in range(3))),
+        SetLight(run.moments.choice((Light.RED, Light.GREEN, Light.BLUE))),
         ChangeSpeed(run.moments.choice((SpeedStep.UP, SpeedStep.DOWN))),
         Find(),
     )
@@ -152,7 +164,7 @@ def _acts(run: NormalRun) -> None:
 def _whistles(run: NormalRun) -> None:
     """Whistle without a pause for half a minute, so that the car's loop hardly runs."""
     for _ in range(80):
-        run.ask(OneShot(General(Motion.STOP, whistle=True)))
+        run.ask(Whistle())
         run.run(0.36)
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from gateway.protocol.frames import ModeOpen, encode
+from gateway.drivers.yahboom.protocol.frames import ModeOpen, encode
 from schemas import messages
 from schemas.bus import Bus, Sample, sample_of
 from schemas.words import Mode

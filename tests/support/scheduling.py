@@ -31,7 +31,7 @@ _COMPUTING: Final = (
     "tests/fleet/replay/rerun/",
     "tests/fuzz/",
     "tests/gateway/control/",
-    "tests/gateway/protocol/",
+    "tests/gateway/drivers/yahboom/protocol/",
     "tests/gateway/sim/model/",
     "tests/gateway/sim/scenarios/",
     "tests/schemas/",

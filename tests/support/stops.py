@@ -10,9 +10,22 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 
-from gateway.control.commands import ChangeSpeed, Drive, Fan, Find, OneShot, SetMode, Stop
-from gateway.protocol.frames import ColorLed, General, ModeOpen, Ptz, encode
-from gateway.protocol.platforms import StopStyle
+from gateway.control.commands import (
+    AimServo,
+    ChangeSpeed,
+    Drive,
+    Fan,
+    Find,
+    Led,
+    MoveServo,
+    PartAction,
+    SetLight,
+    SetMode,
+    Stop,
+    Whistle,
+)
+from gateway.drivers.yahboom.protocol.frames import ModeOpen, encode
+from gateway.drivers.yahboom.protocol.platforms import StopStyle
 from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import Transport
@@ -24,7 +37,7 @@ LONGEST_S = 4.6
 """Maximum time of a stop outside obstacle avoidance and restored links: the longest opening, behind a ranging."""
 AVOIDING_S = 4.3
 ENDS_S = 18.5
-"""Maximum time from the request of a stop to its last record (gateway/control/stops/stopping.py)."""
+"""Maximum time from the request of a stop to its last record (gateway/drivers/yahboom/stops/stopping.py)."""
 OPENS_S = 14.0
 """Maximum time from the request of a mode to its opening. The stop before it ends within 10 s, or control gives up."""
 RATIO = 1.5
@@ -32,7 +45,7 @@ RATIO = 1.5
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
 PRINTING = (Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
 READS_PINS = (Mode.REMOTE_CONTROL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
-WHISTLE = OneShot(General(Motion.STOP, whistle=True))
+WHISTLE = Whistle()
 MOTIONS = (Motion.FORWARD, Motion.LEFT, Motion.SPIN_RIGHT, Motion.BACK)
 
 Load = Callable[[Pair, random.Random], None]
@@ -126,12 +139,12 @@ def let_go(pair: Pair, moments: random.Random) -> None:
 def acting(pair: Pair, moments: random.Random) -> None:
     """Queue one-shots of every kind while the car drives."""
     pair.ask(Drive(Motion.FORWARD, 10.0))
-    for what in (WHISTLE, OneShot(Ptz(45)), OneShot(ColorLed(255, 2, 3)), WHISTLE, OneShot(Ptz(120))):
+    for what in (WHISTLE, AimServo(45), Led(255, 2, 3), WHISTLE, AimServo(120)):
         pair.ask(what)
     pair.run(2.5 * moments.random())
 
 
-def one_shot(what: OneShot | Fan | Find | ChangeSpeed, block_s: float) -> Load:
+def one_shot(what: PartAction | Fan | Find | ChangeSpeed, block_s: float) -> Load:
     """Return a load: a one-shot during a drive, from just before its frame to the end of its block."""
 
     def load(pair: Pair, moments: random.Random) -> None:
@@ -180,7 +193,7 @@ def last_moment(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), OPENS_S)
-        pair.run(pair.control.model.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
+        pair.run(pair.control.driver.model.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
 
     return load
 
@@ -229,8 +242,8 @@ class StopTestCase:
         return Pair(self.platform, seed=seed, world=world, told=self.told, transport=self.transport, start_s=2.0)
 
 
-SERVO = OneShot(General(Motion.STOP, servo=ServoAction.FRONT_LEFT))
-LIGHT = OneShot(General(Motion.STOP, light=Light.RED))
+SERVO = MoveServo(ServoAction.FRONT_LEFT)
+LIGHT = SetLight(Light.RED)
 MOVING: list[tuple[str, Load]] = [
     ("rest", rest),
     ("driving", driving),
@@ -250,8 +263,8 @@ EVERY_CAR: list[tuple[str, Load]] = [
     ("fan-on", fan),
 ]
 NAMED: list[tuple[str, Load]] = [
-    ("ptz", one_shot(OneShot(Ptz(45)), 0.65)),
-    ("led", one_shot(OneShot(ColorLed(255, 2, 3)), 0.1)),
+    ("ptz", one_shot(AimServo(45), 0.65)),
+    ("led", one_shot(Led(255, 2, 3), 0.1)),
     ("find", one_shot(Find(), 1.0)),
     ("acting", acting),
 ]
@@ -295,7 +308,7 @@ CASES = tuple(_cases())
 # ---------------------------------------------------------------------- restored links
 
 
-def half(*whats: Drive | OneShot | SetMode) -> Load:
+def half(*whats: Drive | PartAction | SetMode) -> Load:
     """Return a load: the link breaks anywhere in the write of a frame."""
 
     def load(pair: Pair, moments: random.Random) -> None:
@@ -354,7 +367,7 @@ def then(first: Load, second: Load) -> Load:
 
 
 HALF_GENERAL = half(*(Drive(motion, 5.0) for motion in (Motion.RIGHT, Motion.SPIN_LEFT)))
-HALF_NAMED = half(OneShot(Ptz(135)), OneShot(ColorLed(255, 128, 33)), OneShot(Ptz(45)))
+HALF_NAMED = half(AimServo(135), Led(255, 128, 33), AimServo(45))
 LOST: list[tuple[str, Load]] = [
     ("rest", cut_off(rest)),
     ("driving", cut_off(driving)),
@@ -426,32 +439,32 @@ class Seen:
 def state_of(pair: Pair) -> str:
     """Return the state that control can distinguish when the stop is requested."""
     control, now = pair.control, pair.now
-    style = control.model.profile.stop_style
+    style = control.driver.model.profile.stop_style
     kind = {
         StopStyle.MODE_FRAME: "",
         StopStyle.BOTH: "readings contradict the platform, ",
-        StopStyle.GENERAL: f"{control.model.profile.kind}, ",
+        StopStyle.GENERAL: f"{control.driver.model.profile.kind}, ",
         StopStyle.TIMER: f"{Platform.STM32}, ",
     }
-    running = control.stops.running
-    if control.model.trust.state in (CarTrust.UNHEARD, CarTrust.UNPROVEN):
-        return f"{kind[style]}{control.model.trust.state}"
-    if not control.model.known:
+    running = control.driver.stops.running
+    if control.driver.model.trust.state in (CarTrust.UNHEARD, CarTrust.UNPROVEN):
+        return f"{kind[style]}{control.driver.model.trust.state}"
+    if not control.driver.model.known:
         return f"{kind[style]}link just restored"
     if running is not None and running.sequence.rank > 1:
         avoiding = " of obstacle avoidance" if running.worst_at - running.began_at > AVOIDING_S else ""
         return f"{kind[style]}a stop under way{avoiding}"
-    mode = control.model.mode.asked
-    if control.model.mode.verdict is Verdict.CONTRADICTED:
+    mode = control.driver.model.mode.asked
+    if control.driver.model.mode.verdict is Verdict.CONTRADICTED:
         return f"{kind[style]}mode contradicted"
     if mode is None or mode is Mode.MANUAL:
-        pacing = control.model.pacing
-        if control.model.at_rest and control.model.basis is Basis.SENT and pacing.blocked_at(now):
+        pacing = control.driver.model.pacing
+        if control.driver.model.at_rest and control.driver.model.basis is Basis.SENT and pacing.blocked_at(now):
             return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio has no meaning
         unread = "a frame may be unread" if not pacing.clear_at(now) else ""
         what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
-    if now < control.model.pacing.block_until:
+    if now < control.driver.model.pacing.block_until:
         return f"{kind[style]}opening {mode}"
     # docs/reference/protocol.md#blocking-times gives these modes one row, "up to 0.1 s per turn". The infrared remote
     # counts as one of them.
@@ -485,8 +498,8 @@ def play(case: StopTestCase, seed: int) -> Seen:
         max(off_at, settled_at) - asked_at if settled_at > asked_at else max(0.0, off_at - asked_at),
         last.at - asked_at if last is not None and last.phase is not Phase.FAILED else float("inf"),
         shown - asked_at if shown is not None else float("inf"),
-        pair.control.model.motors,
-        pair.control.model.basis or "",
+        pair.control.driver.model.motors,
+        pair.control.driver.model.basis or "",
         last.phase if last is not None else "",
         last.basis if last is not None else "",
         last.words if last is not None else "",

@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 
 from gateway.control.commands import SetMode
-from gateway.protocol.frames import ModeClose, ModeOpen, encode
+from gateway.drivers.yahboom.protocol.frames import ModeClose, ModeOpen, encode
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.world import World
 from schemas.geometry import Segment
@@ -44,7 +44,7 @@ def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> P
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.car.truth.mode is mode, 8.0)
         pair.run(4.0)
-    elif pair.control.model.basis != "shown":
+    elif pair.control.driver.model.basis != "shown":
         pair.run(RENEWED_S)
     pair.run(2.0 * moments.random())
     return pair

@@ -4,10 +4,9 @@ import random
 from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
-from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, LogRecord
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
@@ -15,6 +14,7 @@ from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from schemas.authority import Sender
 from schemas.words import Level, Phase
+from tests.support.controls import control
 
 TICK_S = 0.05
 """Interval at which control checks silence. Bytes, deadlines and events of the car wake the loop when they are due."""
@@ -42,7 +42,7 @@ class Pair:
             platform, world or World.room(), 0, random.Random(seed), transport=transport, name=name, traits=traits
         )
         self.transport = transport
-        self.control = Controller(name, parse_platform(told or platform))
+        self.control = control(parse_platform(told or platform), name=name)
         self.decoder = Decoder()
         self.sent: list[tuple[float, bytes]] = []
         self.records: list[CommandRecord] = []
@@ -79,7 +79,9 @@ class Pair:
     def ready(self) -> "Pair":
         """Connect, and wait until recovery is complete and a reading has arrived."""
         self.connect()
-        self.until(lambda: self.control.model.known and self.control.model.mode.inferred is not None, 30.0)
+        self.until(
+            lambda: self.control.driver.model.known and self.control.driver.model.mode.inferred is not None, 30.0
+        )
         return self
 
     def ask(
@@ -168,7 +170,7 @@ class Pair:
                 for event in self.decoder.feed(data, at):
                     self._touched = True
                     self.control.on_event(event, self.now)
-                    self.decoder.use_head(self.control.model.profile.dialect.head)
+                    self.decoder.use_head(self.control.driver.model.profile.dialect.head)
         if linked:
             for event in self.decoder.tick(self.now):
                 self._touched = True
@@ -197,7 +199,7 @@ class Pair:
         self._take()
 
     def _take(self) -> None:
-        shown_at = self.control.model.trust.shown_at
+        shown_at = self.control.driver.model.trust.shown_at
         if shown_at is not None and shown_at not in self.shown_at[-1:]:
             self.shown_at.append(shown_at)
         for record in self.control.take_records():

@@ -31,19 +31,16 @@ from fleet.policy.plan.plan import (
     Rule,
 )
 from fleet.policy.snapshot import ALIASES, NAMES
-from gateway.protocol.platforms import parse_platform
+from gateway import drivers
 from schemas import keys
 from schemas.colors import parse_color
-from schemas.platform_name import OPTIONS
-from schemas.words import Mode, Platform
+from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.messages import Where, suggest
 
 BadPlan = BadFile
 """Raised for a plan with faults; the text has one line for each, with file, line and column."""
-CAPABILITIES: Final = frozenset(
-    {*parse_platform(Platform.ARDUINO).capabilities, *parse_platform(Platform.RASPBERRY_PI).capabilities, *OPTIONS}
-)
+PARTS: Final = frozenset().union(*(each.capabilities for each in drivers.built_in_profiles()))
 _MISSING: Final = {"mode": Mode.MANUAL, "when": "true", "then": []}
 """Values for missing required fields, so that the rest of a file can be checked."""
 
@@ -115,11 +112,11 @@ class _PlanParser:
     def _role(self, name: str, entry: RoleEntry) -> Role:
         where: Where = ("roles", name)
         for index, capability in enumerate(entry.capabilities):
-            if capability not in CAPABILITIES:
-                self._report_unknown((*where, "capabilities", index), capability, sorted(CAPABILITIES), "capability")
+            if capability not in PARTS:
+                self._report_unknown((*where, "capabilities", index), capability, sorted(PARTS), "capability")
         for index, platform in enumerate(entry.platforms or ()):
             try:
-                profile = parse_platform(platform)
+                profile = drivers.profile_of(platform)
             except ValueError as error:
                 self._report((*where, "platforms", index), str(error))
                 continue

@@ -15,18 +15,15 @@ from fleet.policy.allocation import find_barrier
 from fleet.policy.assignment import assign
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Role, Rule
 from fleet.policy.snapshot import CarSnapshot, topic_of
-from gateway.protocol.platforms import Profile, parse_platform
-from schemas.platform_name import OPTIONS
-from schemas.words import Mode, Platform
+from gateway import drivers
+from schemas.car_profile import CarProfile
+from schemas.words import Mode
 
 ANY_CAR: Final = "a car"
 """Name for a car that neither a fleet file nor the plan names."""
-_KINDS: Final = tuple(
-    parse_platform("+".join((kind, *sorted(OPTIONS)))) for kind in Platform if kind is not Platform.UNKNOWN
-)
 
 
-def list_unmeasured(expression: Expression, profile: Profile, mode: Mode) -> tuple[str, ...]:
+def list_unmeasured(expression: Expression, profile: CarProfile, mode: Mode) -> tuple[str, ...]:
     """List the names in the expression that such a car does not measure in this mode."""
     measured = profile.measurable(mode)
     topics = {name: topic_of(name).partition("/") for name in expression.names}
@@ -34,7 +31,7 @@ def list_unmeasured(expression: Expression, profile: Profile, mode: Mode) -> tup
 
 
 @cache
-def can_be_true(expression: Expression, profile: Profile, mode: Mode) -> bool:
+def can_be_true(expression: Expression, profile: CarProfile, mode: Mode) -> bool:
     """Return True if the expression can become true by what such a car measures in this mode."""
     names = frozenset(list_unmeasured(expression, profile, mode))
     return not names or not is_contradictory(Expression(_without(expression.root, names, wanted=True)))
@@ -84,11 +81,11 @@ class ModeReachability:
             self._firing |= more
             self._places, self._open = {}, {}
 
-    def profiles(self, car: str) -> tuple[Profile, ...]:
+    def profiles(self, car: str) -> tuple[CarProfile, ...]:
         """Return the platform profiles that a car may have."""
         known = self.cars.get(car)
         profile = known.profile if known is not None else None
-        return _KINDS if profile is None else (profile,)
+        return drivers.built_in_profiles() if profile is None else (profile,)
 
     def can_have(self, car: str, role: Role) -> bool:
         """Return True if this car can ever have this role."""
@@ -113,7 +110,7 @@ class ModeReachability:
 
     def blind_to(self, role: Role) -> str:
         """Say why no car can measure what this role needs before it has the role; empty if one can."""
-        needs, modes, kinds = role.needs, dict[Mode, None](), dict[Profile, None]()
+        needs, modes, kinds = role.needs, dict[Mode, None](), dict[CarProfile, None]()
         if needs is None:
             return ""
         for car in (car for car in self.cars if self.can_have(car, role)):
@@ -136,7 +133,7 @@ class ModeReachability:
             return Outlook(f"{why}.")
         if condition.car is not None and condition.car not in self.cars:
             return Outlook(f"There is no car {condition.car}.")
-        only, modes, kinds = "", dict[Mode, None](), dict[Profile, None]()
+        only, modes, kinds = "", dict[Mode, None](), dict[CarProfile, None]()
         for car in self._watched(condition):
             kinds |= dict.fromkeys(self.profiles(car))
             for phase in self._phases(during):
@@ -155,7 +152,7 @@ class ModeReachability:
         self,
         condition: PlanCondition,
         modes: tuple[Mode, ...],
-        kinds: tuple[Profile, ...],
+        kinds: tuple[CarProfile, ...],
         during: Iterable[str] | None,
     ) -> str:
         where = f" in phase {' or '.join(sorted(during))}" if during is not None else ""
@@ -281,7 +278,7 @@ class ModeReachability:
         return len(assign(costs, names)) > len(assign(rest, names))
 
 
-def _first_missing(expression: Expression, kinds: Iterable[Profile], modes: Iterable[Mode]) -> str:
+def _first_missing(expression: Expression, kinds: Iterable[CarProfile], modes: Iterable[Mode]) -> str:
     """Return the first name that none of these modes measures; all names if only no mode measures all."""
     measured = [
         set(list_unmeasured(expression, profile, mode)) for profile in kinds for mode in modes if mode in profile.modes

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from gateway.protocol.platforms import parse_platform
+from gateway import drivers
 from schemas.topics import TOPICS
 from schemas.words import UNKNOWN, Mode, Platform, Verdict
 
@@ -17,7 +17,7 @@ assert MODE.stale_after_s is not None
 _HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
 """A state holds until the next one, and no longer than until it is stale."""
 # Only Arduino cars are known to report in other modes than manual. No other car reports more there.
-_PROFILE: Final = parse_platform(Platform.ARDUINO)
+_PROFILE: Final = drivers.profile_of(Platform.ARDUINO)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from gateway.sim.model.scheduler import EventScheduler
 from gateway.sim.model.traits import CarTraits
 from schemas.words import Mode
 
-# The numbers below repeat those of gateway.protocol on purpose: the simulator is the oracle of the tests, and an oracle
-# that shares its numbers with the tested code finds no wrong number.
+# The numbers below repeat those of gateway.drivers.yahboom.protocol on purpose: the simulator is the oracle of the
+# tests, and an oracle that shares its numbers with the tested code finds no wrong number.
 
 BYTES_PER_S: Final = 960.0
 """9600 baud, 8N1: ten bits a byte (docs/reference/protocol.md#framing)."""

@@ -3,7 +3,7 @@
 import pytest
 
 from fleet.console.car_view import MAX_LISTED_CARS, MAX_OTHER_CARS, SILENT_AFTER_S, BatteryTrend, FleetView
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.authority import Right, Sender
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Rank

@@ -8,21 +8,21 @@ from gateway.bus.publisher import _fill_safety
 from gateway.control import arbiter
 from gateway.control.commands import (
     Action,
+    AimServo,
     ChangeSpeed,
     Command,
     Drive,
     EndLoan,
     Find,
     Lend,
-    OneShot,
     Pause,
     Resume,
+    SetLight,
     SetMode,
     TakeLease,
     Unpause,
 )
 from gateway.control.safety import Safety
-from gateway.protocol.frames import General, Ptz
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Right, Sender
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Light, Mode, Motion, Rank, SpeedStep
@@ -55,8 +55,8 @@ PAUSES = (None, FleetPause("p1", TEACHER, "listen", 1, LEAD), FleetPause("p2", A
 LEASES = (None, Sender(ANN, PERSON), Sender(TEACHER, LEAD), Sender("script@lab-9", Rank.SCRIPT))
 LOANS = ("", "bob", "eve", "teacher")
 ASKED: dict[Right, tuple[Action, ...]] = {
-    Right.MOVE: (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), OneShot(Ptz(90)), ChangeSpeed(SpeedStep.DOWN)),
-    Right.ACT: (OneShot(General(Motion.STOP, light=Light.RED)), Find()),
+    Right.MOVE: (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), AimServo(90), ChangeSpeed(SpeedStep.DOWN)),
+    Right.ACT: (SetLight(Light.RED), Find()),
     Right.TAKE: (TakeLease(),),
     Right.RESUME: (Resume(),),
     Right.PAUSE: (Pause("listen"),),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
 from fleet.fleetfile.models import FileEntry
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
-from gateway.control.estimate import battery
+from gateway.control import battery
 from gateway.link import BadUrl, parse_url
 from schemas.colors import car_color, hex_color
 from schemas.links import BadLink, parse_link

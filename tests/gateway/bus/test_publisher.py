@@ -10,17 +10,17 @@ import zenoh
 
 from gateway.bus.publisher import ANSWERS_PER_SLICE, CarPublisher
 from gateway.control.commands import Command, Drive, Find, SetMode, Stop
-from gateway.control.controller import Controller
-from gateway.control.estimate.link_health import LinkHealth
-from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.events import CommandRecord
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.events import ImuReading
-from gateway.protocol.platforms import parse_platform
+from gateway.control.link_health import LinkHealth
+from gateway.drivers.yahboom.estimate.platform import PlatformDetector
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.events import ImuReading
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
 from schemas.words import Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import PERSON, READING, SCRIPT, Workbench
+from tests.support.controls import control
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 
@@ -30,9 +30,9 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         with Bus.open(fleet.endpoint) as opened:
-            out = CarPublisher(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
+            out = CarPublisher(opened, "fleet", "red", control(parse_platform("arduino")), "tcp://x")
             for number in range(3 * ANSWERS_PER_SLICE + 1):
-                out.publish_event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), None, loaded=False)
+                out.publish_event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)))
             pauses: queue.Queue[int] = queue.Queue()
 
             def answer(query: zenoh.Query) -> None:
@@ -82,9 +82,9 @@ class Published:
 
     def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
         """Publish the health of a car of this platform. Return its fields, as in JSON."""
-        model = self.desk.control.model
+        model = self.desk.control.driver.model
         model.platform = platform
-        self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0, model=model)
+        self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0)
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before["state/health"]
 

@@ -15,20 +15,25 @@ from gateway.bus.requests import BadRequest, ParsedRequest, parse
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,
+    AimServo,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    FrameAction,
-    OneShot,
+    Led,
+    MoveArm,
+    MoveServo,
+    PartAction,
     Resume,
+    SetLight,
     SetMode,
     Stop,
     TakeLease,
+    Whistle,
 )
-from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, Ptz
+from gateway.drivers.yahboom.protocol.frames import Frame, General
 from schemas import messages
 from schemas.authority import Sender
 from schemas.commands import COMMANDS
@@ -59,10 +64,6 @@ def parsed(request: ParsedRequest) -> tuple[Command, str]:
         return error.command, error.words or "no words"
 
 
-def general(**fields: Any) -> OneShot:
-    return OneShot(General(Motion.STOP, **fields))
-
-
 @pytest.mark.parametrize(
     ("verb", "payload", "what"),
     [
@@ -71,17 +72,17 @@ def general(**fields: Any) -> OneShot:
         ("drive", {"motion": "forward", "continues": True}, Drive(Motion.FORWARD, 0.5, continues=True)),
         ("drive", {"motion": "forward", "duration_s": 1e-3}, Drive(Motion.FORWARD, 1e-3)),
         *(("mode", {"mode": mode}, SetMode(mode)) for mode in Mode),
-        ("led", {"r": 0, "g": 0, "b": 0}, OneShot(ColorLed(0, 0, 0))),
-        ("led", {"r": 255, "g": 16, "b": 1}, OneShot(ColorLed(255, 16, 1))),
-        *(("light", {"light": light}, general(light=light)) for light in Light),
-        ("servo", {"deg": 0}, OneShot(Ptz(0))),
-        ("servo", {"servo": "front", "deg": 180}, OneShot(Ptz(180))),
-        ("servo", {"action": "left"}, general(servo=ServoAction.FRONT_LEFT)),
-        ("servo", {"servo": "front", "action": "reset"}, general(servo=ServoAction.FRONT_RESET)),
-        ("servo", {"servo": "vertical", "action": "up"}, general(servo=ServoAction.VERTICAL_UP)),
-        ("servo", {"servo": "horizontal", "action": "right"}, general(servo=ServoAction.HORIZONTAL_RIGHT)),
-        ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, OneShot(ArmSet((0, 180, 1, 2, 3, 4)))),
-        ("whistle", {}, general(whistle=True)),
+        ("led", {"r": 0, "g": 0, "b": 0}, Led(0, 0, 0)),
+        ("led", {"r": 255, "g": 16, "b": 1}, Led(255, 16, 1)),
+        *(("light", {"light": light}, SetLight(light)) for light in Light),
+        ("servo", {"deg": 0}, AimServo(0)),
+        ("servo", {"servo": "front", "deg": 180}, AimServo(180)),
+        ("servo", {"action": "left"}, MoveServo(ServoAction.FRONT_LEFT)),
+        ("servo", {"servo": "front", "action": "reset"}, MoveServo(ServoAction.FRONT_RESET)),
+        ("servo", {"servo": "vertical", "action": "up"}, MoveServo(ServoAction.VERTICAL_UP)),
+        ("servo", {"servo": "horizontal", "action": "right"}, MoveServo(ServoAction.HORIZONTAL_RIGHT)),
+        ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, MoveArm((0, 180, 1, 2, 3, 4))),
+        ("whistle", {}, Whistle()),
         ("speed", {"step": "up"}, ChangeSpeed(SpeedStep.UP)),
         ("speed", {"step": "down"}, ChangeSpeed(SpeedStep.DOWN)),
         ("fan", {}, Fan(None)),
@@ -123,7 +124,7 @@ def test_the_fields_of_a_plain_action_are_flags_and_durations() -> None:
 
 
 @dataclass(frozen=True)
-class Horn(FrameAction):
+class Horn(PartAction):
     """A verb with a duration, made from `lend`, whose message has one."""
 
     duration_s: float
@@ -263,7 +264,7 @@ def test_another_verbs_message_is_refused() -> None:
 
 @pytest.mark.parametrize("encoding", ["", messages.JSON, PROTOBUF])
 def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
-    assert ask("whistle", b"", encoding).what == general(whistle=True)
+    assert ask("whistle", b"", encoding).what == Whistle()
     assert ask("stop", b"", encoding).what == Stop()
     assert "motion is missing" in refused("drive", b"", encoding).words
 

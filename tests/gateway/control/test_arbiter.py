@@ -10,6 +10,7 @@ import pytest
 from gateway.control.arbiter import MAX_QUEUED_COMMANDS, TABLE, CommandContext, Refusal, needs, refuse
 from gateway.control.commands import (
     Action,
+    AimServo,
     ChangeSpeed,
     Command,
     Drive,
@@ -17,17 +18,20 @@ from gateway.control.commands import (
     EndLoan,
     Fan,
     Find,
+    Led,
     Lend,
-    OneShot,
+    MoveArm,
+    MoveServo,
+    PartAction,
     Pause,
     Resume,
+    SetLight,
     SetMode,
     Stop,
     TakeLease,
     Unpause,
+    Whistle,
 )
-from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
-from gateway.protocol.platforms import parse_platform
 from schemas.authority import Authority, Estop, Hold, LeaseState, Sender
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
@@ -47,12 +51,12 @@ WHATS: list[Action] = [
     Drive(Motion.STOP),
     SetMode(Mode.TRACKING),
     SetMode(Mode.MANUAL),
-    OneShot(General(Motion.STOP, light=Light.RED)),
-    OneShot(General(Motion.STOP, whistle=True)),
-    OneShot(General(Motion.STOP, servo=ServoAction.FRONT_LEFT)),
-    OneShot(ColorLed(1, 2, 3)),
-    OneShot(Ptz(90)),
-    OneShot(ArmSet((0,) * 6)),
+    SetLight(Light.RED),
+    Whistle(),
+    MoveServo(ServoAction.FRONT_LEFT),
+    Led(1, 2, 3),
+    AimServo(90),
+    MoveArm((0,) * 6),
     ChangeSpeed(SpeedStep.UP),
     Fan(),
     Fan(on=True),
@@ -60,8 +64,8 @@ WHATS: list[Action] = [
 ]
 DIRECTIONS: list[Action] = [Pause("listen"), Unpause(), Lend("bob", 60.0), EndLoan()]
 """Commands that test_people.py tests, with leads and pauses."""
-MOVES = (Drive, SetMode, ChangeSpeed, Fan)
-"""Commands that move the car or change how it moves. These, servo and arm need the lease."""
+MOVES = (Drive, SetMode)
+"""Commands that move the car."""
 KINDS = [Rank.PERSON, Rank.SCRIPT, Rank.COORDINATOR]
 SENDERS = [Sender("ann", kind) for kind in KINDS]
 LEASES = [
@@ -80,11 +84,11 @@ def situations() -> tuple[CommandContext, ...]:
 
 
 def _situations() -> Iterator[CommandContext]:
-    """Yield 4,096 states: link, closing, hold, e-stop, lease, battery, queue, mode, platform."""
+    """Yield 2,048 states: link, closing, hold, e-stop, lease, battery, queue, mode, supported or not."""
     for (
         (link, closing, held, estopped, lease, battery, queued),
         asked,
-        platform,
+        unsupported,
     ) in itertools.product(
         itertools.product(
             (True, False),
@@ -96,11 +100,10 @@ def _situations() -> Iterator[CommandContext]:
             (0, 8),
         ),
         MODES,
-        ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
+        (None, "red cars do not know it"),
     ):
         yield CommandContext(
             car="red",
-            profile=PROFILES[platform],
             now=NOW,
             link_open=link,
             link_reason="gone",
@@ -109,12 +112,9 @@ def _situations() -> Iterator[CommandContext]:
             authority=Authority(hold=held, estops=estopped, lease=lease),
             ended=("over",),
             battery=battery,
-            fan=None,
             queued=queued,
+            unsupported=unsupported,
         )
-
-
-PROFILES = {name: parse_platform(name) for name in ("arduino", "raspberry_pi", "unknown", "stm32+arm")}
 
 
 @pytest.mark.parametrize("sender", SENDERS, ids=lambda sender: sender.kind)
@@ -133,7 +133,17 @@ def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
     assert [text for text in printed if count_lines(text) > MAX_LINES] == []
     seen = {each and each[0] for each in found}
     if isinstance(what, Drive) and what.motion is not Motion.STOP:
-        every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
+        every = {
+            None,
+            *(
+                Reason.UNSUPPORTED,
+                Reason.ESTOPPED,
+                Reason.LEASED,
+                Reason.BATTERY_LOW,
+                Reason.LINK_DOWN,
+                Reason.WRONG_MODE,
+            ),
+        }
         assert seen == (every | {Reason.HELD} if sender.kind is Rank.COORDINATOR else every)
 
 
@@ -142,6 +152,9 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     what, kind = command.what, command.sender.kind
     if isinstance(what, Stop | EmergencyStop):
         assert reason is None, "stop wins from every state"
+        return
+    if at.unsupported is not None:
+        assert reason is Reason.UNSUPPORTED
         return
     if isinstance(what, Resume):
         in_force = what.ids == ("e1",) and bool(at.authority.estops)
@@ -158,7 +171,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     if not isinstance(what, TakeLease):
         assert at.link_open
         assert not at.closing
-    moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
+    moves = isinstance(what, MOVES) or (isinstance(what, PartAction) and what.needs_lease)
     if (moves or isinstance(what, TakeLease)) and at.authority.lease is not None:
         mine, theirs = RANK.index(kind), RANK.index(at.authority.lease.holder.kind)
         assert mine > theirs or (mine == theirs and command.take and kind is Rank.PERSON)
@@ -168,16 +181,19 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     releases = isinstance(what, Drive) and what.motion is Motion.STOP
     if not isinstance(what, SetMode | TakeLease) and not releases:
         assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
-    if isinstance(what, OneShot | ChangeSpeed | Fan | Find):
+    if isinstance(what, PartAction | Find):
         assert at.queued < MAX_QUEUED_COMMANDS
 
 
-def _turns(act: OneShot) -> bool:
-    return isinstance(act.frame, Ptz | ArmSet) or (isinstance(act.frame, General) and act.frame.servo is not None)
+def test_who_moves_a_part_needs_the_lease() -> None:
+    parts = [what for what in WHATS if isinstance(what, PartAction)]
+    without = {type(what) for what in parts if not what.needs_lease}
+    assert without == {Led, SetLight, Whistle}
+    assert {type(what) for what in parts} - without == {MoveServo, AimServo, MoveArm, ChangeSpeed, Fan}
 
 
 def test_the_table_has_every_command() -> None:
-    others = {type(what) for what in (*WHATS, *DIRECTIONS)} - {OneShot, ChangeSpeed, Fan}
+    others = {type(what) for what in (*WHATS, *DIRECTIONS) if not isinstance(what, PartAction)}
     assert others == set(TABLE)
     for what in (*WHATS, *DIRECTIONS):
         assert needs(what)
@@ -189,10 +205,8 @@ def test_the_table_has_every_command() -> None:
 def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     calm = replace(
         situations()[0],
-        profile=PROFILES["stm32+arm"],
         asked=Mode.MANUAL,
         closing=False,
-        fan=True,
     )
     late = Command("c", "verb", Sender("ann"), what, age_s=2.1, ttl_s=2.0)
     refusal = refuse(late, calm)
@@ -203,30 +217,6 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
 
 
 @pytest.mark.parametrize(
-    ("platform", "speed", "step", "limit", "refused"),
-    [
-        ("arduino", 150.0, SpeedStep.UP, 1.0, False),
-        ("arduino", 150.0, SpeedStep.UP, 0.78, True),
-        ("arduino", 150.0, SpeedStep.UP, 0.79, False),
-        ("arduino", 150.0, SpeedStep.DOWN, 0.1, False),
-        ("arduino", 50.0, SpeedStep.DOWN, 0.3, True),  # docs/reference/protocol.md#platforms: that step goes up, to 100
-        ("raspberry_pi", 50.0, SpeedStep.UP, 0.6, True),
-    ],
-)
-def test_no_step_beyond_the_speed_that_is_allowed(
-    platform: str, speed: float, step: SpeedStep, limit: float, refused: bool
-) -> None:
-    calm = replace(situations()[0], profile=PROFILES[platform], asked=Mode.MANUAL, closing=False)
-    refusal = refuse(
-        Command("c", "speed", Sender("ann"), ChangeSpeed(step)), replace(calm, speed=speed, speed_max=limit)
-    )
-    assert (refusal is not None) is refused
-    if refusal is not None:
-        assert refusal[0] is Reason.UNSUPPORTED
-        assert f"Its maximum is {limit:.0%}" in refusal[1]
-
-
-@pytest.mark.parametrize(
     ("age_s", "refused"),
     [(-1e12, True), (-3600.0, True), (-5.1, True), (-4.9, False), (0.0, False), (2.0, False), (3600.0, True)],
 )
@@ -234,7 +224,7 @@ def test_no_step_beyond_the_speed_that_is_allowed(
 def test_a_time_far_from_now_is_refused_but_a_stop_looks_at_no_clock(
     what: Action, age_s: float, *, refused: bool
 ) -> None:
-    calm = replace(situations()[0], profile=PROFILES["stm32+arm"], asked=Mode.MANUAL, closing=False, fan=True)
+    calm = replace(situations()[0], asked=Mode.MANUAL, closing=False)
     refusal = refuse(Command("c", "verb", Sender("ann", Rank.PERSON), what, age_s=age_s, ttl_s=2.0), calm)
     is_stale = refusal is not None and refusal[0] is Reason.STALE
     assert is_stale is (refused and not isinstance(what, Stop | EmergencyStop | Pause))

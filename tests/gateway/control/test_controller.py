@@ -10,21 +10,26 @@ import pytest
 from gateway.control import command_queue
 from gateway.control.commands import (
     Action,
+    AimServo,
     ChangeSpeed,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    OneShot,
+    Led,
+    MoveArm,
+    MoveServo,
     Resume,
+    SetLight,
     SetMode,
     Stop,
+    Whistle,
 )
 from gateway.control.safety import PersistedSafety
-from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
-from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.control.stops.stopping import RETRY_S
-from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
+from gateway.drivers.yahboom.protocol.frames import ModeOpen, parse_sent
+from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
+from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops.stopping import RETRY_S
 from gateway.sim.model.traits import CarTraits
 from schemas.authority import Hold, Sender
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
@@ -57,8 +62,8 @@ from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 
 ASKED, QUEUED, SENT, COMPLETE = Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE
-WHISTLE = OneShot(General(Motion.STOP, whistle=True))
-LIGHT = OneShot(General(Motion.STOP, light=Light.RED))
+WHISTLE = Whistle()
+LIGHT = SetLight(Light.RED)
 FORWARD = Drive(Motion.FORWARD, 5.0)
 
 
@@ -81,11 +86,11 @@ def desk() -> Workbench:
         (Drive(Motion.STOP), [], [ASKED, SENT]),
         (SetMode(Mode.TRACKING), [b"$4WD,MODE21#"], [ASKED, QUEUED, SENT, Phase.EFFECT_SEEN]),
         (SetMode(Mode.MANUAL), SHOWN_STOP, [ASKED, QUEUED, SENT, Phase.EFFECT_SEEN]),
-        (OneShot(ColorLed(1, 2, 3)), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
-        (OneShot(Ptz(30)), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
+        (Led(1, 2, 3), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
+        (AimServo(30), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
         (LIGHT, [b"$0,0,0,0,0,0,2,0,0#"], [ASKED, QUEUED, SENT]),
         (WHISTLE, [b"$0,0,1,0,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
-        (OneShot(General(Motion.STOP, servo=ServoAction.FRONT_RESET)), [b"$0,0,0,0,0,0,0,0,1#"], [ASKED, QUEUED, SENT]),
+        (MoveServo(ServoAction.FRONT_RESET), [b"$0,0,0,0,0,0,0,0,1#"], [ASKED, QUEUED, SENT]),
         (ChangeSpeed(SpeedStep.UP), [b"$0,0,0,1,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
         (Fan(), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
         (Fan(on=True), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
@@ -105,7 +110,7 @@ def test_the_life_of_a_command(desk: Workbench, what: Action, frames: list[bytes
     answer = desk.ask(what, identity="it")
     assert answer.status in (QUEUED, SENT)
     desk.run(6.0 if frames is SHOWN_STOP else 4.0)
-    shown = desk.control.model.basis == Basis.SHOWN or isinstance(what, SetMode)
+    shown = desk.control.driver.model.basis == Basis.SHOWN or isinstance(what, SetMode)
     assert desk.frames == (frames if shown else [*frames, STOP]), "a rest that nothing has shown is renewed"
     assert shown or desk.sent[-1][2] is FrameOrigin.REPEAT
     assert desk.life("it") == life
@@ -208,7 +213,7 @@ def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
         Basis.SENT,
         "sent for 0.7 s",
     )
-    assert (desk.control.model.motors, desk.control.model.basis) == ("off", Basis.SENT)
+    assert (desk.control.driver.model.motors, desk.control.driver.model.basis) == ("off", Basis.SENT)
 
 
 def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Workbench) -> None:
@@ -227,7 +232,7 @@ def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Work
 
 def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
     desk.run(60.0)
-    assert (desk.frames, desk.control.model.basis) == ([], Basis.SHOWN)
+    assert (desk.frames, desk.control.driver.model.basis) == ([], Basis.SHOWN)
 
 
 def test_a_drive_that_had_to_wait_lasts_as_long_as_asked_and_says_that_it_waited(desk: Workbench) -> None:
@@ -398,9 +403,9 @@ def test_what_waits_too_long_for_a_busy_car_expires(what: Action, monkeypatch: p
 
 def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Workbench) -> None:
     desk.ask(WHISTLE)
-    desk.ask(OneShot(Ptz(30)))
+    desk.ask(AimServo(30))
     desk.ask(SetMode(Mode.TRACKING))
-    assert desk.ask(OneShot(Ptz(60))).reason is Reason.WRONG_MODE
+    assert desk.ask(AimServo(60)).reason is Reason.WRONG_MODE
     desk.run(3.0)
     assert desk.frames == [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,PTZ30#", b"$4WD,MODE21#"]
 
@@ -475,7 +480,7 @@ def test_a_hold_from_before_a_restart_counts() -> None:
 # ---------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("what", [FORWARD, LIGHT, OneShot(Ptz(1)), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
+@pytest.mark.parametrize("what", [FORWARD, LIGHT, AimServo(1), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
 def test_in_another_mode_the_car_would_ignore_it(desk: Workbench, what: Action) -> None:
     desk.ask(SetMode(Mode.TRACKING))
     desk.run(3.0)
@@ -493,12 +498,12 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Workbench, what: Action) 
     ("platform", "what"),
     [
         ("raspberry_pi", SetMode(Mode.TRACKING)),
-        ("raspberry_pi", OneShot(General(Motion.STOP, light=Light.YELLOW))),
+        ("raspberry_pi", SetLight(Light.YELLOW)),
         ("raspberry_pi", Fan(on=True)),
         ("unknown", SetMode(Mode.FOLLOWING)),
-        ("unknown", OneShot(Ptz(3))),
-        ("arduino", OneShot(ArmSet((1, 2, 3, 4, 5, 6)))),
-        ("arduino", OneShot(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))),
+        ("unknown", AimServo(3)),
+        ("arduino", MoveArm((1, 2, 3, 4, 5, 6))),
+        ("arduino", MoveServo(ServoAction.VERTICAL_UP)),
     ],
     ids=str,
 )
@@ -558,7 +563,11 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
     desk.take()
     for identity in ("held", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.LINK_DOWN), identity
-    assert (desk.control.model.motors, desk.control.model.motion, desk.control.model.believed.fan) == (
+    assert (
+        desk.control.driver.model.motors,
+        desk.control.driver.model.motion,
+        desk.control.driver.model.believed.fan,
+    ) == (
         "unknown",
         None,
         None,
@@ -606,8 +615,8 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
     times = [at - began for at, _, _ in desk.sent]
     assert [round(at, 2) for at in times[:4]] == [0.0, 0.05, 3.7, 4.8]
     assert max(later - earlier for earlier, later in pairwise(times)) <= RETRY_S[-1]
-    assert (desk.control.model.motors, desk.control.model.basis) == ("unknown", None)
-    assert desk.control.model.trust.state is CarTrust.UNHEARD
+    assert (desk.control.driver.model.motors, desk.control.driver.model.basis) == ("unknown", None)
+    assert desk.control.driver.model.trust.state is CarTrust.UNHEARD
     assert [log.code for log in desk.logs].count("unheard") == 1
     assert desk.end("it") == (Phase.FAILED, Reason.NOT_SHOWN)
     assert desk.ask(FORWARD, identity="unheard").status is QUEUED, "what is not shown forbids nothing"
@@ -617,7 +626,7 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
     assert desk.end("again") == (Phase.FAILED, Reason.NOT_SHOWN)
     desk.hear()
     desk.run(15.0)
-    assert (desk.control.model.motors, desk.control.model.basis) == ("off", Basis.SHOWN)
+    assert (desk.control.driver.model.motors, desk.control.driver.model.basis) == ("off", Basis.SHOWN)
 
 
 def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
@@ -627,10 +636,10 @@ def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
     for _ in range(4):
         desk.run(0.95, reports=False)
         desk.hear()
-        assert not desk.control.model.known, "it reports, and nothing shows that it reads"
-    desk.until(lambda: desk.control.model.known)
-    assert desk.control.model.basis == Basis.SHOWN
-    assert desk.control.model.trust.evidence.endswith("pauses in its reports, each after MODE00")
+        assert not desk.control.driver.model.known, "it reports, and nothing shows that it reads"
+    desk.until(lambda: desk.control.driver.model.known)
+    assert desk.control.driver.model.basis == Basis.SHOWN
+    assert desk.control.driver.model.trust.evidence.endswith("pauses in its reports, each after MODE00")
     assert desk.logs[-1].code == "recovered"
 
 
@@ -647,7 +656,7 @@ def driving(desk: Workbench) -> None:
 
 def acting(desk: Workbench) -> None:
     desk.ask(Find(), identity="it")
-    desk.ask(OneShot(Ptz(1)))
+    desk.ask(AimServo(1))
 
 
 def opening(desk: Workbench) -> None:
@@ -676,13 +685,13 @@ def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Ca
     began, sent = desk.now, len(desk.sent)
     desk.control.shut_down(desk.now)
     desk.control.shut_down(desk.now)
-    while not desk.control.stops.finished:
+    while not desk.control.driver.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01)
-    assert not desk.control.stops.not_stopped
-    assert (desk.control.model.motors, desk.control.model.basis is not None) == ("off", True)
-    assert platform != "arduino" or desk.control.model.basis == Basis.SHOWN
-    assert platform != "raspberry_pi" or desk.control.model.basis == Basis.SENT
+    assert not desk.control.driver.stops.not_stopped
+    assert (desk.control.driver.model.motors, desk.control.driver.model.basis is not None) == ("off", True)
+    assert platform != "arduino" or desk.control.driver.model.basis == Basis.SHOWN
+    assert platform != "raspberry_pi" or desk.control.driver.model.basis == Basis.SENT
     if state is idle and platform == "arduino":
         assert (desk.now, len(desk.sent)) == (began, sent), "it has shown that it stands: nothing is sent"
     if desk.life("it"):
@@ -698,26 +707,26 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
 ) -> None:
     desk = Workbench(platform).ready()
     state(desk)
-    if desk.control.model.basis is not None:
+    if desk.control.driver.model.basis is not None:
         desk.ask(Drive(Motion.FORWARD, 0.2))
         desk.run(0.1)
     began = desk.now
     desk.control.shut_down(desk.now)
-    while not desk.control.stops.finished:
+    while not desk.control.driver.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01, reports=False)
     desk.take()
     assert desk.now - began == pytest.approx(SHUTDOWN_S, abs=0.02)
-    assert desk.control.stops.not_stopped == "has not reacted to the stop"
+    assert desk.control.driver.stops.not_stopped == "has not reacted to the stop"
     assert desk.logs[-1].code == "not_stopped"
     assert desk.logs[-1].words.startswith("red may still be moving: red has not reacted to the stop")
-    assert desk.control.model.basis is None
+    assert desk.control.driver.model.basis is None
 
 
 def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Workbench) -> None:
     desk.control.link_down("unplugged", desk.now)
     desk.control.shut_down(desk.now)
-    assert desk.control.stops.finished
+    assert desk.control.driver.stops.finished
     desk.take()
     assert [(entry.code, entry.words) for entry in desk.logs] == [
         ("not_stopped", "red may still be moving: red is unreachable (unplugged). Look at the car.")
@@ -742,10 +751,10 @@ def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() 
     """The previous gateway may have left the car driving."""
     desk = Workbench()
     desk.control.shut_down(desk.now)
-    assert desk.control.stops.finished
+    assert desk.control.driver.stops.finished
     desk.take()
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
-    assert desk.control.stops.not_stopped
+    assert desk.control.driver.stops.not_stopped
 
 
 def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
@@ -756,9 +765,9 @@ def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
     pair.lose_frames()
     began = pair.now
     pair.control.shut_down(began)
-    pair.until(lambda: pair.control.stops.finished, SHUTDOWN_S + 0.1)
+    pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S + 0.1)
     assert pair.car.truth.mode is Mode.TRACKING
-    assert pair.control.stops.not_stopped
+    assert pair.control.driver.stops.not_stopped
     assert pair.logs[-1].code == "not_stopped"
 
 
@@ -767,10 +776,10 @@ def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
     pair.control.shut_down(pair.now)
-    assert pair.until(lambda: pair.control.stops.finished, SHUTDOWN_S) <= 1.1 + 4.5
-    assert pair.control.model.mode.verdict is Verdict.CONFIRMED
-    assert pair.control.model.basis == Basis.SHOWN
-    assert not pair.control.stops.not_stopped
+    assert pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S) <= 1.1 + 4.5
+    assert pair.control.driver.model.mode.verdict is Verdict.CONFIRMED
+    assert pair.control.driver.model.basis == Basis.SHOWN
+    assert not pair.control.driver.stops.not_stopped
 
 
 def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
@@ -780,7 +789,7 @@ def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
     assert desk.frames == [RUN, MODE00]
     desk.control.link_down("unplugged", desk.now)
     desk.take()
-    assert desk.control.stops.finished
+    assert desk.control.driver.stops.finished
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
 
 
@@ -792,7 +801,7 @@ def anything(moments: random.Random) -> Action:
         [
             *(Drive(motion, moments.choice([0.1, 0.5, 3.0])) for motion in Motion),
             *(SetMode(mode) for mode in (Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED)),
-            *(WHISTLE, LIGHT, OneShot(Ptz(90)), OneShot(ColorLed(1, 2, 3)), Find(), Resume()),
+            *(WHISTLE, LIGHT, AimServo(90), Led(1, 2, 3), Find(), Resume()),
             *(Fan(), ChangeSpeed(SpeedStep.UP), Stop()),
         ]
     )
@@ -818,16 +827,16 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         assert set(desk.frames[before:]) <= stops, seed
         ends = [each for each in desk.records if each.command.id == "the-stop"]
         if (
-            desk.car.fan and not desk.control.model.believed.fan_may_run
+            desk.car.fan and not desk.control.driver.model.believed.fan_may_run
         ):  # the fan ran when the link was lost, so control does not know why the car is silent
             assert (ends[-1].phase, ends[-1].reason) == (Phase.FAILED, Reason.NOT_SHOWN), seed
-            assert desk.control.model.motors == "unknown", seed
+            assert desk.control.driver.model.motors == "unknown", seed
             continue
-        assert desk.control.model.motors == "off", seed
+        assert desk.control.driver.model.motors == "off", seed
         assert (ends[-1].phase is COMPLETE) == (ends[-1].basis == Basis.SHOWN), seed
         assert ends[-1].phase is COMPLETE or (ends[-1].phase, ends[-1].basis) == (SENT, Basis.SENT), seed
 
-        profile = desk.control.model.profile
+        profile = desk.control.driver.model.profile
         for index in set(range(1, len(desk.sent))) - links:
             (earlier, first, _), (later, second, why) = desk.sent[index - 1 : index + 1]
             frame = parse_sent(first)
@@ -855,11 +864,11 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
     for _ in range(3):
         pair.ask(Fan())
         pair.run(2.5)
-        assert pair.car.truth.fan is pair.control.model.believed.fan
+        assert pair.car.truth.fan is pair.control.driver.model.believed.fan
     for step in (SpeedStep.DOWN, SpeedStep.DOWN, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP):
         pair.ask(ChangeSpeed(step))
         pair.run(0.5)
-        assert pair.car.truth.speed == pair.control.model.believed.speed
+        assert pair.car.truth.speed == pair.control.driver.model.believed.speed
 
 
 @pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("arduino", False), ("raspberry_pi", True)])
@@ -890,16 +899,16 @@ def test_a_drive_of_an_unknown_car_whose_mode_nothing_shows_says_so(*, heard: bo
 
 def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> None:
     pair = Pair("arduino", told="arduino+fan_level", traits=CarTraits(fan_level=True), start_s=2.0).ready()
-    pair.control.model.believed.fan = None  # as after a connect: a level needs no known state
+    pair.control.driver.model.believed.fan = None  # as after a connect: a level needs no known state
     assert pair.ask(Fan(on=True)).status is QUEUED
-    for what in (OneShot(General(Motion.STOP, light=Light.RED)), Drive(Motion.FORWARD, 0.5)):
+    for what in (SetLight(Light.RED), Drive(Motion.FORWARD, 0.5)):
         pair.run(4.0)
         pair.ask(what)
         pair.run(4.0)
-        assert (pair.car.truth.fan, pair.control.model.believed.fan) == (True, True)
+        assert (pair.car.truth.fan, pair.control.driver.model.believed.fan) == (True, True)
     pair.ask(Fan(on=False))
     pair.run(4.0)
-    assert (pair.car.truth.fan, pair.control.model.believed.fan) == (False, False)
+    assert (pair.car.truth.fan, pair.control.driver.model.believed.fan) == (False, False)
 
 
 def test_readings_of_a_car_that_reports_by_a_timer_do_not_show_its_fan() -> None:
@@ -907,7 +916,7 @@ def test_readings_of_a_car_that_reports_by_a_timer_do_not_show_its_fan() -> None
     pair.ask(Fan())
     pair.run(6.0)
     assert pair.car.truth.fan
-    assert pair.control.model.believed.fan is None
+    assert pair.control.driver.model.believed.fan is None
     refused = pair.ask(Fan(on=True))
     assert (refused.status, pair.car.truth.fan) == (Phase.REJECTED, True), "it would turn the fan off"
 
@@ -920,7 +929,7 @@ def test_what_is_asked_while_a_mode_is_left_is_not_lost(mode: Mode) -> None:
         pair.run(6.0 + 2.0 * random.Random(seed).random())
         pair.ask(SetMode(Mode.MANUAL))
         control = pair.control
-        pair.until(lambda control=control: control.stops.running is None, 20.0)
+        pair.until(lambda control=control: control.driver.stops.running is None, 20.0)
         before = pair.car.truth.fan
         pair.ask(Fan())
         pair.run(7.0)

@@ -14,8 +14,8 @@ from gateway.control.commands import (
     EmergencyStop,
     EndLoan,
     Find,
+    Led,
     Lend,
-    OneShot,
     Pause,
     Resume,
     SetMode,
@@ -24,8 +24,6 @@ from gateway.control.commands import (
     Unpause,
 )
 from gateway.control.safety import PersistedSafety
-from gateway.protocol.frames import ColorLed
-from gateway.protocol.platforms import parse_platform
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
@@ -41,7 +39,7 @@ ACTIONS: dict[str, Action] = {
     "release": Drive(Motion.STOP),
     "mode": SetMode(Mode.TRACKING),
     "manual": SetMode(Mode.MANUAL),
-    "led": OneShot(ColorLed(1, 2, 3)),
+    "led": Led(1, 2, 3),
     "find": Find(),
     "lease": TakeLease(),
     "free": TakeLease(release=True),
@@ -72,7 +70,6 @@ def names(kind: Rank) -> str:
 
 FREE = CommandContext(
     car="red",
-    profile=parse_platform("arduino"),
     now=NOW,
     link_open=True,
     link_reason="",
@@ -81,7 +78,6 @@ FREE = CommandContext(
     authority=Authority(PEOPLE),
     ended=(),
     battery="",
-    fan=False,
     queued=0,
 )
 ESTOPS: list[tuple[Estop, ...]] = [
@@ -406,7 +402,7 @@ def test_a_loan_that_ends_early_stops_a_mode_of_the_borrower_and_nobody_elses(de
     assert desk.ask(EndLoan(), CID).words == "the loan to cid has ended"
     desk.run(5.0)
     assert desk.control.asked is Mode.MANUAL
-    assert desk.control.model.at_rest
+    assert desk.control.driver.model.at_rest
     desk.ask(Lend("cid", 60.0), TEACHER)
     desk.ask(FORWARD, TEACHER)
     desk.sent.clear()

@@ -3,8 +3,7 @@
 import pytest
 
 from gateway.control.arbiter import AFTER_SLEEP_S
-from gateway.control.commands import Drive, EmergencyStop, Fan, Lend, OneShot, Pause, SetMode, Stop
-from gateway.protocol.frames import ColorLed
+from gateway.control.commands import Drive, EmergencyStop, Fan, Led, Lend, Pause, SetMode, Stop
 from schemas.limits import STREAM_PAUSE_S
 from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
@@ -41,12 +40,12 @@ def test_a_drive_is_over_and_the_car_is_stopped_first(platform: str, *, counted:
     assert desk.control.safety.lease is None
     desk.run(8.0)
     assert RUN not in desk.frames
-    assert desk.control.model.motors == "off"
+    assert desk.control.driver.model.motors == "off"
 
 
 @pytest.mark.parametrize("counted", [False, True])
 def test_what_was_queued_never_goes_out(desk: Workbench, *, counted: bool) -> None:
-    desk.ask(OneShot(ColorLed(1, 2, 3)), identity="led", pump=False)
+    desk.ask(Led(1, 2, 3), identity="led", pump=False)
     desk.ask(Fan(), identity="fan", pump=False)
     desk.ask(FORWARD, identity="drive", pump=False)
     desk.ask(SetMode(Mode.TRACKING), identity="mode", pump=False)
@@ -62,13 +61,13 @@ def test_a_mode_that_runs_is_stopped(desk: Workbench) -> None:
     sleep(desk)
     desk.run(12.0)
     assert MODE00 in desk.frames
-    assert desk.control.model.at_rest
+    assert desk.control.driver.model.at_rest
 
 
 def test_a_car_that_has_shown_that_it_stands_gets_no_frame(desk: Workbench) -> None:
     desk.ask(Stop())
     desk.run(8.0)
-    assert desk.control.model.basis is Basis.SHOWN
+    assert desk.control.driver.model.basis is Basis.SHOWN
     sleep(desk)
     desk.run(4.0)
     assert desk.frames == []
@@ -84,7 +83,7 @@ def test_the_silence_during_the_sleep_is_none_of_the_car(desk: Workbench, *, cou
         desk.now += 0.2
         desk.control.tick(desk.now)
         desk.pump()
-    assert desk.control.model.is_heard
+    assert desk.control.driver.model.is_heard
     assert [entry.code for entry in desk.logs] == ["slept"]
 
 
@@ -96,7 +95,7 @@ def test_report_times_from_before_the_sleep_show_nothing(desk: Workbench) -> Non
     desk.run(1.5)
     sleep(desk, 1.9, counted=True)
     desk.hear()
-    assert desk.control.model.basis is not Basis.SHOWN, "one report after the sleep shows no pause"
+    assert desk.control.driver.model.basis is not Basis.SHOWN, "one report after the sleep shows no pause"
 
 
 def test_a_stop_from_before_the_sleep_goes_on(desk: Workbench) -> None:
@@ -154,7 +153,7 @@ def test_a_stop_that_waits_for_evidence_is_sent_again_at_once(desk: Workbench) -
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop(), identity="stop")
-    desk.until(lambda: bool(desk.control.stops.running and desk.control.stops.running.frames_sent))
+    desk.until(lambda: bool(desk.control.driver.stops.running and desk.control.driver.stops.running.frames_sent))
     sleep(desk)
     desk.run(0.1)
     assert MODE00 in desk.frames
@@ -167,7 +166,7 @@ def test_a_sleep_at_the_end_of_the_gateway_begins_no_stop_after_it() -> None:
     desk.control.shut_down(desk.now)
     sleep(desk)
     desk.run(10.0)
-    assert desk.control.stops.finished
+    assert desk.control.driver.stops.finished
     desk.sent.clear()
     sleep(desk)
-    assert desk.control.stops.finished
+    assert desk.control.driver.stops.finished

@@ -3,16 +3,16 @@
 from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
-from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, LogRecord
 from gateway.control.safety import PersistedSafety
-from gateway.control.stops.evidence import SETTLING_S
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
-from gateway.protocol.platforms import parse_platform
-from gateway.protocol.timing import FRAME_S
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.timing import FRAME_S
+from gateway.drivers.yahboom.stops.evidence import SETTLING_S
 from schemas.authority import NO_PEOPLE, People, Sender
 from schemas.words import FrameOrigin, Level, Mode, Phase, Platform, Rank, Reason
+from tests.support.controls import control
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
@@ -87,8 +87,8 @@ class Workbench:
         self, platform: str = "arduino", *, kept: PersistedSafety | None = None, people: People = NO_PEOPLE
     ) -> None:
         self.now = 100.0
-        self.control = Controller(
-            "red", parse_platform(platform), persisted=kept, people=people, now=self.now, now_ns=int(self.now * 1e9)
+        self.control = control(
+            parse_platform(platform), persisted=kept, people=people, now=self.now, now_ns=int(self.now * 1e9)
         )
         self.car = ObedientCar(platform, self.now)
         self.sent: list[tuple[float, bytes, FrameOrigin]] = []
@@ -102,8 +102,8 @@ class Workbench:
         """Connect, and wait until the car has shown that it stands. Forget all frames and records until then."""
         self.control.link_up(self.now)
         self.pump()
-        self.until(lambda: self.control.model.known, 12.0)
-        assert self.control.model.motors == "off"
+        self.until(lambda: self.control.driver.model.known, 12.0)
+        assert self.control.driver.model.motors == "off"
         self.run(1.5 - SETTLING_S)
         self.sent.clear()
         self.take()

@@ -19,10 +19,10 @@ from pathlib import Path
 import pytest
 import serial
 
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.sensors import Sensors
 from schemas.links import TcpUrl
 from tests.gateway.link.peers import (
     BlePeer,

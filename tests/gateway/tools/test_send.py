@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.tools.send import why_not
 from schemas.words import Mode
 from tests.gateway.conftest import PATIENCE_S, Command
@@ -139,7 +139,7 @@ def test_a_tcp_car_that_nothing_could_stop_is_not_set_going(command: Command) ->
 
 
 def test_every_mode_has_its_words(command: Command) -> None:
-    from gateway.protocol.frames import ModeOpen
+    from gateway.drivers.yahboom.protocol.frames import ModeOpen
     from gateway.tools.send import aftermath
 
     for mode in set(Mode) - {Mode.MANUAL}:

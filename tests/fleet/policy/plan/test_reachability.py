@@ -5,7 +5,7 @@ import pytest
 from fleet.policy.plan.lint import Severity, check
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 
 
 def listed(platform: str) -> CarSnapshot:

@@ -13,7 +13,7 @@ from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import NAMES, CarSnapshot, FleetSnapshot
 from fleet.policy.state import PolicyState
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.words import Mode
 from schemas.yaml_document.document import BadFile
 from tests.fleet.policy.cars import HERE, seen

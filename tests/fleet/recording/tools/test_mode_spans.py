@@ -9,7 +9,7 @@ from mcap.writer import Writer
 from fleet import Session
 from fleet.recording.tools.analysis import NoTable
 from fleet.recording.tools.mode_spans import ModeSpan, does_exist, mode_spans, sensor_of, spans_without
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Mode, Platform
 from tests.fleet.replay.make_session import START_NS, Made

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 
 from gateway.control.commands import Drive, SetMode, Stop
-from gateway.control.controller import Controller
-from gateway.control.estimate.learned import REACTED, Learned
-from gateway.control.estimate.platform import OTHER_PROGRAM_FRAMES
-from gateway.protocol.decoder import Decoder
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.estimate.learned import REACTED, Learned
+from gateway.drivers.yahboom.estimate.platform import OTHER_PROGRAM_FRAMES
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
 from schemas.platform_name import parse_option
 from schemas.words import Basis, Mode, Motion, Phase, Shows
+from tests.support.controls import control
 from tests.support.virtual import Pair
 
 KEPT: dict[str, Any] = {
@@ -30,9 +30,7 @@ KEPT: dict[str, Any] = {
 def met(kept_s: float, traits: CarTraits) -> Pair:
     """Connect a car of which another rhythm is kept, that showed its stops."""
     pair = Pair(start_s=2.0, traits=traits)
-    pair.control = Controller(
-        "red", parse_platform("arduino"), learned=Learned.restore(KEPT | {"echo_s": [kept_s] * 9})
-    )
+    pair.control = control(parse_platform("arduino"), learned=Learned.restore(KEPT | {"echo_s": [kept_s] * 9}))
     pair.connect()
     return pair
 
@@ -53,10 +51,10 @@ def met(kept_s: float, traits: CarTraits) -> Pair:
 def test_a_kept_rhythm_of_another_program_is_learned_again_while_stops_go_out(kept_s: float, traits: CarTraits) -> None:
     pair = met(kept_s, traits)
     pair.run(60.0)
-    learned = pair.control.model.learned
+    learned = pair.control.driver.model.learned
     assert abs(learned.echo.median_s - traits.interval_s) < 0.1
     assert not learned.doubted
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.model.motors == "off"
     pair.ask(Stop(), identity="it")
     pair.run(25.0)
     last = pair.last_of("it")
@@ -71,12 +69,12 @@ def test_a_car_that_could_not_show_its_stops_shows_them_when_its_wire_is_whole()
     feed = pair.car.feed
     pair.car.feed = lambda *_: None  # type: ignore[method-assign]
     pair.connect()
-    pair.until(lambda: pair.control.model.learned.shows is Shows.NO, 60.0)
+    pair.until(lambda: pair.control.driver.model.learned.shows is Shows.NO, 60.0)
     pair.car.feed = feed  # type: ignore[method-assign]
     for number in range(REACTED + 1):
         pair.ask(Stop(), identity=str(number))
         pair.run(15.0)
-    assert pair.control.model.learned.shows is Shows.YES
+    assert pair.control.driver.model.learned.shows is Shows.YES
     last = pair.last_of(str(REACTED))
     assert last is not None
     assert last.basis == "shown"
@@ -138,7 +136,7 @@ def test_a_report_that_mode_00_has_delayed_is_no_rhythm_if_a_drive_follows_it() 
             pair.run(moments.uniform(0.2, 3.0))
             pair.ask(Stop() if moments.random() < 0.4 else Drive(Motion.BACK, 0.3))
         pair.run(6.0)
-        intervals_s = pair.control.model.learned.echo.intervals
+        intervals_s = pair.control.driver.model.learned.echo.intervals
         assert all(abs(each - 2.2) < 0.1 for each in intervals_s), f"seed {seed}: {intervals_s}"
 
 
@@ -146,8 +144,8 @@ def test_a_raspberry_pi_car_that_never_sends_a_reading_is_taken_as_such_until_on
     pair = Pair("course", told="raspberry_pi", start_s=2.0)
     pair.connect()
     control = pair.control
-    pair.until(lambda: control.model.profile.name == "raspberry_pi+no_readings", 15.0)
-    pair.until(lambda: control.model.at_rest, 3.0)
+    pair.until(lambda: control.driver.model.profile.name == "raspberry_pi+no_readings", 15.0)
+    pair.until(lambda: control.driver.model.at_rest, 3.0)
     pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     pair.run(2.0)
     pair.ask(Stop(), identity="stop")
@@ -157,8 +155,8 @@ def test_a_raspberry_pi_car_that_never_sends_a_reading_is_taken_as_such_until_on
     assert "platform_contradicted" in {record.code for record in pair.logs}
     assert not any(b"MODE" in data for _, data in pair.sent)
     control.shut_down(pair.now)
-    pair.until(lambda: control.stops.finished, 2.0)
-    assert not control.stops.not_stopped
+    pair.until(lambda: control.driver.stops.finished, 2.0)
+    assert not control.driver.stops.not_stopped
 
 
 def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
@@ -166,17 +164,17 @@ def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
     feed = pair.decoder.feed
     pair.decoder.feed = lambda *_: []  # type: ignore[method-assign]  # a wire that carries nothing
     pair.control.link_up(pair.now)
-    pair.until(lambda: pair.control.model.profile.name == "raspberry_pi+no_readings", 15.0)
+    pair.until(lambda: pair.control.driver.model.profile.name == "raspberry_pi+no_readings", 15.0)
     pair.decoder.feed = feed  # type: ignore[method-assign]
     pair.run(10.0)
-    assert pair.control.model.profile.name == "raspberry_pi"
-    assert not pair.control.model.platform.doubted
+    assert pair.control.driver.model.profile.name == "raspberry_pi"
+    assert not pair.control.driver.model.platform.doubted
     pair.lose()
     pair.decoder.feed = lambda *_: []  # type: ignore[method-assign]
     pair.control.link_up(pair.now)
     pair.run(20.0)
-    assert pair.control.model.profile.name == "raspberry_pi", "it reported before: its silence is odd"
-    assert not pair.control.model.is_heard
+    assert pair.control.driver.model.profile.name == "raspberry_pi", "it reported before: its silence is odd"
+    assert not pair.control.driver.model.is_heard
 
 
 @pytest.mark.parametrize(
@@ -190,10 +188,10 @@ def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
 def test_readings_end_the_option_that_there_are_none(platform: str, told: str, counts_as: str) -> None:
     pair = Pair(platform, told=counts_as, start_s=2.0)
     name, auto = parse_option(told)
-    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
     pair.run(30.0)
-    model = pair.control.model
+    model = pair.control.driver.model
     assert (model.profile.name, model.platform.doubted) == (counts_as, False)
     assert bool(model.platform.contradictions) is not auto
     assert model.shows_stops[0] is (Shows.NO if platform == "raspberry_pi" else Shows.YES)
@@ -206,9 +204,9 @@ def test_readings_end_the_option_that_there_are_none(platform: str, told: str, c
 def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, other: str) -> None:
     name, auto = parse_option(told)
     pair = Pair("arduino", told="arduino", start_s=2.0)
-    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
-    model = pair.control.model
+    model = pair.control.driver.model
     pair.until(lambda: model.at_rest and model.trust.shown and model.learned.echo.is_firm, 60.0)
     pair.car = Pair(other, start_s=2.0).car
     pair.car.advance(pair.now)
@@ -226,9 +224,9 @@ def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, o
 def test_a_detected_platform_is_detected_again_when_the_program_is_swapped(first: str, other: str) -> None:
     pair = Pair(first, start_s=2.0)
     name, auto = parse_option("auto")
-    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
-    model = pair.control.model
+    model = pair.control.driver.model
     pair.until(lambda: model.profile.name == first and model.at_rest and model.learned.echo.is_firm, 60.0)
     pair.car = Pair(other, start_s=2.0).car
     pair.car.advance(pair.now)
@@ -242,11 +240,11 @@ def swapped(told: str, mode: Mode) -> Pair:
     """Let the car's program change to a Raspberry Pi's on the link while a silent mode is open."""
     name, auto = parse_option(told)
     pair = Pair("arduino", told="arduino", start_s=2.0)
-    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
-    pair.until(lambda: pair.control.model.profile.kind == "arduino" and pair.control.is_free(pair.now), 30.0)
+    pair.until(lambda: pair.control.driver.model.profile.kind == "arduino" and pair.control.is_free(pair.now), 30.0)
     pair.ask(SetMode(mode), identity="mode")
-    pair.until(lambda: pair.control.model.mode.asked is mode, 15.0)
+    pair.until(lambda: pair.control.driver.model.mode.asked is mode, 15.0)
     pair.run(6.0)
     other = Pair("raspberry_pi", start_s=2.0)
     pair.car = other.car
@@ -257,14 +255,14 @@ def swapped(told: str, mode: Mode) -> Pair:
 @pytest.mark.parametrize("told", ["auto", "arduino"])
 def test_a_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
     pair = swapped(told, Mode.COLOR_LED)
-    pair.until(lambda: pair.control.model.mode.is_left, 15.0)
+    pair.until(lambda: pair.control.driver.model.mode.is_left, 15.0)
     answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     assert answer.status != "rejected", answer
     pair.run(15.0)
     last = pair.last_of("drive")
     assert last is not None
     assert last.phase in ("sent", "complete"), last
-    assert pair.control.model.learned.opened_as == "", "readings have shown mode 0"
+    assert pair.control.driver.model.learned.opened_as == "", "readings have shown mode 0"
 
 
 def test_another_head_is_used_as_soon_as_it_is_known() -> None:
@@ -275,7 +273,7 @@ def test_another_head_is_used_as_soon_as_it_is_known() -> None:
     pair.control.link_up(pair.now)
     began = pair.now
     pair.decoder = Decoder(head="TANK")
-    pair.until(lambda: pair.control.model.profile.dialect.head == "4WD", 3.0)
+    pair.until(lambda: pair.control.driver.model.profile.dialect.head == "4WD", 3.0)
     pair.until(lambda: pair.car.truth.mode is Mode.MANUAL, began + 6.0 - pair.now)
     assert not pair.car.truth.driving
 
@@ -285,7 +283,7 @@ def test_a_head_that_is_corrected_neither_cuts_nor_delays_a_drive(told: str) -> 
     name, auto = parse_option(told)
     for tenth in range(0, 40, 3):
         pair = Pair(start_s=2.0, traits=CarTraits(head="3WD"))
-        pair.control = Controller("red", parse_platform(name), auto=auto)
+        pair.control = control(parse_platform(name), auto=auto)
         pair.connect()
         pair.run(tenth / 10)
         asked_at = pair.now

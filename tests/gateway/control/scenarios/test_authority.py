@@ -2,19 +2,8 @@
 
 import pytest
 
-from gateway.control.commands import (
-    Action,
-    ChangeSpeed,
-    Drive,
-    EmergencyStop,
-    OneShot,
-    Resume,
-    SetMode,
-    Stop,
-    TakeLease,
-)
+from gateway.control.commands import Action, ChangeSpeed, Drive, EmergencyStop, Led, Resume, SetMode, Stop, TakeLease
 from gateway.control.safety import PersistedSafety
-from gateway.protocol.frames import ColorLed
 from schemas.authority import Estop, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason, SpeedStep
 from tests.gateway.control.workbench import (
@@ -50,7 +39,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     desk.run(600.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.life("e1") == [Phase.ASKED, QUEUED, SENT, Phase.COMPLETE]
-    for what in (FORWARD, SetMode(Mode.MANUAL), OneShot(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
+    for what in (FORWARD, SetMode(Mode.MANUAL), Led(1, 2, 3), TakeLease(), Drive(Motion.STOP)):
         refused = desk.ask(what, PERSON)
         assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
         assert 'red is emergency-stopped (mia: "smoke"). Release it with `fleet resume red --estops`.' in refused.words
@@ -141,7 +130,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
     assert "red is driven by script (script) for another 5.0 s. Wait until the car is free." in refused.words
     desk.run(4.9)
     assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
-    assert desk.ask(OneShot(ColorLed(1, 2, 3)), other).status is QUEUED
+    assert desk.ask(Led(1, 2, 3), other).status is QUEUED
     desk.run(0.2)
     assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
 
@@ -348,8 +337,8 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> No
     for _ in range(3):
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
-    assert (desk.control.model.motors, desk.control.model.motion) == ("unknown", None)
-    assert desk.ask(OneShot(ColorLed(1, 2, 3)), PERSON).reason is None, "the gateway stops it first"
+    assert (desk.control.driver.model.motors, desk.control.driver.model.motion) == ("unknown", None)
+    assert desk.ask(Led(1, 2, 3), PERSON).reason is None, "the gateway stops it first"
 
 
 def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> None:

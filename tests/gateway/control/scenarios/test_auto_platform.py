@@ -5,12 +5,12 @@ import json
 import pytest
 
 from gateway.control.commands import Drive, SetMode, Stop
-from gateway.control.controller import Controller
-from gateway.control.estimate.learned import Learned
-from gateway.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
 from schemas.platform_name import parse_option
 from schemas.words import Mode, Motion, Platform
+from tests.support.controls import control
 from tests.support.virtual import Pair
 
 
@@ -18,7 +18,7 @@ def paired(platform: str) -> Pair:
     transport = Transport.TCP if platform == "raspberry_pi" else Transport.SERIAL
     pair = Pair(platform, transport=transport)
     name, auto = parse_option("auto")
-    pair.control = Controller("red", parse_platform(name), auto=auto)
+    pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
     return pair
 
@@ -33,12 +33,12 @@ def paired(platform: str) -> Pair:
 )
 def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: str, first: bytes) -> None:
     pair = paired(platform)
-    assert pair.control.model.profile.name == "unknown"
-    pair.until(lambda: pair.control.model.known, 20.0)
+    assert pair.control.driver.model.profile.name == "unknown"
+    pair.until(lambda: pair.control.driver.model.known, 20.0)
     assert pair.sent[0][1] == b"$0,0,0,0,0,0,0,0,0#", "not knowing what it is, the frame that every car obeys first"
-    pair.until(lambda: pair.control.model.profile.name == settled, 10.0)
+    pair.until(lambda: pair.control.driver.model.profile.name == settled, 10.0)
     assert any(log.code == "platform_settled" and settled in log.words for log in pair.logs)
-    assert settled in pair.control.model.platform.evidence[0]
+    assert settled in pair.control.driver.model.platform.evidence[0]
     pair.ask(Drive(Motion.FORWARD, 5.0))
     pair.run(1.9)
     pair.sent.clear()
@@ -52,25 +52,25 @@ def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: st
 def test_before_it_is_settled_only_what_every_car_knows_is_sent() -> None:
     pair = paired("arduino")
     assert pair.ask(SetMode(Mode.TRACKING)).reason == "unsupported"
-    pair.until(lambda: pair.control.model.profile.name == "arduino", 20.0)
+    pair.until(lambda: pair.control.driver.model.profile.name == "arduino", 20.0)
     assert pair.ask(SetMode(Mode.TRACKING)).reason is None
 
 
 def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
     pair = paired("arduino")
-    pair.until(lambda: pair.control.model.profile.name == "arduino", 20.0)
+    pair.until(lambda: pair.control.driver.model.profile.name == "arduino", 20.0)
     pair.control.link_down("unplugged", pair.now)
     other = Pair("raspberry_pi", transport=Transport.TCP)
     other.control = pair.control
     other.run(pair.now, linked=False)
     other.connect()
-    assert other.control.model.profile.name == "unknown"
-    other.until(lambda: other.control.model.profile.name == "raspberry_pi", 30.0)
+    assert other.control.driver.model.profile.name == "unknown"
+    other.until(lambda: other.control.driver.model.profile.name == "raspberry_pi", 30.0)
 
 
 def in_a_silent_mode(platform: str, mode: Mode) -> Pair:
     pair = paired(platform)
-    pair.until(lambda: pair.control.model.profile.kind is not Platform.UNKNOWN, 20.0)
+    pair.until(lambda: pair.control.driver.model.profile.kind is not Platform.UNKNOWN, 20.0)
     pair.until(lambda: pair.control.is_free(pair.now), 20.0)
     pair.ask(SetMode(mode))
     pair.until(lambda: pair.car.truth.driving, 20.0)
@@ -88,14 +88,14 @@ def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
     if gateway == "the same":
         pair.control.link_down("unplugged", pair.now)
     else:
-        kept = json.loads(json.dumps(pair.control.model.learned.kept()))
-        pair.control = Controller("red", parse_platform("unknown"), auto=True, learned=Learned.restore(kept))
+        kept = json.loads(json.dumps(pair.control.driver.model.learned.kept()))
+        pair.control = control(parse_platform("unknown"), auto=True, learned=Learned.restore(kept))
     pair.run(1.0, linked=False)
     pair.connect()
     pair.until(lambda: not pair.car.truth.driving, 8.0)
     pair.run(5.0)
     assert not pair.car.truth.driving
-    assert pair.control.model.learned.opened_as == "", "a report has shown mode 0"
+    assert pair.control.driver.model.learned.opened_as == "", "a report has shown mode 0"
 
 
 def test_what_a_car_was_is_forgotten_if_its_link_ends_without_a_word_after_a_mode_frame() -> None:
@@ -118,4 +118,4 @@ def test_a_contradicted_profile_is_told_of_once() -> None:
     told = [log for log in pair.logs if log.code == "platform_contradicted"]
     assert told
     assert len({log.words for log in told}) == len(told)
-    assert parse_platform("arduino").name == pair.control.model.profile.name, "what was told stays"
+    assert parse_platform("arduino").name == pair.control.driver.model.profile.name, "what was told stays"

@@ -2,13 +2,12 @@
 
 import pytest
 
-from gateway.control.commands import Drive, OneShot, SetMode, Stop
-from gateway.control.controller import Controller
-from gateway.control.estimate.battery import BatteryPolicy
-from gateway.protocol.frames import General
-from gateway.protocol.platforms import parse_platform
+from gateway.control.battery import BatteryPolicy
+from gateway.control.commands import Drive, SetLight, SetMode, Stop
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.words import BatteryAction, Light, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, REPORT_S, RUN, STOP, Workbench
+from tests.support.controls import control
 
 FORWARD = Drive(Motion.FORWARD, 9.0)
 
@@ -35,7 +34,7 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
         refused = desk.ask(what)
         assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
         assert "Charge it" in refused.words
-    for still in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
+    for still in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), SetLight(Light.RED)):
         assert desk.ask(still).status is not Phase.REJECTED
         desk.run(3.0)
     drained(desk, 8.0)
@@ -45,16 +44,14 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
 
 def test_a_car_can_be_stopped_by_its_battery() -> None:
     desk = Workbench()
-    desk.control = Controller(
-        "red", parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryAction.STOP)
-    )
+    desk.control = control(parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryAction.STOP))
     desk.ready()
     desk.ask(FORWARD, identity="d")
     desk.car.reading = reading(5.9)
     desk.run(11.0)
     assert desk.frames[0] == RUN
     assert MODE00 in desk.frames
-    assert desk.control.model.motors == "off"
+    assert desk.control.driver.model.motors == "off"
     assert desk.end("d") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
     assert STOP in desk.frames
 
@@ -66,5 +63,5 @@ def test_a_constant_is_no_battery(platform: str) -> None:
     for _ in range(20):
         desk.run(REPORT_S, reports=False)
         desk.hear(b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#")
-    assert desk.control.model.battery.level is None
+    assert desk.control.driver.model.battery.level is None
     assert not [log for log in desk.logs if log.code.startswith("battery")]

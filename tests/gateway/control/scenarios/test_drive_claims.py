@@ -12,12 +12,12 @@ def driven(*, deaf: bool) -> Pair:
     """Drive a car for a second. A deaf car has shown a stop before, and receives no frame any more."""
     pair = Pair(start_s=2.0)
     pair.connect()
-    pair.until(lambda: pair.control.model.trust.shown, 20.0)
+    pair.until(lambda: pair.control.driver.model.trust.shown, 20.0)
     if deaf:
         pair.lose_frames()
         pair.ask(Stop())
         pair.run(20.0)
-    assert pair.control.model.trust.state is (CarTrust.UNPROVEN if deaf else CarTrust.STOPPED)
+    assert pair.control.driver.model.trust.state is (CarTrust.UNPROVEN if deaf else CarTrust.STOPPED)
     pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     pair.run(4.0)
     return pair
@@ -52,23 +52,25 @@ def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:
     pair.run(1.5)
     pair.lose_frames()
     pair.ask(Stop())
-    pair.until(lambda: pair.control.model.trust.state is CarTrust.UNPROVEN, 30.0)
+    pair.until(lambda: pair.control.driver.model.trust.state is CarTrust.UNPROVEN, 30.0)
     pair.ask(Drive(Motion.FORWARD, 0.5), identity="again")
     pair.run(12.0)
     assert pair.car.truth.driving
     last = pair.last_of("again")
     assert last is not None
     assert (last.phase, last.basis) == (Phase.SENT, "sent")
-    assert pair.control.model.trust.state is CarTrust.UNPROVEN, "the car drives: a soft stop is no reason to say `off`"
+    assert pair.control.driver.model.trust.state is CarTrust.UNPROVEN, (
+        "the car drives: a soft stop is no reason to say `off`"
+    )
     assert MODE00 in [data for at, data in pair.sent if at > pair.now - 10.0]
 
 
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 90.0])
 def test_no_mode_is_confirmed_by_old_evidence_while_a_stop_goes_on(seconds: float) -> None:
     pair = Pair(start_s=2.0).ready()
-    assert pair.control.model.mode.confirmed is not None
+    assert pair.control.driver.model.mode.confirmed is not None
     pair.deaf_until = float("inf")
     pair.run(4.5)
     for _ in range(int(seconds)):
         pair.run(1.0)
-        assert pair.control.model.mode.confirmed is None
+        assert pair.control.driver.model.mode.confirmed is None

@@ -2,8 +2,7 @@
 
 import pytest
 
-from gateway.control.commands import Drive, Find, OneShot
-from gateway.protocol.frames import ColorLed
+from gateway.control.commands import Drive, Find, Led
 from schemas.words import Motion, Phase
 from tests.support.virtual import Pair
 
@@ -57,7 +56,7 @@ def test_a_car_that_drives_blinks_and_beeps_and_drives_on(platform: str) -> None
 
 def test_the_led_is_what_it_was_before_also_after_two() -> None:
     pair = Pair().ready()
-    pair.ask(OneShot(ColorLed(10, 20, 30)))
+    pair.ask(Led(10, 20, 30))
     pair.run(3.0)
     pair.ask(Find())
     pair.run(0.6)
@@ -69,7 +68,7 @@ def test_the_led_is_what_it_was_before_also_after_two() -> None:
 def test_a_colour_that_still_waits_is_what_is_left() -> None:
     pair = Pair().ready()
     pair.ask(Find())
-    pair.ask(OneShot(ColorLed(10, 20, 30)))
+    pair.ask(Led(10, 20, 30))
     pair.ask(Find())
     pair.run(6.0)
     assert pair.car.truth.led == COLOUR
@@ -77,7 +76,7 @@ def test_a_colour_that_still_waits_is_what_is_left() -> None:
 
 def test_a_white_led_goes_dark_to_be_seen() -> None:
     pair = Pair().ready()
-    pair.ask(OneShot(ColorLed(255, 255, 255)))
+    pair.ask(Led(255, 255, 255))
     pair.run(3.0)
     pair.ask(Find())
     assert seen(pair, 3.0) == [WHITE, "off", WHITE]

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.commands import Answer, Drive, Fan, OneShot, SetMode, Stop
-from gateway.control.stops.evidence import EVIDENCE, StopCase
-from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz, parse_sent
+from gateway.control.commands import AimServo, Answer, Drive, Fan, Led, MoveArm, PartAction, SetLight, SetMode, Stop
+from gateway.drivers.yahboom.protocol.frames import General, parse_sent
+from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from schemas.words import Basis, Light, Mode, Motion, Phase, Reason
 from tests.gateway.sim.hazards import HAZARDS, Hazard
@@ -66,7 +66,7 @@ def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
     pair.until(lambda: pair.car.truth.driving, 3.0)
 
 
-def blocked(pair: Pair, by: OneShot | Fan) -> None:
+def blocked(pair: Pair, by: PartAction | Fan) -> None:
     """Block the car with a frame, and wait until the block begins."""
     pair.ask(by)
     pair.until(lambda: pair.car.truth.blocked, 3.0)
@@ -90,7 +90,7 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
     else:
         words = EVIDENCE[case].words.format(car="red")
         assert (last.phase, last.basis, last.words) == (Phase.SENT, Basis.SENT, words)
-    assert (pair.control.model.motors, pair.control.model.basis) == ("off", last.basis)
+    assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", last.basis)
     pair.records.clear()
     return answer
 
@@ -98,16 +98,16 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
 def recovers(pair: Pair) -> None:
     """Open the link again. Require that recovery brings the car to rest in mode 0, and that the gateway knows it."""
     since = pair.now
-    assert pair.control.model.motors == "unknown"
+    assert pair.control.driver.model.motors == "unknown"
     pair.connect()
-    pair.until(lambda: pair.control.model.known, 30.0)
+    pair.until(lambda: pair.control.driver.model.known, 30.0)
     pair.run(SETTLED_S)
     assert pair.off_for_good_at() - since <= RECOVERED_S
     assert pair.car.truth.mode is Mode.MANUAL
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.model.motors == "off"
 
 
-def refused(pair: Pair, what: OneShot | SetMode) -> None:
+def refused(pair: Pair, what: PartAction | SetMode) -> None:
     sent = len(pair.sent)
     assert pair.ask(what).reason is Reason.UNSUPPORTED
     pair.run(2.0)
@@ -115,7 +115,7 @@ def refused(pair: Pair, what: OneShot | SetMode) -> None:
     assert all(parse_sent(data) == repeated for _, data in pair.sent[sent:]), "only the repetition"
 
 
-PTZ = OneShot(Ptz(90))
+PTZ = AimServo(90)
 
 
 # ---------------------------------------------------------------------- the Arduino program
@@ -197,11 +197,11 @@ def opened_while_driving(pair: Pair) -> None:
 @ours("a named frame it does not know: wedged")
 def wedged(pair: Pair) -> None:
     driving(pair)
-    refused(pair, OneShot(ArmSet((90,) * 6)))
+    refused(pair, MoveArm((90,) * 6))
     stops(pair)
 
 
-def cut(pair: Pair, what: OneShot | Drive, count: int) -> None:
+def cut(pair: Pair, what: PartAction | Drive, count: int) -> None:
     """Cut the next write after `count` bytes, and the link with it."""
     pair.cut = count
     pair.ask(what)
@@ -211,7 +211,7 @@ def cut(pair: Pair, what: OneShot | Drive, count: int) -> None:
 
 @ours("half of a named frame: wedged", "half of a named frame, then a MODE frame: it can OPEN mode 4")
 def half_named(pair: Pair) -> None:
-    for what, length in ((PTZ, 12), (OneShot(ColorLed(255, 0, 16)), 24)):
+    for what, length in ((PTZ, 12), (Led(255, 0, 16), 24)):
         for count in range(1, length):
             driving(pair)
             cut(pair, what, count)
@@ -341,7 +341,7 @@ def pi_hang_up(pair: Pair) -> None:
     """Require that the gateway closes only after a stop. It cannot prevent a lost link, so it reports the danger."""
     driving(pair)
     pair.control.shut_down(pair.now)
-    pair.until(lambda: pair.control.stops.finished, 3.0)
+    pair.until(lambda: pair.control.driver.stops.finished, 3.0)
     pair.lose("closed")
     pair.run(SETTLED_S, linked=False)
     assert not pair.car.alive
@@ -353,7 +353,7 @@ def pi_hang_up(pair: Pair) -> None:
     cut_off.run(2.0, linked=False)
     assert not cut_off.car.alive
     assert cut_off.car.truth.driving
-    assert cut_off.control.model.motors == "unknown"
+    assert cut_off.control.driver.model.motors == "unknown"
     answer = cut_off.ask(Stop(), verb="stop")
     assert answer.reason is Reason.LINK_DOWN
     assert answer.words.startswith("NOT STOPPED: red is unreachable. If it was driving, it still is")
@@ -362,9 +362,9 @@ def pi_hang_up(pair: Pair) -> None:
 @ours("light 1 cycles; lights 5..8 are not known")
 def pi_light(pair: Pair) -> None:
     for light in (Light.WHITE, Light.CYAN, Light.MAGENTA, Light.YELLOW, Light.OFF):
-        refused(pair, OneShot(General(Motion.STOP, light=light)))
+        refused(pair, SetLight(light))
     before = pair.car.truth.led
-    pair.ask(OneShot(General(Motion.STOP, light=Light.GREEN)))
+    pair.ask(SetLight(Light.GREEN))
     pair.run(1.0)
     assert (before, pair.car.truth.led) == ("off", "#00ff00")
 

@@ -6,8 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.commands import Drive, OneShot, SetMode, Stop
-from gateway.protocol.frames import ColorLed
+from gateway.control.commands import Drive, Led, SetMode, Stop
 from gateway.sim.model.world import World
 from schemas.words import Basis, CarTrust, Mode, Motion, Phase, Reason, Shows
 from tests.support.stops import ENDS_S
@@ -53,15 +52,15 @@ def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_a
     pair.ask(FORWARD)
     pair.run(0.2)
     wire.stuck = True
-    took = pair.until(lambda: pair.control.model.motors == "unknown", 6.0)
+    took = pair.until(lambda: pair.control.driver.model.motors == "unknown", 6.0)
     assert took > 1.9, "the silence that a report without echo explains is none"
     pair.run(5.0)
     assert pair.car.truth.motor_left, "its stop is in the wire"
-    assert pair.control.model.motors == "unknown"
+    assert pair.control.driver.model.motors == "unknown"
     pair.ask(Drive(Motion.BACK, 0.5))  # the wire also holds this drive and its stops, and delivers them together
     pair.run(3.0)
     wire.free()
-    pair.until(lambda: pair.control.model.motors == "off", 12.0)
+    pair.until(lambda: pair.control.driver.model.motors == "off", 12.0)
     assert not pair.car.truth.motor_left
     codes = [log.code for log in pair.logs]
     assert codes.index("recovered") > codes.index("answers_again") > codes.index("unheard"), "no claim before it"
@@ -75,7 +74,7 @@ def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
     for number in range(20):
         pair.ask(Drive((Motion.FORWARD, Motion.BACK)[number % 2], 0.5))
         pair.run(0.25)
-    assert pair.control.model.motors == "unknown"
+    assert pair.control.driver.model.motors == "unknown"
     assert "unheard" in [log.code for log in pair.logs]
     answer = pair.ask(Drive(Motion.FORWARD, 25.0))
     assert answer.status is Phase.QUEUED, "what is not shown forbids nothing"
@@ -115,7 +114,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     pair.ask(FORWARD)
     pair.run(0.2)
     wire.stuck = True
-    pair.until(lambda: pair.control.model.motors == "unknown", 6.0)
+    pair.until(lambda: pair.control.driver.model.motors == "unknown", 6.0)
     answer = pair.ask(Stop(), identity="stop")
     assert answer.words.startswith("red may not get this stop: it has been silent for ")
     pair.until(lambda: pair.last_of("stop") is not None, ENDS_S)
@@ -131,7 +130,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     assert last is not None
     assert (last.phase, last.basis) == ends
     assert not pair.car.truth.motor_left
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.model.motors == "off"
 
 
 def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None:
@@ -140,7 +139,7 @@ def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None
     pair.run(8.0)
     for _ in range(10):
         pair.ask(Stop())
-        pair.until(lambda: pair.control.model.motors == "off", 8.0)
+        pair.until(lambda: pair.control.driver.model.motors == "off", 8.0)
         pair.run(6.0)
         pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
         pair.run(8.7)
@@ -187,7 +186,7 @@ def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on
     tries = 40
     for seed in range(tries):
         pair = Pair(seed=seed, start_s=2.0).ready()
-        pair.until(lambda pair=pair: pair.control.model.trust.shown, 12.0)
+        pair.until(lambda pair=pair: pair.control.driver.model.trust.shown, 12.0)
         pair.run(seed / tries)
         pair.ask(Drive(Motion.FORWARD, 9.0))
         pair.run(1.5)
@@ -204,12 +203,12 @@ def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on
         assert lost.startswith("red did not get a stop")
         codes = [log.code for log in pair.logs]
         assert codes.count("not_obeyed") == codes.count("not_shown") == 1, "said once"
-        assert (pair.control.model.motors, pair.control.model.basis) == ("unknown", None)
-        assert pair.control.model.trust.state is CarTrust.UNPROVEN
-        assert pair.control.lost_frames
+        assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("unknown", None)
+        assert pair.control.driver.model.trust.state is CarTrust.UNPROVEN
+        assert pair.control.driver.lost_frames
         pair.car.feed = hears  # type: ignore[method-assign]
-        pair.until(lambda pair=pair: pair.control.model.motors == "off", 20.0)
-        assert pair.control.model.basis == Basis.SHOWN
+        pair.until(lambda pair=pair: pair.control.driver.model.motors == "off", 20.0)
+        assert pair.control.driver.model.basis == Basis.SHOWN
         assert not pair.car.truth.motor_left, "stopped when it hears again, without being asked"
         assert pair.logs[-1].code in ("hears", "recovered")
 
@@ -217,11 +216,11 @@ def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on
 def doubtful() -> Pair:
     """Return a car that has shown a stop, is deaf now, and has not shown the next one."""
     pair = Pair("arduino", start_s=2.0).ready()
-    pair.until(lambda: pair.control.model.trust.shown, 12.0)
+    pair.until(lambda: pair.control.driver.model.trust.shown, 12.0)
     pair.hears = pair.car.feed  # type: ignore[attr-defined]  # for the tests that give it back
     deaf(pair)
     pair.ask(Stop())
-    pair.until(lambda: pair.control.model.trust.state is CarTrust.UNPROVEN, 30.0)
+    pair.until(lambda: pair.control.driver.model.trust.state is CarTrust.UNPROVEN, 30.0)
     return pair
 
 
@@ -230,9 +229,9 @@ def test_a_car_that_was_deaf_from_the_start_is_one_that_cannot_show_a_stop() -> 
     pair = Pair("arduino", start_s=2.0)
     deaf(pair)
     pair.connect()
-    pair.until(lambda: pair.control.model.learned.shows is Shows.NO, 30.0)
+    pair.until(lambda: pair.control.driver.model.learned.shows is Shows.NO, 30.0)
     pair.run(1.0)
-    assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT)
+    assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
     assert [log.code for log in pair.logs].count("cannot_show") == 1
     assert pair.ask(Drive(Motion.FORWARD, 1.0)).status is Phase.QUEUED
 
@@ -240,7 +239,7 @@ def test_a_car_that_was_deaf_from_the_start_is_one_that_cannot_show_a_stop() -> 
 def test_a_deaf_car_is_told_for_ever_with_pauses_that_grow_to_ten_seconds_at_most() -> None:
     pair = doubtful()
     pair.run(300.0)
-    assert pair.control.model.trust.state is CarTrust.UNPROVEN
+    assert pair.control.driver.model.trust.state is CarTrust.UNPROVEN
     times = [at for at, _ in pair.sent]
     assert max(later - earlier for earlier, later in pairwise(times)) < 10.0
     assert pair.now - times[-1] < 10.0
@@ -261,16 +260,16 @@ def test_a_deaf_car_that_somebody_drives_all_the_same_is_stopped_again_and_never
         last = pair.last_of(f"stop{number}")
         assert last is not None
         assert last.phase is Phase.FAILED
-        assert pair.control.model.basis != Basis.SHOWN
+        assert pair.control.driver.model.basis != Basis.SHOWN
     assert len(pair.shown_at) <= 1, "the one from before it was deaf"
 
 
 def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_asks() -> None:
     pair = doubtful()
-    assert pair.control.model.motors == "unknown"
+    assert pair.control.driver.model.motors == "unknown"
     pair.car.feed = pair.hears  # type: ignore[method-assign,attr-defined]
-    pair.until(lambda: pair.control.model.motors == "off", 15.0)
-    assert pair.control.model.basis == Basis.SHOWN
+    pair.until(lambda: pair.control.driver.model.motors == "off", 15.0)
+    assert pair.control.driver.model.basis == Basis.SHOWN
     assert {"not_obeyed", "hears"} <= {log.code for log in pair.logs}
 
 
@@ -287,11 +286,11 @@ def test_a_slow_link_is_no_deaf_one(delay_s: float) -> None:
         pair.ask(Stop(), identity=f"stop{number}")
         pair.until(lambda number=number: pair.last_of(f"stop{number}") is not None, ENDS_S)
         assert pair.phases(f"stop{number}")[-1] is Phase.COMPLETE
-        assert pair.control.model.basis == Basis.SHOWN
+        assert pair.control.driver.model.basis == Basis.SHOWN
         assert not pair.car.truth.motor_left
         pair.run(2.0 * moments.random())
-    assert pair.control.lost_frames == 0
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.lost_frames == 0
+    assert pair.control.driver.model.motors == "off"
 
 
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
@@ -300,8 +299,8 @@ def test_no_stop_that_was_obeyed_is_thought_to_be_lost(platform: str, world: Cal
     pair = Pair(platform, world=world(), start_s=2.0).ready()
     moments = random.Random(7)
     for _ in range(60):
-        pair.ask(moments.choice([Drive(Motion.FORWARD, 2.0), OneShot(ColorLed(1, 2, 3)), SetMode(Mode.MANUAL)]))  # type: ignore[arg-type]
+        pair.ask(moments.choice([Drive(Motion.FORWARD, 2.0), Led(1, 2, 3), SetMode(Mode.MANUAL)]))  # type: ignore[arg-type]
         pair.run(2.5 * moments.random())
         pair.ask(Stop())
         pair.run(4.0 * moments.random())
-    assert pair.control.lost_frames == 0
+    assert pair.control.driver.lost_frames == 0

@@ -40,18 +40,20 @@ def modes(row: Row) -> tuple[Mode, Mode]:
 
 def contradicted(pair: Pair, row: Row, within: str, since: float) -> None:
     """Require that the mode is contradicted in time, with the evidence of the table."""
-    pair.until(lambda: pair.control.model.mode.verdict is Verdict.CONTRADICTED, LONG_S)
-    assert pair.now - since <= float(row[within]), pair.control.model.mode
-    assert any(words in pair.control.model.mode.evidence for words in BY[row["by"]]), pair.control.model.mode.evidence
+    pair.until(lambda: pair.control.driver.model.mode.verdict is Verdict.CONTRADICTED, LONG_S)
+    assert pair.now - since <= float(row[within]), pair.control.driver.model.mode
+    assert any(words in pair.control.driver.model.mode.evidence for words in BY[row["by"]]), (
+        pair.control.driver.model.mode.evidence
+    )
     assert pair.logs[-1].code in ("mode_contradicted", "unheard")
 
 
 def never(pair: Pair, row: Row) -> None:
     """Require that a mode stays assumed if readings cannot distinguish it, with both modes among the candidates."""
     pair.run(LONG_S)
-    assert pair.control.model.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
-    assert set(modes(row)) <= set(pair.control.model.mode.candidates)
-    assert pair.control.model.mode.inferred is None
+    assert pair.control.driver.model.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
+    assert set(modes(row)) <= set(pair.control.driver.model.mode.candidates)
+    assert pair.control.driver.model.mode.inferred is None
 
 
 def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
@@ -69,7 +71,7 @@ def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
 def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str) -> None:
     asked, true = modes(row)
     pair = car_in(asked, world, seed=TABLE.index(row))
-    assert pair.control.model.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)
+    assert pair.control.driver.model.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)
     if asked is not true:
         pair.car.feed(frame_of(true), pair.now)
         if asked is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
@@ -77,15 +79,15 @@ def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str) -> 
             assert pair.car.truth.mode is asked, (
                 "docs/reference/protocol.md#blocking-times: with no echo at all it is deaf for ever"
             )
-            assert pair.control.model.mode.verdict is Verdict.ASSUMED
+            assert pair.control.driver.model.mode.verdict is Verdict.ASSUMED
             return
         pair.until(lambda: pair.car.truth.mode is true, 6.0)
     if row["verdict"] == "contradicted":
         contradicted(pair, row, "within_s", pair.now)
     elif asked in TALKING:
         pair.run(LONG_S)
-        assert pair.control.model.mode.confirmed is asked
-        assert pair.control.model.mode.candidates == (asked,)
+        assert pair.control.driver.model.mode.confirmed is asked
+        assert pair.control.driver.model.mode.candidates == (asked,)
     else:
         never(pair, row)
 
@@ -95,7 +97,7 @@ def test_a_mode_in_which_an_stm32_car_is_silent_stays_assumed(mode: Mode) -> Non
     pair = car_in(mode, "room", seed=1, platform="stm32")
     pair.run(LONG_S)
     assert pair.car.truth.mode is mode, "the gateway does not end it"
-    assert pair.control.model.mode.verdict is Verdict.ASSUMED
+    assert pair.control.driver.model.mode.verdict is Verdict.ASSUMED
     assert not [log for log in pair.logs if log.code in ("mode_contradicted", "unheard")]
 
 
@@ -107,7 +109,7 @@ def test_a_reset_brings_the_car_to_mode_0(row: Row, world: str) -> None:
     pair.car.brown_out(pair.now)
     if asked is Mode.MANUAL:
         pair.run(LONG_S)
-        assert pair.control.model.mode.confirmed is Mode.MANUAL, "a reset in mode 0 cannot be seen"
+        assert pair.control.driver.model.mode.confirmed is Mode.MANUAL, "a reset in mode 0 cannot be seen"
     else:
         contradicted(pair, row, "within_s", pair.now)
 
@@ -128,7 +130,7 @@ def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
         told_again(pair, world)
         return
     # A car that was never seen to report in the mode may be silent there, so only readings of another mode contradict.
-    is_new = asked not in pair.control.model.learned.reporting
+    is_new = asked not in pair.control.driver.model.learned.reporting
     contradicted(pair, row | {"by": "3 readings"} if is_new else row, "asked_s", lost[0])
     assert pair.car.truth.mode is true
 
@@ -137,13 +139,13 @@ def told_again(pair: Pair, world: str) -> None:
     """Require that control sends the stop again, and claims nothing before. Silence contradicts no running stop."""
     true, end = pair.car.truth.mode, pair.now + LONG_S
     while pair.car.truth.mode is true and pair.now < end:
-        assert pair.control.model.mode.verdict is not Verdict.CONFIRMED
-        assert pair.control.model.motors in ("stopping", "unknown")
+        assert pair.control.driver.model.mode.verdict is not Verdict.CONFIRMED
+        assert pair.control.driver.model.motors in ("stopping", "unknown")
         pair.run(0.01)
     if true is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
         assert pair.car.truth.mode is true, "docs/reference/protocol.md#blocking-times: deaf without an echo"
         return
-    pair.until(lambda: pair.control.model.mode.confirmed is Mode.MANUAL, LONG_S)
+    pair.until(lambda: pair.control.driver.model.mode.confirmed is Mode.MANUAL, LONG_S)
     assert pair.car.truth.mode is Mode.MANUAL
 
 
@@ -163,9 +165,9 @@ def test_a_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> N
     asked, _ = modes(row)
     pair = car_in(before, world, seed=TABLE.index(row))
     pair.ask(SetMode(asked))
-    pair.until(lambda: pair.control.model.mode.asked is asked, 6.0)
+    pair.until(lambda: pair.control.driver.model.mode.asked is asked, 6.0)
     asked_at = pair.now
-    pair.until(lambda: pair.control.model.mode.confirmed is asked, LONG_S)
+    pair.until(lambda: pair.control.driver.model.mode.confirmed is asked, LONG_S)
     assert pair.now - asked_at <= float(row["asked_s"])
     assert not [log for log in pair.logs if log.code in ("mode_contradicted", "unheard")]
 
@@ -176,10 +178,10 @@ def test_a_raspberry_pi_car_knows_mode_0_only(world: str) -> None:
     for mode in Mode:
         pair.car.feed(frame_of(mode), pair.now)
         pair.run(5.0)
-        assert pair.car.truth.mode is pair.control.model.mode.confirmed is Mode.MANUAL
+        assert pair.car.truth.mode is pair.control.driver.model.mode.confirmed is Mode.MANUAL
     pair.car.feed(b"$1#", pair.now)  # shorter than its nine fields: the program dies
     pair.until(lambda: not pair.car.alive, 2.0)
-    took = pair.until(lambda: pair.control.model.mode.verdict is Verdict.CONTRADICTED, 4.0)
+    took = pair.until(lambda: pair.control.driver.model.mode.verdict is Verdict.CONTRADICTED, 4.0)
     assert took <= 3.2
-    assert "its program has ended" in pair.control.model.mode.evidence
-    assert pair.control.model.mode.candidates == ()
+    assert "its program has ended" in pair.control.driver.model.mode.evidence
+    assert pair.control.driver.model.mode.candidates == ()

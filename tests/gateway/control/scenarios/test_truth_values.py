@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.control.commands import Drive, Fan, SetMode, Stop
-from gateway.protocol.events import Event
-from gateway.protocol.platforms import parse_platform
-from gateway.protocol.sensors import Sensors, fullmatch_sensors, read_sensors
+from gateway.control.driver import Event
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.sensors import Sensors, fullmatch_sensors, read_sensors
 from schemas.words import Mode, Motion
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
@@ -53,7 +53,7 @@ class Source:
 
         def publishing(event: Event, now: float) -> None:
             if isinstance(event, Sensors):
-                profile, confirmed = pair.control.model.profile, pair.control.model.mode.confirmed
+                profile, confirmed = pair.control.driver.model.profile, pair.control.driver.model.mode.confirmed
                 published = profile.measured(event, confirmed), profile.obstacle(event, confirmed)
                 self.published.append((event, *published))
             heard(event, now)
@@ -80,7 +80,7 @@ class Source:
 
     def check(self) -> None:
         """Require that all published fields were measured, and have the values that the program read."""
-        constants = {"battery", "grayscale"} if self.pair.control.model.profile.kind == "raspberry_pi" else set()
+        constants = {"battery", "grayscale"} if self.pair.control.driver.model.profile.kind == "raspberry_pi" else set()
         for event, measured, obstacle in self.published:
             sent = self.origin(event)
             assert measured <= MEASURED[sent.mode] - constants, (event.raw, sent.mode)

@@ -13,7 +13,7 @@ TOLD = [("arduino", "raspberry_pi"), ("stm32", "raspberry_pi"), ("raspberry_pi",
 @pytest.mark.parametrize(("platform", "told"), TOLD)
 def test_a_car_of_another_platform_than_told_is_stopped_by_what_stops_any(platform: str, told: str) -> None:
     pair = Pair(platform, told=told, start_s=2.0).ready()
-    pair.until(lambda: pair.control.model.platform.doubted, 10.0)
+    pair.until(lambda: pair.control.driver.model.platform.doubted, 10.0)
     pair.ask(Stop(), identity="first")
     pair.until(lambda: pair.last_of("first") is not None, ENDS_S)
     pair.ask(Drive(Motion.FORWARD, 9.0))
@@ -24,27 +24,27 @@ def test_a_car_of_another_platform_than_told_is_stopped_by_what_stops_any(platfo
     pair.until(lambda: pair.last_of("second") is not None, ENDS_S)
     last = pair.last_of("second")
     assert last is not None
-    assert last.basis == pair.control.model.basis
+    assert last.basis == pair.control.driver.model.basis
     if platform == "raspberry_pi":
         assert (last.phase, last.basis) == (Phase.SENT, Basis.SENT), "it shows nothing, whatever it was told to be"
     pair.run(8.0)
     assert pair.off_for_good_at() <= asked_at + answer.worst_case_s
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.model.motors == "off"
 
 
 def test_a_car_told_to_know_no_modes_that_tracks_is_stopped() -> None:
     pair = Pair(told="raspberry_pi", start_s=2.0).ready()
     pair.car.feed(b"$4WD,MODE21#", pair.now)
     pair.until(lambda: pair.car.truth.mode is Mode.TRACKING, 3.0)
-    pair.until(lambda: pair.control.model.motors == "unknown", 3.0)
-    assert pair.control.model.motion is None
+    pair.until(lambda: pair.control.driver.model.motors == "unknown", 3.0)
+    assert pair.control.driver.model.motion is None
     answer = pair.ask(Stop(), identity="stop")
     asked_at = pair.now
     pair.until(lambda: pair.last_of("stop") is not None, ENDS_S)
     pair.run(8.0)
     assert pair.car.truth.mode is Mode.MANUAL
     assert pair.off_for_good_at() <= asked_at + answer.worst_case_s
-    assert pair.control.model.motors == "off"
+    assert pair.control.driver.model.motors == "off"
 
 
 def test_a_fan_that_runs_over_a_cut_link_can_be_toggled_and_the_car_used_again() -> None:
@@ -54,14 +54,14 @@ def test_a_fan_that_runs_over_a_cut_link_can_be_toggled_and_the_car_used_again()
     pair.until(lambda: pair.car.truth.fan, 3.0)
     pair.lose()
     pair.connect()
-    pair.until(lambda: not pair.control.model.is_heard, 60.0)
+    pair.until(lambda: not pair.control.driver.model.is_heard, 60.0)
     pair.run(60.0)
     assert pair.now - pair.sent[-1][0] < 10.0, "the stop goes on"
-    assert (pair.control.model.motors, pair.control.model.basis) == ("unknown", None)
+    assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("unknown", None)
     assert "unheard" in [log.code for log in pair.logs]
     assert pair.ask(Fan(on=False)).reason is Reason.UNSUPPORTED, "after a cut it is not known whether it runs"
     pair.ask(Fan(), identity="off")
-    pair.until(lambda: pair.control.model.known, 30.0)
+    pair.until(lambda: pair.control.driver.model.known, 30.0)
     assert Phase.SENT in pair.phases("off")
     assert not pair.car.truth.fan
     pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")

@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from gateway.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.sim.model.faulty_link import FLOOD_INTERVAL_S, TO_HOST_LIMIT, Direction, FaultyLink, Flood
 
 FRAME = b"$1,0,0,0,0,0,0,0,0#"

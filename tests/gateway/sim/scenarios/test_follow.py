@@ -38,7 +38,7 @@ class Row:
             pair.connect()
         self.until(
             lambda: all(
-                pair.control.model.known and pair.control.model.mode.inferred is not None
+                pair.control.driver.model.known and pair.control.driver.model.mode.inferred is not None
                 for pair in self.pairs.values()
             ),
             30.0,
@@ -90,7 +90,7 @@ def test_two_follow_a_leader_that_seeks_a_moving_lamp_for_a_minute(seed: int, la
         last = places
     for begun, ended in zip(began, last, strict=True):
         assert hypot(begun[0] - ended[0], begun[1] - ended[1]) > 1.0  # around a corner by now
-    assert all(pair.control.model.mode.verdict is Verdict.CONFIRMED for pair in row.pairs.values())
+    assert all(pair.control.driver.model.mode.verdict is Verdict.CONFIRMED for pair in row.pairs.values())
     assert min(way) > 1.8
 
 

@@ -1,0 +1,485 @@
+"""The seam between a gateway and a family of cars: what every family's driver says and does. Pure, time is an argument.
+
+A gateway has one driver for its car. The driver turns bytes into events and readings, actions into frames or a refusal.
+It decides when a frame may be written, how the car is stopped, and what may be claimed of it afterwards. Everything
+else is the gateway's: who may command the car, the queue, the records, the link, the bus.
+
+The two meet in three places. `Desk` is what the gateway shares with its driver: the queue of commands and the log.
+`Claims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls `poll`,
+writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more than one
+frame in flight.
+
+Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` leads through a driver of 150 lines.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+from gateway.control.battery import Battery, BatteryPolicy
+from gateway.control.command_log import CommandLog, Pending
+from gateway.control.command_queue import CommandQueue
+from gateway.control.commands import Action
+from gateway.control.events import OutgoingFrame
+from gateway.control.trust import TrustState
+from schemas.car_profile import CarProfile
+from schemas.words import (
+    Basis,
+    Cause,
+    FrameOrigin,
+    Mode,
+    Motion,
+    Motors,
+    Phase,
+    Reason,
+    Shows,
+    Verdict,
+)
+
+LATE_DRIVE_S: Final = 0.1
+"""Report that a drive has waited if its frame goes out later than this."""
+
+
+# ---------------------------------------------------------------------- bytes of a car
+
+
+class Event(Protocol):
+    """One thing that a decoder found in the bytes. `at`: when its last byte arrived."""
+
+    @property
+    def raw(self) -> bytes:
+        """The bytes."""
+
+    @property
+    def at(self) -> float:
+        """When the last byte arrived, s, monotonic."""
+
+
+@dataclass(frozen=True, slots=True)
+class Echo:
+    """Bytes equal to a frame that we sent shortly before. `at` is the time of the last byte."""
+
+    raw: bytes
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Bytes that are not a reading, with the cause. `detail` is for a person; `at` is the time of the last byte."""
+
+    raw: bytes
+    at: float
+    cause: Cause
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TextLine:
+    """A whole line of text between frames with its line end, such as a debug print. It is no damage.
+
+    `at` is the time of the last byte of the junk that it came with.
+    """
+
+    raw: bytes
+    at: float
+
+
+Fields = Mapping[str, Any]
+"""Values by the field of a message, in its units. A tuple fills a repeated field."""
+
+
+# ---------------------------------------------------------------------- what is claimed of a car
+
+
+class ModeClaims(Protocol):
+    """The mode that was commanded, and what readings say about it."""
+
+    @property
+    def asked(self) -> Mode | None:
+        """The last commanded mode; None if unknown."""
+
+    @property
+    def inferred(self) -> Mode | None:
+        """The mode that the readings show; None if they show none."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The confidence in `asked`."""
+
+    @property
+    def evidence(self) -> str:
+        """What the verdict rests on, for a person."""
+
+    @property
+    def evidence_at(self) -> float | None:
+        """When the evidence came."""
+
+    @property
+    def since(self) -> float | None:
+        """Since when `asked` and `verdict` are what they are."""
+
+    @property
+    def candidates(self) -> tuple[Mode, ...]:
+        """The modes that the last reading may come from."""
+
+    @property
+    def is_left(self) -> bool:
+        """True if the readings show that the car left the commanded mode."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The estimated state of what the gateway has set. None: not known, or the car has none."""
+
+    speed: float = 0.0
+    """Share of full speed, 0..1."""
+    fan: bool | None = None
+    servo_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What was found out about the car itself, for `state/health`."""
+
+    platform_evidence: tuple[str, ...] = ()
+    platform_contradictions: tuple[str, ...] = ()
+    numbers: Fields = field(default_factory=dict)
+    """Other fields of fleet.v1.Health."""
+
+
+class Claims(Protocol):
+    """What may be said of the car now. A gateway publishes it, and refuses or delays commands by it."""
+
+    name: str
+    link_open: bool
+    link_reason: str
+    """Why the link is down."""
+    trust: TrustState
+    battery: Battery
+
+    @property
+    def profile(self) -> CarProfile:
+        """What the car can do, as far as it is known now."""
+
+    @property
+    def mode(self) -> ModeClaims:
+        """What is known of its mode."""
+
+    @property
+    def known(self) -> bool:
+        """True if the car takes frames as meant: its first stop is over, and no write has failed since."""
+
+    @property
+    def at_rest(self) -> bool:
+        """True if the car stands in mode 0 after a stop, whatever that claim rests on."""
+
+    @property
+    def is_heard(self) -> bool:
+        """False if the car is silent for longer than any normal silence."""
+
+    @property
+    def motors(self) -> Motors:
+        """What is claimed of the motors."""
+
+    @property
+    def basis(self) -> Basis | None:
+        """What the claim that the motors are off rests on; None if they are not."""
+
+    @property
+    def motion(self) -> Motion | None:
+        """The last motion sent; None if the state is unknown or the car drives by itself."""
+
+    @property
+    def outputs(self) -> Outputs:
+        """The estimated state of speed, fan and servo."""
+
+    @property
+    def range_cm(self) -> float | None:
+        """The last distance measured; None if the car measures none."""
+
+    @property
+    def shows(self) -> Shows:
+        """Whether its reports show that a stop arrived."""
+
+    @property
+    def shows_stops(self) -> tuple[Shows, str]:
+        """The same, with the reason in words."""
+
+    @property
+    def doubted(self) -> bool:
+        """True if the car has shown its stops before, and did not show the last one."""
+
+    @property
+    def findings(self) -> Findings:
+        """What was found out about the car."""
+
+    @property
+    def silence_limit_s(self) -> float | None:
+        """The longest normal silence now; None if silence says nothing."""
+
+    @property
+    def why_quiet(self) -> str:
+        """Why a silence is normal now, for a person."""
+
+    def unheard_s(self, now: float) -> float:
+        """Return for how long the car has sent nothing."""
+
+    def moved_since(self, range_cm: float | None, since: float) -> str:
+        """Return in words what shows that a drive moved the car; empty if nothing does."""
+
+
+# ---------------------------------------------------------------------- the driver
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """What a gateway shares with its driver. Commands lie in `queue`; the driver takes them when the car can."""
+
+    car: str
+    log: CommandLog
+    queue: CommandQueue
+    battery_policy: BatteryPolicy = field(default_factory=BatteryPolicy)
+    speed_max: float = 1.0
+    """Maximum share of full speed, 0..1."""
+
+
+class Driver(ABC):
+    """One car of one family. See the module's docstring for how it is driven."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+        self.queue = desk.queue
+        self.safety = desk.queue.safety
+        self.senders = desk.queue.senders
+
+    @property
+    @abstractmethod
+    def model(self) -> Claims:
+        """What is claimed of the car."""
+
+    @property
+    @abstractmethod
+    def bytes_per_s(self) -> float:
+        """Return the rate of the car's own wire, bytes/s."""
+
+    @property
+    def lost_frames(self) -> int:
+        """Return the number of stop frames that did not arrive, by the car's reports."""
+        return 0
+
+    # ------------------------------------------------------------------ bytes in
+
+    @abstractmethod
+    def feed(self, data: bytes, now: float) -> list[Event]:
+        """Return the events in the bytes."""
+
+    @abstractmethod
+    def flush(self, now: float) -> list[Event]:
+        """Return the events that a silence has ended."""
+
+    @abstractmethod
+    def flush_at(self) -> float:
+        """Return when `flush` has something to do if no byte comes before; inf if never."""
+
+    @abstractmethod
+    def drop_bytes(self) -> list[Event]:
+        """Forget the unfinished frame, and return what it was: the link is lost, or bytes were discarded."""
+
+    @abstractmethod
+    def sends(self, data: bytes, now: float) -> None:
+        """Remember the bytes of a frame that is written now: the link may echo them."""
+
+    @abstractmethod
+    def measured(self, event: Event) -> Mapping[str, Fields]:
+        """Return the measured values of an event by topic. What was not measured is left out."""
+
+    @abstractmethod
+    def verdict(self, event: Event) -> str:
+        """Return what kind of bytes these are, for `frame/rx`."""
+
+    @abstractmethod
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the state with an event, after its measurements are published."""
+
+    # ------------------------------------------------------------------ the link, and time
+
+    @abstractmethod
+    def link_up(self, now: float) -> None:
+        """Bring the car to a known state: the link is open."""
+
+    @abstractmethod
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail all commands: the link is down. After WRITE_FAILED the car may have a part of a frame."""
+
+    @abstractmethod
+    def tick(self, now: float) -> None:
+        """Check for silence. The gateway calls it a few times a second."""
+
+    @abstractmethod
+    def on_stall(self, gap_s: float, now: float) -> None:
+        """Handle a gap of the loop."""
+
+    @abstractmethod
+    def on_sleep(self, slept_s: float, now: float) -> None:
+        """Handle a sleep of the computer: stop the car first, begin nothing again."""
+
+    # ------------------------------------------------------------------ frames out
+
+    @abstractmethod
+    def poll(self, now: float) -> OutgoingFrame | None:
+        """Return the frame to write now, if any."""
+
+    @abstractmethod
+    def on_written(self, write: OutgoingFrame, now: float) -> None:
+        """Update the state: the link has taken the frame that `poll` returned."""
+
+    @abstractmethod
+    def next_at(self, now: float) -> float:
+        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+
+    # ------------------------------------------------------------------ commands
+
+    @abstractmethod
+    def refusal(self, what: Action) -> str | None:
+        """Return why this car cannot do it in any state; None if it can."""
+
+    @abstractmethod
+    def frames(self, what: Action) -> tuple[Any, ...]:
+        """Return the frames of an action on a part of the car. `poll` returns them again, one at a time."""
+
+    @abstractmethod
+    def accepts_commands(self, now: float) -> bool:
+        """Return True if a command's frame may be written: no stop runs, or a new command may take its place."""
+
+    @abstractmethod
+    def free_at(self, now: float) -> float:
+        """Return when the car can take a motion, as far as that is known."""
+
+    def mode_wait_s(self, busy_s: float, now: float) -> float:
+        """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
+        del now
+        return busy_s
+
+    def opening_s(self, mode: Mode) -> float:
+        """Return how long it takes until a mode is open, s."""
+        del mode
+        return 0.0
+
+    # ------------------------------------------------------------------ stops
+
+    @property
+    @abstractmethod
+    def shutting_down(self) -> bool:
+        """Return True after `shut_down`."""
+
+    @property
+    @abstractmethod
+    def not_stopped(self) -> str:
+        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+
+    @property
+    @abstractmethod
+    def is_stopping(self) -> bool:
+        """Return True if a stop is in progress."""
+
+    @property
+    def finished(self) -> bool:
+        """Return True after `shut_down` if the stop is over, or the car did not show it in time."""
+        return self.shutting_down and not self.is_stopping
+
+    @abstractmethod
+    def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
+        """Stop the car by all means, for a command if there is one. Joins a stop in progress that is no weaker."""
+
+    @abstractmethod
+    def end_motion(self, now: float, pending: Pending | None = None) -> None:
+        """Stop the car at the end of a drive."""
+
+    @abstractmethod
+    def resume_motion(self, words: str, now: float) -> None:
+        """End the stop at the end of a drive: the car drives again."""
+
+    @abstractmethod
+    def worst_s(self, now: float) -> float:
+        """Return the longest time until the motors are off if a stop is asked now and its frames arrive, s."""
+
+    @abstractmethod
+    def shut_down(self, now: float) -> None:
+        """Stop the car for the last time, and reject all later commands: the gateway ends."""
+
+    def stop_if_open(self, now: float) -> None:
+        """Stop the car, unless the link is down or the gateway shuts down."""
+        if self.model.link_open and not self.shutting_down:
+            self.stop(FrameOrigin.STOP, now)
+
+    def end_doubt(self, now: float) -> None:
+        """End the doubt about a car that has shown its stops before: a person says that it is fine."""
+        del now
+
+    # ------------------------------------------------------------------ what outlives the gateway
+
+    def kept(self) -> Mapping[str, Any]:
+        """Return what was learned of the car, for the next gateway, as JSON can hold it."""
+        return {}
+
+    @property
+    def opened_as(self) -> str:
+        """Return what the next gateway must know to stop the car. A change is kept at once."""
+        return ""
+
+    # ------------------------------------------------------------------ the same for every family
+
+    def halt(self, words: str, now: float, by: str = "") -> None:
+        """Drop all queued commands. Ignore a continuous drive stream until its sender pauses."""
+        self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self.safety.shorten_lease(now)
+        self.senders.halt(now, by)
+
+    def end_drive(self, words: str, now: float) -> None:
+        """End a held motion that went as requested. It was sent: no reading shows that the car drove all the time.
+
+        A changed distance is told. Something else may have moved before the car.
+        """
+        held, model = self.queue.held, self.model
+        if held is None or held.began_at is None:
+            self.queue.close_held(Phase.COMPLETE, None, words, now)
+            return
+        sent = f"sent for {now - held.began_at:.1f} s"
+        moved = model.moved_since(held.range_cm, held.began_at)
+        doubt = f"{model.name} may not have moved: {self.doubt_of_drive}" if self.doubt_of_drive else ""
+        words = "; ".join(filter(None, (words, sent, moved or doubt)))
+        evidence = (moved,) if moved else ()
+        self.queue.close_held(Phase.SENT, None, words, now, basis=Basis.SENT, evidence=evidence)
+
+    @property
+    def doubt_of_drive(self) -> str:
+        """Return why the car may have ignored a drive; empty if there is no reason to think so."""
+        return ""
+
+    def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
+        """End the held motion with the stop at the end of a drive, unless the car is at rest."""
+        if phase is Phase.COMPLETE:
+            self.end_drive(words, now)
+        else:
+            self.queue.close_held(phase, reason, words, now)
+        if self.model.link_open and not self.is_stopping and not self.model.at_rest:
+            self.end_motion(now)
+
+    def expire(self, now: float) -> None:
+        """End the commands whose time is over."""
+        held, car = self.queue.held, self.desk.car
+        if held is not None and now >= self.queue.held_until:
+            if now < held.expires_at:
+                self.safety.mark_holder(held.sender.name, connected=False)
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} disconnected", now)
+            elif held.pending.sent:
+                words = ""
+                if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:
+                    waited_s = held.began_at - held.pending.received_at
+                    words = f"began after {waited_s:.1f} s: {car} was busy"
+                self.release(Phase.COMPLETE, None, words, now)
+            else:
+                waited_s = now - held.pending.received_at
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for {waited_s:.1f} s", now)
+        self.queue.expire(now)

@@ -1,0 +1,129 @@
+"""The families of cars: finds the driver and the profile of a platform by its name in the fleet file.
+
+A family is a module with `PLATFORMS`, `profile_of` and `driver_of` (see `Family`). Ours are the rows of `BUILT_IN`.
+Others come with their own package, by the entry point group `zenoh_car_fleet.drivers`, whose value names the module
+(docs/how-to/write-a-driver.md). No family is imported before one of its cars is named.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+
+from schemas.car_profile import CarProfile
+from schemas.platform_name import AUTO, AUTO_PLATFORMS, kind_of, normalize_name, parse_option
+from schemas.suggestion import did_you_mean
+from schemas.words import Platform
+
+if TYPE_CHECKING:
+    from gateway.control.driver import Desk, Driver
+
+BUILT_IN: Final = {"yahboom": "gateway.drivers.yahboom.family"}
+"""Module of each family that comes with the gateway."""
+GROUP: Final = "zenoh_car_fleet.drivers"
+
+
+class Family(Protocol):
+    """A family of cars: a module with these names."""
+
+    PLATFORMS: tuple[str, ...]
+    """The names that `platform:` of the fleet file may have, without options."""
+
+    def profile_of(self, name: str) -> CarProfile:
+        """Return what cars of a platform can do, with its options; raise ValueError for a wrong name."""
+
+    def profiles(self) -> tuple[CarProfile, ...]:
+        """Return the profile of each platform that is known, with all parts that such a car may have."""
+
+    def driver_of(self, name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
+        """Return the driver of a car. `kept`: what `Driver.kept` has returned, empty if nothing was kept."""
+
+
+def check_platform(text: str) -> str:
+    """Return the name of a platform in its usual spelling; raise ValueError if there is none of this name."""
+    name = normalize_name(text)
+    try:
+        if kind_of(name) in (AUTO, *Platform):
+            parse_option(name)  # without the import of its family, a gateway joins the bus 13 ms sooner
+        else:
+            profile_of(name)
+    except ValueError as error:
+        raise ValueError(f"{error} Leave it out to detect it.") from None
+    return name
+
+
+def profile_of(name: str) -> CarProfile:
+    """Return what cars of this platform can do; raise ValueError. `auto` has no profile of its own."""
+    name = normalize_name(name)
+    return _family_of(kind_of(name)).profile_of(name)
+
+
+def profiles_of(name: str) -> tuple[CarProfile, ...]:
+    """Return what a car of this platform may be: one profile, or for `auto` each that can be found out."""
+    name = normalize_name(name)
+    kind, plus, options = name.partition("+")
+    return tuple(profile_of(f"{each}{plus}{options}") for each in (AUTO_PLATFORMS if kind == AUTO else (kind,)))
+
+
+def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
+    """Return the driver of a car of this platform, or of `auto`; raise ValueError."""
+    name = normalize_name(name)
+    kind = kind_of(name)
+    return _family_of(AUTO_PLATFORMS[0] if kind == AUTO else kind).driver_of(name, kept)
+
+
+def platforms() -> tuple[str, ...]:
+    """Return the names of all platforms, without options, ours first."""
+    return tuple(name for _, family in _families() for name in family.PLATFORMS)
+
+
+@cache
+def built_in_platforms() -> tuple[str, ...]:
+    """Return the names of the platforms that come with the gateway, without options."""
+    return tuple(name for module in BUILT_IN.values() for name in _load(module).PLATFORMS)
+
+
+@cache
+def built_in_profiles() -> tuple[CarProfile, ...]:
+    """Return the profile of each platform that comes with the gateway, with all parts that such a car may have."""
+    return tuple(profile for module in BUILT_IN.values() for profile in _load(module).profiles())
+
+
+def family_name(platform: str) -> str:
+    """Return the name of the family of a platform, such as `yahboom`; raise ValueError."""
+    kind = kind_of(normalize_name(platform))
+    if kind == AUTO:
+        return next(iter(BUILT_IN))
+    return _find(kind)[0]
+
+
+def _family_of(kind: str) -> Family:
+    return _find(kind)[1]
+
+
+@cache
+def _find(kind: str) -> tuple[str, Family]:
+    found = next(((name, family) for name, family in _families() if kind in family.PLATFORMS), None)
+    if found is None:
+        hint = did_you_mean(kind, platforms()) or f"There are {', '.join(platforms())}."
+        raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
+    return found
+
+
+def _families() -> Iterator[tuple[str, Family]]:
+    """Yield the families with their names: ours, then those of other packages."""
+    for name, module in BUILT_IN.items():
+        yield name, _load(module)
+    yield from _installed()
+
+
+def _load(module: str) -> Family:
+    return cast("Family", import_module(module))
+
+
+@cache
+def _installed() -> tuple[tuple[str, Family], ...]:
+    # The metadata of all installed packages takes some 10 ms, and few cars need it.
+    from importlib.metadata import entry_points
+
+    return tuple((each.name, cast("Family", each.load())) for each in entry_points(group=GROUP))

@@ -1,0 +1,284 @@
+"""The estimates of one car: platform, mode, battery, outputs, trust, and evidence of a stop. It decides nothing.
+
+`Executor` updates it with each written frame, `CarMonitor` with each reading.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from gateway.control.battery import Battery, BatteryPolicy
+from gateway.control.command_log import CommandLog
+from gateway.control.driver import Findings, Outputs
+from gateway.control.trust import TrustEvent, TrustState
+from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.estimate.mode import ModeEstimator
+from gateway.drivers.yahboom.estimate.outputs import StateEstimate
+from gateway.drivers.yahboom.estimate.platform import PlatformDetector
+from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
+from gateway.drivers.yahboom.protocol.frames import ColorLed
+from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
+from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
+from gateway.drivers.yahboom.stops import stopping
+from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase, StopEvidence
+from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Motors, Platform, Shows, Verdict
+
+MOVED_CM: Final = 5.0
+"""Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
+KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
+"""States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
+
+
+@dataclass(slots=True)
+class CarModel:
+    """The estimates of one car. Times: s, monotonic."""
+
+    name: str
+    profile: Profile
+    auto: bool
+    log: CommandLog
+    battery_policy: BatteryPolicy
+    learned: Learned = field(default_factory=Learned)
+    platform: PlatformDetector = field(init=False)
+    mode: ModeEstimator = field(init=False)
+    battery: Battery = field(init=False)
+    pacing: Pacing = field(init=False)
+    believed: StateEstimate = field(init=False)
+    evidence: StopEvidence = field(init=False)
+    trust: TrustState = field(default_factory=TrustState)
+    rest: StopCase = StopCase.SOFT
+    """The case of the stop, if the claim of rest has the basis `sent`."""
+    left_at: float = float("-inf")
+    left_until: float = float("-inf")
+    """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""
+    range_cm: float | None = None
+    """The last distance that was measured, and when."""
+    range_at: float = float("-inf")
+    cut_write: bool = False
+    """True if a write has failed since the last recovery: the car may keep a string that only a color frame clears."""
+    missed_stop: bool = False
+    """True if a stop on this link has had its time, and the car, which reported meanwhile, did not show it."""
+    link_since: float = float("-inf")
+    """When the link was opened."""
+    link_open: bool = False
+    link_reason: str = "not connected yet"
+
+    def __post_init__(self) -> None:
+        self.platform = PlatformDetector(self.profile, auto=self.auto)
+        self.mode = ModeEstimator(self.profile, self.learned)
+        self.evidence = StopEvidence(self.profile, self.learned)
+        self.battery = Battery(self.battery_policy.of_cells(self.profile.cells), self.profile.cells)
+        self.pacing = Pacing(self.profile, self.learned)
+        self.believed = StateEstimate(self.profile)
+
+    def treat_as(self, profile: Profile) -> None:
+        """Use another platform's profile from now on."""
+        self.profile = self.mode.profile = self.pacing.profile = self.evidence.profile = profile
+        self.believed = replace(self.believed, profile=profile)
+
+    def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
+        """Update the trust state, and log each change. Only this function changes it."""
+        if self.trust.take(event, now, evidence):
+            trust = self.trust
+            basis = f" ({trust.basis})" if trust.basis is not None else ""
+            words = f"{self.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
+            self.log.log(Level.DEBUG, "trust", words, now)
+
+    @property
+    def outputs(self) -> Outputs:
+        """Return the estimated state of speed, fan and servo."""
+        believed = self.believed
+        return Outputs(self.profile.speed.fraction(believed.speed), believed.fan, believed.servo_deg)
+
+    @property
+    def findings(self) -> Findings:
+        """Return what was found out about the car."""
+        learned = self.learned
+        numbers: dict[str, Any] = {
+            "blocks_s": {str(kind): block_s for kind, block_s in learned.blocks.items()},
+            "reporting_modes": tuple(sorted(learned.reporting)),
+            "out_of_range": tuple(sorted(learned.always_rejected)),
+        }
+        if learned.echo.is_known:
+            numbers |= {"interval_s": learned.echo.median_s, "interval_spread_s": learned.echo.spread_s}
+        if learned.no_echo.is_known:
+            numbers["interval_no_echo_s"] = learned.no_echo.median_s
+        return Findings(self.platform.evidence, self.platform.contradictions, numbers)
+
+    @property
+    def doubted(self) -> bool:
+        """Return True if the car has shown its stops before, and did not show the last one."""
+        return self.learned.doubted
+
+    @property
+    def shows(self) -> Shows:
+        """Return whether its reports were seen to react to frames."""
+        return self.learned.shows
+
+    @property
+    def silence_limit_s(self) -> float | None:
+        """Return the longest normal silence now; None if silence says nothing."""
+        return self.mode.silence_limit(fan=bool(self.believed.fan))
+
+    @property
+    def why_quiet(self) -> str:
+        """Return why a silence is normal now."""
+        return self.mode.why_quiet
+
+    def unheard_s(self, now: float) -> float:
+        """Return for how long the car has sent nothing."""
+        return self.mode.unheard_s(now)
+
+    @property
+    def known(self) -> bool:
+        """Return True if the car reads frames as meant."""
+        return self.trust.state in KNOWN
+
+    @property
+    def manual(self) -> bool:
+        """Return True if mode 0 was commanded last, and no reading contradicts it."""
+        return self.mode.asked is Mode.MANUAL and self.mode.verdict is not Verdict.CONTRADICTED
+
+    @property
+    def at_rest(self) -> bool:
+        """Return True if the car stands in mode 0 after a stop. The basis may be `shown` or `sent`."""
+        return self.trust.state is CarTrust.STOPPED and self.manual
+
+    @property
+    def rest_is_sure(self) -> bool:
+        """Return True if the car has shown that it stands, or cannot show it."""
+        return self.at_rest and (self.trust.shown or self.rest is not StopCase.SOFT or not self.can_show)
+
+    @property
+    def can_show(self) -> bool:
+        """Return True if this car shows a stop, or may: not as its program is known, nor as it was found out."""
+        match self.stop_style:
+            case StopStyle.GENERAL:
+                return False
+            case StopStyle.TIMER:
+                return self.learned.shows is Shows.YES
+            case StopStyle.MODE_FRAME | StopStyle.BOTH:
+                return self.profile.has_readings and self.learned.shows is not Shows.NO
+
+    @property
+    def shows_fan(self) -> bool:
+        """Return True if a reading shows that the fan is off.
+
+        A car that reports by a timer sends readings with the fan on, too. An arduino that was only detected may be one,
+        until it has shown that its reports wait for its loop.
+        """
+        is_sure = not self.auto or self.learned.shows is Shows.YES
+        return self.profile.kind is Platform.ARDUINO and is_sure and not self.profile.fan_is_level
+
+    @property
+    def is_deaf(self) -> bool:
+        """Return True if the car could have shown a stop, and has not reacted to the last one yet."""
+        shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME
+        return shows and self.evidence.reacted_at is None and not self.evidence.without_echo
+
+    @property
+    def stop_style(self) -> StopStyle:
+        """Return the kind of stop for this car now."""
+        return stopping.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
+
+    @property
+    def silent_program(self) -> str:
+        """Return what to do about a car that never sent a reading; empty if it has sent one."""
+        if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
+            return ""
+        if self.profile.kind is not Platform.UNKNOWN:
+            return (
+                f" If it never sends readings, say so: `platform: {self.profile.name}+no_readings` in the fleet file."
+            )
+        return (
+            " In some modes a car sends nothing, and general stops do not end a mode: name its platform in the fleet "
+            "file, as in `platform: arduino`. If it never sends readings: `platform: raspberry_pi+no_readings`."
+        )
+
+    @property
+    def is_heard(self) -> bool:
+        """Return False if the car is silent for longer than any normal silence."""
+        return self.trust.state is not CarTrust.UNHEARD
+
+    @property
+    def motors(self) -> Motors:
+        """Return what is claimed of the motors."""
+        believed_moving = self.trust.state in (CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.STOPPED)
+        if believed_moving and self.mode.verdict is Verdict.CONTRADICTED:
+            return Motors.UNKNOWN
+        return self.trust.motors
+
+    @property
+    def basis(self) -> Basis | None:
+        """Return the basis of the claim that the motors are off; None if they are not."""
+        return self.trust.basis if self.motors is Motors.OFF else None
+
+    @property
+    def motion(self) -> Motion | None:
+        """Return the last motion sent; None if the state is unknown or the car drives by itself."""
+        return self.believed.motion if self.known and self.manual else None
+
+    def moved_since(self, range_cm: float | None, since: float) -> str:
+        """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
+        if range_cm is None or self.range_cm is None or self.range_at < since + FLIGHT_S:
+            return ""
+        if abs(self.range_cm - range_cm) < MOVED_CM:
+            return ""
+        return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
+
+    @property
+    def shows_stops(self) -> tuple[Shows, str]:
+        """Return whether the reports of this car show that a stop arrived, and why, in words."""
+        if not self.profile.has_readings:
+            return Shows.NO, EVIDENCE[StopCase.NO_READINGS].words.format(car=self.name)
+        if self.stop_style is StopStyle.GENERAL and self.auto and not self.platform.is_settled:
+            return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
+        if self.stop_style is StopStyle.GENERAL:
+            case = StopCase.RASPBERRY_PI if self.profile.kind is Platform.RASPBERRY_PI else StopCase.UNKNOWN_PLATFORM
+            return Shows.NO, EVIDENCE[case].words.format(car=self.name)
+        if self.learned.doubted:
+            return Shows.YES, f"{self.name} has shown its stops before, and did not show the last one"
+        if self.learned.shows is Shows.YES:
+            now = ", but not now: it has no sonar echo" if self.evidence.without_echo > 1 else ""
+            return Shows.YES, f"the reports of {self.name} show that a stop arrived{now}"
+        if not self.can_show and Blocking.MODE_CLOSE not in self.learned.blocks:
+            return Shows.NO, EVIDENCE[StopCase.NO_REACTION].words.format(car=self.name)
+        return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
+
+    def for_stop(self, now: float) -> stopping.StopContext:
+        """Return the context for the choice of a stop."""
+        contradicted = self.mode.verdict is Verdict.CONTRADICTED
+        clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
+        return stopping.StopContext(
+            self.profile,
+            self.known,
+            self.mode.asked,
+            contradicted,
+            clear,
+            blocked,
+            doubted=self.platform.doubted,
+            open_mode=self.platform.open_mode,
+            clearing=self._clearing,
+        )
+
+    @property
+    def _clearing(self) -> ColorLed | None:
+        """Return the color that clears a string which begins with `4WD,`, if there is a reason to suspect one."""
+        suspected = self.cut_write or (self.learned.shows is Shows.YES and self.trust.state is CarTrust.UNPROVEN)
+        color = self.believed.led
+        return color if suspected and self.profile.refusal(color) is None else None
+
+    @property
+    def ready_at(self) -> float:
+        """Return the earliest time for a frame that belongs to no stop."""
+        return max(self.pacing.flight_until, self.left_until)
+
+    def is_awake(self, now: float) -> bool:
+        """Return True if the car reads a frame at once, because no block runs, known or unknown."""
+        pacing = self.pacing
+        if now <= pacing.awake_until and now >= pacing.block_from - FLIGHT_S / 2:
+            return True
+        if now < pacing.block_until - FLIGHT_S:
+            return False
+        if self.known and self.manual:
+            return True
+        return now >= pacing.written_at + RECOVERY_SILENCE_S - 0.1

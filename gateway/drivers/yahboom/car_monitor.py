@@ -1,0 +1,308 @@
+"""Updates `CarModel` from readings and silence, and stops the car if they require it. Pure."""
+
+from typing import Final
+
+from gateway.control.command_log import CommandLog
+from gateway.control.commands import SetMode
+from gateway.control.driver import Rejected
+from gateway.control.trust import STOP_GOES_ON, TrustEvent
+from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.estimate.platform import PlatformDetector
+from gateway.drivers.yahboom.executor import Executor
+from gateway.drivers.yahboom.pacing import FLIGHT_S
+from gateway.drivers.yahboom.protocol.events import Event
+from gateway.drivers.yahboom.protocol.modes import only_candidate
+from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
+from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.stops.evidence import EVIDENCE, Finding, StopCase
+from schemas.words import (
+    BatteryAction,
+    BatteryLevel,
+    Blocking,
+    CarTrust,
+    Cause,
+    FrameOrigin,
+    Level,
+    Mode,
+    Motors,
+    Phase,
+    Platform,
+    Reason,
+    Shows,
+    Verdict,
+)
+
+STALL_S: Final = 0.5
+"""Maximum gap of the loop during a held motion. After a longer one it stops the car
+(docs/explanation/how-it-works.md#processes-and-threads)."""
+STALE_TIMES_S: Final = 0.5
+"""Maximum gap of the loop. After a longer one report times do not count: a normal gap may look like a pause."""
+FAN_SETTLED_S: Final = 2.0
+"""Minimum time from a fan toggle to a reading that shows the new state of the fan."""
+
+
+class CarMonitor:
+    """Handles readings, silence, and stalls of the loop."""
+
+    def __init__(self, model: CarModel, executor: Executor, log: CommandLog) -> None:
+        self.model = model
+        self.lost_frames = 0
+        """Number of `MODE00` frames that did not arrive, by the car's reports."""
+        self._executor = executor
+        self._stops = executor.stops
+        self._log = log
+        self._not_obeyed_logged = False
+        self._silent_since: float | None = None
+        """When the last reading before a silence arrived that was dealt with; a command may have come since."""
+
+    def link_up(self) -> None:
+        """Forget the evidence of the last link."""
+        model = self.model
+        self._not_obeyed_logged = False
+        self._silent_since = None
+        model.platform.begin_link()
+        if model.platform.auto:  # another car may have been plugged in
+            opened_as = model.learned.opened_as
+            remembered = parse_platform(opened_as) if opened_as else None
+            model.platform = PlatformDetector(model.platform.configured, auto=True, remembered=remembered)
+            model.treat_as(model.platform.profile)
+
+    def link_down(self) -> None:
+        """Forget what the car was before this link if it said nothing after a frame that only such a car takes."""
+        model = self.model
+        is_silent = model.left_at > model.link_since > model.mode.heard_at
+        if model.platform.is_remembered and is_silent:
+            model.learned.opened_as = ""
+
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the model with an event of the decoder."""
+        model = self.model
+        settled = not isinstance(event, Sensors) or model.evidence.is_settled(event)
+        was_open = model.platform.open_mode
+        contradictions = model.platform.on_event(event, counts=settled)
+        if model.platform.open_mode and not was_open and model.profile.stop_style is StopStyle.GENERAL:
+            self._stops.leave_open_mode(now)
+        for words in contradictions:
+            self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
+            if model.platform.doubted:  # the last stop may have been of the wrong kind
+                self._on_other_program(now, words)
+        if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
+            model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
+        if not isinstance(event, Sensors):
+            return
+        before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at)
+        model.mode.on_reading(event, counts=settled)
+        self._log_contradiction(before, now)
+        self._record_effect(event, now)
+        # Somebody may have commanded it in the silence.
+        if self._silent_since is not None or model.trust.state is CarTrust.UNHEARD:
+            self._silent_since = None
+            # If a `MODE00` delays the report for longer than expected, the silence leads to the next one, for ever.
+            model.mode.allow_silence(silent_s)
+            self._on_contact(now)
+        finding = model.evidence.on_reading(event)
+        if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:
+            words = f"its reports pause after MODE00, which those of {model.profile.name} cars do not"
+            if model.platform.note(words):
+                self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
+        if only_candidate(event) is Mode.MANUAL:
+            self._on_report(event, now)
+        self._log_delivery(finding, now)
+        self._stops.on_finding(finding, event.at, now)
+        if model.evidence.found_out:
+            self._on_found_out(now)
+
+    def _on_report(self, event: Sensors, now: float) -> None:
+        """Update the model with a report of mode 0."""
+        model = self.model
+        model.learned.on_fields(event, model.profile.rejects(event))
+        if event.at > model.left_at + FLIGHT_S:
+            model.left_until = float("-inf")
+            if model.trust.state is not CarTrust.IN_MODE or model.mode.is_left:
+                model.learned.opened_as = ""
+        if event.range_cm is not None:
+            model.pacing.on_report(event.at)
+            model.range_cm, model.range_at = event.range_cm or None, event.at
+        if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
+            self._update_battery(event.voltage_v, now)
+        if now > model.believed.fan_at + FAN_SETTLED_S:
+            model.believed.fan_toggled = False
+            if model.shows_fan:  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
+                model.believed.fan = False
+
+    def _log_delivery(self, finding: Finding, now: float) -> None:
+        """Log once that a car which has shown its stops did not get one, and once that it gets them again."""
+        name = self.model.name
+        if finding is Finding.LOST and self.model.learned.shows is Shows.YES:
+            self.lost_frames += 1
+            if not self._not_obeyed_logged:
+                self._not_obeyed_logged = True
+                words = f"{name} did not get a stop: it does not react as before, while readings arrive."
+                self._log.log(Level.WARNING, "not_obeyed", f"{words} The gateway stops it again.", now)
+        elif finding in (Finding.SHOWN, Finding.SETTLING) and self._not_obeyed_logged:
+            self._not_obeyed_logged = False
+            self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
+
+    def _on_found_out(self, now: float) -> None:
+        """Handle what the readings have shown about the car itself."""
+        name, learned = self.model.name, self.model.learned
+        if learned.shows is Shows.NO:
+            words = EVIDENCE[StopCase.NO_REACTION].words.format(car=name)
+            self._log.log(Level.INFO, "cannot_show", f"{words}. It can be used like any other car.", now)
+        else:
+            words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
+            self._log.log(Level.WARNING, "rhythm_changed", f"{words} What it showed before is forgotten.", now)
+            if self.model.platform.auto:
+                self.model.platform.forget()
+            self._on_other_program(now, words)
+
+    def _on_other_program(self, now: float, words: str) -> None:
+        """Keep no claim that the program before has shown. A car that drives or is in a mode goes on."""
+        model = self.model
+        model.learned.forget_reactions()
+        if model.link_open and (model.trust.state in STOP_GOES_ON or model.trust.basis is not None):
+            self._stops.recover(now, words)
+
+    def _apply_platform(self, now: float) -> None:
+        """Use the profile of the detected platform.
+
+        Not during the first frames of a stop: each stop is for one platform. But if the readings show an open mode, at
+        once: general stops do not end it.
+        """
+        model = self.model
+        if model.platform.profile is model.profile or not model.link_open:
+            return
+        # Named frames with another head reach nobody, and readings with it are not read.
+        has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
+        may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
+        if not may_replace and not self._executor.accepts_commands(now):
+            return
+        before = model.profile.kind
+        model.treat_as(model.platform.profile)
+        words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
+        if model.platform.auto:  # a named one was corrected, and its contradiction says so
+            self._log.log(Level.INFO, "platform_settled", words, now)
+        if has_other_head and self._is_idle:  # a drive is obeyed with any head; it is neither cut nor delayed
+            self._stops.recover(now, words)
+        elif before not in (Platform.UNKNOWN, model.profile.kind):
+            self._on_other_program(now, words)
+        elif model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
+            # It can show its stop, and half a named frame may lie in its buffer.
+            if model.known:
+                self._stops.begin(self._stops.full(now), FrameOrigin.RECOVERY, now)
+            else:
+                self._stops.recover(now, words)
+
+    @property
+    def _is_idle(self) -> bool:
+        """Return True if nothing that a command began goes on."""
+        queue = self._executor.queue
+        waits = queue.held is not None or queue.mode_change is not None or bool(queue.one_shots)
+        return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
+
+    def _update_battery(self, voltage_v: float, now: float) -> None:
+        """Log a change of the battery level, and stop the car if the policy requires it."""
+        model = self.model
+        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
+            return
+        level, words = model.battery.level, f"{model.name}: {model.battery.words}"
+        severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
+        self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
+        if model.battery.action is BatteryAction.STOP and not model.at_rest:
+            self._executor.halt(words, now)
+            self._stops.begin_full(now)
+
+    def tick(self, now: float) -> None:
+        """Check for silence. Call it a few times a second."""
+        self._apply_platform(now)
+        model = self.model
+        before = model.mode.verdict
+        if model.link_open:
+            self._check_silence(now)
+        self._log_contradiction(before, now)
+        # Readings contradict the rest: the stop was lost, or somebody else opened a mode.
+        if model.trust.state is CarTrust.STOPPED and model.mode.verdict is Verdict.CONTRADICTED and model.link_open:
+            self._stops.recover(now, model.mode.evidence)
+
+    def _check_silence(self, now: float) -> None:
+        model = self.model
+        fan = model.believed.fan_may_run
+        limit_s = model.mode.silence_limit(fan=fan)
+        # During a stop silence shows nothing of the mode. An expected silence must still restart the clock.
+        if self._stops.running is None or limit_s is None:
+            model.mode.on_silence(now=now, fan=fan)
+        model.mode.fade(now)
+        if model.trust.state is CarTrust.UNHEARD or limit_s is None:
+            return
+        silent_s = model.mode.unheard_s(now)
+        if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
+            return
+        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting  # now, or by an earlier gateway
+        if not was_heard and (found := model.platform.on_never_heard()):
+            self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {found}", now)
+            model.treat_as(model.platform.profile)
+            self._stops.change_case()
+            return
+        self._silent_since = model.mode.heard_at
+        words = (
+            f"{model.name} may be moving: no reading for {silent_s:.1f} s. Is it on, in range, its fan off? "
+            f"The gateway keeps stopping it.{model.silent_program}"
+        )
+        self._log.log(Level.WARNING, "unheard", words, now)
+        self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self._executor.senders.halt_streams(now)
+        running = self._stops.running
+        if model.at_rest and running is None:
+            self._stops.stop_again(now)
+        elif running is None or running.case is StopCase.SOFT:
+            self._stops.recover(now, words)
+        model.learn(TrustEvent.SILENT, now, words)
+
+    def _on_contact(self, now: float) -> None:
+        """Stop the car when it reports again: a stuck link may deliver all frames of that time at once."""
+        words = f"{self.model.name} sends readings again. The gateway stops it first."
+        self._log.log(Level.INFO, "answers_again", words, now)
+        self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self._executor.senders.halt_streams(now)
+        self.model.learn(TrustEvent.HEARD, now, words)
+        self._stops.on_contact(now, words)
+
+    def on_stall(self, gap_s: float, now: float) -> None:
+        """Stop a driven car after a gap of the loop."""
+        if gap_s > STALE_TIMES_S:
+            self.model.evidence.reset_times()
+        if gap_s > STALL_S and self._executor.queue.held is not None:
+            words = f"{self.model.name} is stopped: its gateway stalled for {gap_s:.1f} s during a drive"
+            self._log.log(Level.ERROR, "stalled", words, now)
+            self._executor.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
+
+    def on_sleep(self, slept_s: float, now: float) -> None:
+        """Stop the car first after a sleep of the computer, unless it has shown that it stands. Begin nothing again."""
+        model, stops = self.model, self._stops
+        model.evidence.reset_times()
+        model.mode.excuse_silence(now)
+        stands = model.at_rest and model.trust.shown and stops.running is None
+        then = f"{model.name} stood before, and stands" if stands else f"{model.name} is stopped first"
+        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
+        self._log.log(Level.WARNING, "slept", words, now)
+        self._executor.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
+        self._executor.senders.halt(now)  # a joystick that is still pushed restarts no car
+        if model.link_open and not stands:
+            stops.on_sleep(now)
+
+    def _log_contradiction(self, before: Verdict, now: float) -> None:
+        mode = self.model.mode
+        if mode.verdict is not before and mode.verdict is Verdict.CONTRADICTED:
+            words = f"{self.model.name} is not in mode {mode.asked} as commanded: {mode.evidence}"
+            self._log.log(Level.WARNING, "mode_contradicted", words, now)
+
+    def _record_effect(self, event: Sensors, now: float) -> None:
+        """Record the effect of a mode command: a reading with the shape of the mode, from after its frame."""
+        mode_sent = self._executor.mode_sent
+        if mode_sent is None or self.model.mode.verdict is not Verdict.CONFIRMED:
+            return
+        pending, sent_at = mode_sent
+        what = pending.command.what
+        if isinstance(what, SetMode) and only_candidate(event) is what.mode and event.at > sent_at + FLIGHT_S:
+            self._executor.mode_sent = None
+            self._log.record(pending, Phase.EFFECT_SEEN, now, evidence=(self.model.mode.evidence,))

@@ -1,0 +1,221 @@
+"""The driver of the cars that speak the `$...#` protocol (docs/reference/protocol.md). Pure.
+
+`CarModel` is what is believed of the car. `CarMonitor` updates it with readings and silence, `Executor` with each
+written frame. `StopExecutor` carries out the stops. Here they become one driver, with the car's bytes and its actions.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+from gateway.control.commands import (
+    Action,
+    AimServo,
+    ChangeSpeed,
+    Drive,
+    Fan,
+    Find,
+    Led,
+    MoveArm,
+    MoveServo,
+    PartAction,
+    SetLight,
+    SetMode,
+    Whistle,
+)
+from gateway.control.driver import Desk, Event, Fields
+from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.car_monitor import CarMonitor
+from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.executor import Executor
+from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.events import Event as WireEvent
+from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
+from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S
+from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
+
+
+class YahboomDriver(Executor):
+    """One car of this protocol."""
+
+    def __init__(self, desk: Desk, profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> None:
+        """`auto`: find out the platform. `profile` is the unknown one then."""
+        super().__init__(desk, CarModel(desk.car, profile, auto, desk.log, desk.battery_policy, learned or Learned()))
+        self._monitor = CarMonitor(self.model, self, desk.log)
+        self._decoder = Decoder(head=profile.dialect.head)
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Return the rate of the car's own wire, bytes/s."""
+        return BYTES_PER_S
+
+    @property
+    def lost_frames(self) -> int:
+        """Return the number of `MODE00` that did not arrive, by the car's reports."""
+        return self._monitor.lost_frames
+
+    # ------------------------------------------------------------------ bytes in
+
+    def feed(self, data: bytes, now: float) -> list[Event]:
+        """Return the events in the bytes."""
+        return [*self._decoder.feed(data, now)]
+
+    def flush(self, now: float) -> list[Event]:
+        """Return the events that a silence has ended."""
+        return [*self._decoder.tick(now)]
+
+    def flush_at(self) -> float:
+        """Return when `flush` has something to do if no byte comes before; inf if never."""
+        deadline = self._decoder.deadline()
+        return float("inf") if deadline is None else deadline
+
+    def drop_bytes(self) -> list[Event]:
+        """Forget the unfinished frame, and return what it was."""
+        return [*self._decoder.end()]
+
+    def sends(self, data: bytes, now: float) -> None:
+        """Remember the bytes of a frame that is written now: the link may echo them."""
+        self._decoder.sent(data, now)
+
+    def measured(self, event: Event) -> Mapping[str, Fields]:
+        """Return the measured values of an event by topic."""
+        return measured(_own(event), self.model.profile, self.model.mode.confirmed)
+
+    def verdict(self, event: Event) -> str:
+        """Return what kind of bytes these are."""
+        return verdict_of(_own(event))
+
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the state with an event."""
+        self._monitor.on_event(_own(event), now)
+        self._decoder.use_head(self.model.profile.dialect.head)
+
+    # ------------------------------------------------------------------ the link, and time
+
+    def link_up(self, now: float) -> None:
+        """Bring the car to a known state: the link is open."""
+        self._monitor.link_up()
+        self._decoder = Decoder(head=self.model.profile.dialect.head)
+        super().link_up(now)
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail all commands: the link is down."""
+        self.model.cut_write = self.model.cut_write or cause is Reason.WRITE_FAILED
+        self._monitor.link_down()
+        super().link_down(reason, now, cause=cause)
+
+    def tick(self, now: float) -> None:
+        """Check for silence."""
+        self._monitor.tick(now)
+
+    def on_stall(self, gap_s: float, now: float) -> None:
+        """Stop a driven car after a gap of the loop."""
+        self._monitor.on_stall(gap_s, now)
+
+    def on_sleep(self, slept_s: float, now: float) -> None:
+        """Stop the car first after a sleep of the computer."""
+        self._monitor.on_sleep(slept_s, now)
+
+    # ------------------------------------------------------------------ commands
+
+    def refusal(self, what: Action) -> str | None:
+        """Return why this car cannot do it in any state; None if it can."""
+        car, profile, believed = self.desk.car, self.model.profile, self.model.believed
+        match what:
+            case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
+                if profile.kind is Platform.UNKNOWN:
+                    return (
+                        f"the platform of {car} is not known, and a mode frame ends the program of some cars. "
+                        f"Name it: `platform:` in the fleet file, or `gateway run --platform`."
+                    )
+                return f"{car} ({profile.name}) has no mode {mode}. It has: {', '.join(sorted(profile.modes))}."
+            case ChangeSpeed(step) if (words := self._too_fast(step)) is not None:
+                return words
+            case Find():
+                return None
+            case PartAction():
+                words = next((why for frame in self._frames_of(what) if (why := profile.refusal(frame))), None)
+                is_unknown = believed.fan is None and not profile.fan_is_level
+                if words is None and isinstance(what, Fan) and what.on is not None and is_unknown:
+                    return f"{car}'s fan state is unknown, so on/off is not possible. Toggle it: `fleet fan {car}`."
+                return words
+            case Drive(motion):
+                return profile.refusal(General(motion))
+            case _:
+                return None
+
+    def _too_fast(self, step: SpeedStep) -> str | None:
+        """Return why the car must not become as fast as after this step; None if it may."""
+        speed, before = self.model.profile.speed, self.model.believed.speed
+        after = speed.step(before, step)
+        share, maximum = speed.fraction(after), self.desk.speed_max
+        if after <= before or share <= maximum:
+            return None
+        car = self.desk.car
+        return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
+
+    def frames(self, what: Action) -> tuple[Frame, ...]:
+        """Return the frames of an action on a part of the car, without those that the car does not know."""
+        return tuple(frame for frame in self._frames_of(what) if self.model.profile.refusal(frame) is None)
+
+    def _frames_of(self, what: Action) -> tuple[Frame, ...]:
+        """Return the frames of an action. A general frame gets the current motion when it is written."""
+        match what:
+            case Led(r, g, b):
+                return (ColorLed(r, g, b),)
+            case SetLight(light):
+                return (General(Motion.STOP, light=light),)
+            case Whistle():
+                return (General(Motion.STOP, whistle=True),)
+            case MoveServo(action):
+                return (General(Motion.STOP, servo=action),)
+            case AimServo(deg):
+                return (Ptz(deg),)
+            case MoveArm(joints):
+                return (ArmSet(joints),)
+            case ChangeSpeed(step):
+                return (General(Motion.STOP, speed=step),)
+            case Fan(on):
+                is_level, fan = self.model.profile.fan_is_level, self.model.believed.fan
+                return (General(Motion.STOP, fan=(not fan if on is None else on) if is_level else True),)
+            case Find():
+                return self._blinks()
+            case _:
+                return ()
+
+    def _blinks(self) -> tuple[Frame, ...]:
+        """Return the frames of `find`. The last one sets the LED color that the queued commands will leave."""
+        waiting = [each for act in self.queue.one_shots for each in act.frames if isinstance(each, ColorLed)]
+        led = waiting[-1] if waiting else self.model.believed.led
+        other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)
+        whistle = General(Motion.STOP, whistle=True)
+        return whistle, other, whistle, led
+
+    def opening_s(self, mode: Mode) -> float:
+        """Return how long it takes until a mode is open, s."""
+        return self.model.profile.block_s(ModeOpen(mode))
+
+    def end_doubt(self, now: float) -> None:
+        """End the doubt about a car that has shown its stops before."""
+        self.stops.end_doubt(now)
+
+    # ------------------------------------------------------------------ what outlives the gateway
+
+    def kept(self) -> Mapping[str, Any]:
+        """Return what was learned of the car."""
+        return self.model.learned.kept()
+
+    @property
+    def opened_as(self) -> str:
+        """Return the platform of a car in which a mode may be open."""
+        return self.model.learned.opened_as
+
+
+def _own(event: Event) -> WireEvent:
+    return cast("WireEvent", event)
+
+
+def yahboom(profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> Callable[[Desk], YahboomDriver]:
+    """Return the driver of such a car, for `Controller`."""
+    return lambda desk: YahboomDriver(desk, profile, auto=auto, learned=learned)

@@ -1,0 +1,1 @@
+"""The estimates of a car that never reports its state: rhythm, mode, platform, outputs. Pure."""

@@ -1,0 +1,301 @@
+"""Learns one car's habits from its readings: its rhythm, its delays, and whether it can show that a stop arrived. Pure.
+
+Cars of one protocol run different programs (docs/reference/protocol.md#programs-that-people-have). One reports by its
+loop, another every second by a timer; for one `MODE00` blocks a second, for another it does not block at all. So no
+number of one program judges another. A car is compared with itself.
+
+A *rhythm* is the interval of undisturbed reports: the last few of them, their median and their spread. A report that
+the link lost or held makes a wrong interval, so an interval enters the rhythm only if it fits the others. Three in a
+row that fit each other, and not the rhythm, are a new rhythm: the car runs another program, or another car came.
+
+A *delay* is by how much a report comes later than the rhythm after one frame that may block. A car that blocks
+acknowledges each such frame by its delay; one that reports by a timer never does.
+
+"It cannot show a stop" is a finding, not a first impression. It takes `UNREACTED` blocking frames without any delay,
+and none with one. It ends as it began: by `REACTED` delays of just the block of a frame. Nothing is sent just to
+learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any, Final
+
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Reject, Sensors
+from schemas.words import Blocking, Mode, Shows
+
+KEPT_INTERVALS: Final = 9
+"""Number of intervals of a rhythm."""
+SAME_S: Final = 0.18
+"""Maximum difference of intervals that belong to one rhythm: cars spread them by up to 0.08 s each way."""
+FIRM_INTERVALS: Final = 4
+"""Number of intervals from which their spread counts as known."""
+FIRST_TOLERANCE_S: Final = 0.12
+"""Tolerance until then."""
+LINK_TOLERANCE_S: Final = 0.05
+"""Tolerance for the link and the machine, in addition to the spread."""
+CHANGED_INTERVALS: Final = 3
+"""Number of consecutive intervals that are a new rhythm."""
+AGREEING_DELAYS: Final = 3
+"""Number of consecutive delays that agree and so are the block of a frame."""
+ALWAYS: Final = 5
+"""Minimum number of values out of range that are a finding, if none was in range."""
+UNREACTED: Final = 4
+"""Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
+REACTED: Final = 3
+"""Number of consecutive reactions that end that finding."""
+MAX_LEARNED_S: Final = 10.0
+"""Maximum interval or block: three times those of the slowest car. A longer gap is the link's or the loop's. As the
+first interval it would be the rhythm, and each stop would wait that long for a report before it is sent again."""
+
+
+def blocking_kind(frame: Frame) -> Blocking | None:
+    """Return the kind of a frame that may block; None for a frame that does not, or blocks in several ways."""
+    match frame:
+        case ModeClose():
+            return Blocking.MODE_CLOSE
+        case Ptz():
+            return Blocking.SERVO
+        case ColorLed():
+            return Blocking.COLOR
+        case General(whistle=True, servo=None, fan=False):
+            return Blocking.WHISTLE
+        case _:
+            return None
+
+
+@dataclass(slots=True)
+class Rhythm:
+    """The interval of undisturbed reports, s."""
+
+    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_INTERVALS))
+    _others: deque[float] = field(default_factory=lambda: deque(maxlen=CHANGED_INTERVALS))
+    """The last consecutive intervals that do not fit."""
+
+    @property
+    def is_known(self) -> bool:
+        """Return True if there is an interval."""
+        return bool(self.intervals)
+
+    @property
+    def median_s(self) -> float:
+        """Return the median; 0 if no interval is known."""
+        return median(self.intervals) if self.intervals else 0.0
+
+    @property
+    def spread_s(self) -> float:
+        """Return the difference of the longest and the shortest interval, s."""
+        return max(self.intervals) - min(self.intervals) if self.intervals else 0.0
+
+    @property
+    def is_changing(self) -> bool:
+        """Return True if the last undisturbed interval did not fit: another rhythm may begin."""
+        return bool(self._others)
+
+    @property
+    def is_firm(self) -> bool:
+        """Return True if there are enough intervals to know their spread."""
+        return len(self.intervals) >= FIRM_INTERVALS
+
+    @property
+    def seen_tolerance_s(self) -> float:
+        """Return the maximum difference of an interval from the median, as far as the intervals show it."""
+        return self.spread_s + LINK_TOLERANCE_S
+
+    @property
+    def tolerance_s(self) -> float:
+        """Return the maximum difference of an interval of this car, on this link, from the median."""
+        return max(self.seen_tolerance_s, 0.0 if self.is_firm else FIRST_TOLERANCE_S)
+
+    def fits(self, interval_s: float) -> bool:
+        """Return True if an interval belongs to this rhythm."""
+        return self.is_known and abs(interval_s - self.median_s) <= SAME_S
+
+    def add(self, interval_s: float) -> bool:
+        """Add an undisturbed interval. Return True if it completes another rhythm, which replaces this one."""
+        if not self.intervals or self.fits(interval_s):
+            self.intervals.append(interval_s)
+            self._others.clear()
+            return False
+        self._others.append(interval_s)
+        first = len(self.intervals) < 2  # nothing has confirmed the first interval yet
+        needed = 2 if first else CHANGED_INTERVALS
+        latest = list(self._others)[-needed:]
+        if len(latest) < needed or max(latest) - min(latest) > SAME_S:
+            return False
+        self.intervals.clear()
+        self.intervals.extend(latest)
+        self._others.clear()
+        return not first
+
+    def is_multiple(self, delay_s: float, tolerance_s: float) -> bool:
+        """Return True if a delay is a whole number of intervals, as if the link had lost that many reports."""
+        if not self.is_known or delay_s < self.median_s / 2:
+            return False
+        count = max(1, round(delay_s / self.median_s))
+        return abs(delay_s - count * self.median_s) <= tolerance_s
+
+
+@dataclass(slots=True)
+class Learned:
+    """The habits of one car. Times: s."""
+
+    echo: Rhythm = field(default_factory=Rhythm)
+    """The rhythm of reports of mode 0 with a sonar echo."""
+    no_echo: Rhythm = field(default_factory=Rhythm)
+    shows: Shows = Shows.UNKNOWN
+    doubted: bool = False
+    """True if the car has shown its stops before, and did not show the last one."""
+    opened_as: str = ""
+    """The detected platform as which the gateway last opened a mode, until a report shows mode 0 again. In a silent
+    mode nothing else tells what ends it. Empty if none is open."""
+    reporting: set[Mode] = field(default_factory=set)
+    """The modes in which the car has sent readings."""
+    extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """The lowest and the highest accepted value of each field with a number, as on the wire."""
+    rejected: dict[str, int] = field(default_factory=dict)
+    """How often the value of a field was out of its range, by the word of the field."""
+    _delays: dict[Blocking, deque[float]] = field(default_factory=dict)
+    _blocks: dict[Blocking, float] = field(default_factory=dict)
+    _unreacted: int = 0
+    _reacted: int = 0
+    """Number of consecutive reactions of a car that counts as one that cannot show a stop."""
+
+    # ------------------------------------------------------------------ rhythm and delays
+
+    def add_interval(self, interval_s: float, *, echo: bool) -> bool:
+        """Add an undisturbed interval. Return True if it completes another rhythm: what the car has shown is over."""
+        if interval_s > MAX_LEARNED_S:
+            return False
+        was_known = self.shows is not Shows.UNKNOWN or self.echo.is_firm
+        changed = (self.echo if echo else self.no_echo).add(interval_s) and echo
+        if changed:
+            self.forget_reactions()
+        return changed and was_known
+
+    def forget_reactions(self) -> None:
+        """Forget what the car can show: it is not known whether it is the same car."""
+        self.shows, self.doubted, self._unreacted = Shows.UNKNOWN, False, 0
+        self._delays.clear()
+        self._blocks.clear()
+
+    def interval_s(self, expected_s: float) -> float:
+        """Return the interval of the reports with an echo: as seen, or else as expected."""
+        return self.echo.median_s if self.echo.is_known else expected_s
+
+    def block_s(self, kind: Blocking, expected_s: float) -> float:
+        """Return by how much a frame of this kind delays the next report: as seen, or else as expected."""
+        return self._blocks.get(kind, expected_s)
+
+    def close_s(self, expected_s: float) -> float:
+        """Return by how much `MODE00` delays the next report: as seen, or else as expected."""
+        return self.block_s(Blocking.MODE_CLOSE, expected_s)
+
+    @property
+    def blocks(self) -> Mapping[Blocking, float]:
+        """Return the delays that were learned."""
+        return self._blocks
+
+    def add_delay(self, kind: Blocking, delay_s: float, longest_s: float, *, controlled: bool) -> bool:
+        """Add the delay of an undisturbed report after a frame. Return True if the last delays agree.
+
+        A delay counts if it is clearly longer than the spread and shorter than `longest_s`. If it is as long as lost
+        reports would be, it counts only if `controlled`: other frames of ours delay no report.
+        """
+        tolerance_s = self.echo.tolerance_s
+        if not 2 * tolerance_s < delay_s < longest_s or (not controlled and self.is_confusable(delay_s)):
+            self._delays.pop(kind, None)
+            return False
+        delays = self._delays.setdefault(kind, deque(maxlen=AGREEING_DELAYS))
+        delays.append(delay_s)
+        if len(delays) < AGREEING_DELAYS or max(delays) - min(delays) > 2 * tolerance_s:
+            return False
+        self._blocks[kind] = median(delays)
+        self._unreacted = 0
+        return True
+
+    def on_reaction(self, *, sure: bool) -> None:
+        """Record that a report came late by just the block of a frame. `sure`: a lost report cannot look so."""
+        self._unreacted = 0
+        if self.shows is Shows.NO and sure:
+            self._reacted += 1
+            if self._reacted >= REACTED:  # its wire was loose, or another program runs
+                self.shows, self._reacted = Shows.UNKNOWN, 0
+
+    def on_no_reaction(self) -> bool:
+        """Record a blocking frame without a delay. Return True if the car counts as one that cannot show a stop now."""
+        self._unreacted += 1
+        self._reacted = 0
+        if self.shows is not Shows.UNKNOWN or self._unreacted < UNREACTED:
+            return False
+        self.shows = Shows.NO
+        return True
+
+    def on_shown(self) -> None:
+        """Record that the car has shown a stop."""
+        self.shows, self.doubted, self._unreacted = Shows.YES, False, 0
+
+    def is_confusable(self, delay_s: float) -> bool:
+        """Return True if reports that the link loses could look like this delay."""
+        return self.echo.is_multiple(delay_s, 2 * self.echo.tolerance_s)
+
+    @property
+    def always_rejected(self) -> tuple[str, ...]:
+        """Return the fields whose values were often out of range, and never in it."""
+        return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
+
+    def on_fields(self, event: Sensors, rejects: tuple[Reject, ...]) -> None:
+        """Record the values of the fields of a report of mode 0. rejects: those out of the range of this car."""
+        rejected = {reject.word for reject in rejects}
+        for name in rejected:
+            self.rejected[name] = self.rejected.get(name, 0) + 1
+        for each in SENSOR_FIELDS:
+            value = getattr(event, each.attribute)
+            word = each.word.decode()
+            if value is None or word in rejected:
+                continue
+            if isinstance(value, tuple):
+                self.extremes.setdefault(word, (0.0, 1.0))
+            else:
+                self.on_number(word, value)
+
+    def on_number(self, field_name: str, value: float) -> None:
+        """Record the value of a field."""
+        low, high = self.extremes.get(field_name, (value, value))
+        self.extremes[field_name] = min(low, value), max(high, value)
+
+    # ------------------------------------------------------------------ state file
+
+    def kept(self) -> dict[str, Any]:
+        """Return what is kept over a restart, as JSON values."""
+        return {
+            "echo_s": [round(each, 4) for each in self.echo.intervals],
+            "no_echo_s": [round(each, 4) for each in self.no_echo.intervals],
+            "shows": str(self.shows),
+            "doubted": self.doubted,
+            "reporting": sorted(self.reporting),
+            "opened_as": self.opened_as,
+            "blocks_s": {str(kind): round(block_s, 4) for kind, block_s in self._blocks.items()},
+        }
+
+    @classmethod
+    def restore(cls, kept: Mapping[str, Any]) -> "Learned":
+        """Return what `kept` returned. Raises ValueError, KeyError or TypeError if it is damaged."""
+        learned = cls(
+            shows=Shows(kept["shows"]),
+            doubted=bool(kept["doubted"]),
+            reporting={Mode(mode) for mode in kept["reporting"]},
+            opened_as=parse_platform(kept["opened_as"]).name if kept.get("opened_as") else "",
+        )
+        for rhythm, name in ((learned.echo, "echo_s"), (learned.no_echo, "no_echo_s")):
+            intervals = [float(each) for each in kept[name]]
+            if not all(0.0 < each <= MAX_LEARNED_S for each in intervals):  # also refuses NaN
+                raise ValueError(f"{name}: {intervals}")
+            rhythm.intervals.extend(intervals)
+        learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
+        if not all(0.0 < each <= MAX_LEARNED_S for each in learned._blocks.values()):
+            raise ValueError(f"blocks_s: {learned._blocks}")
+        return learned

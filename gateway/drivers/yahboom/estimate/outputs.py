@@ -1,0 +1,73 @@
+"""Estimates motion, speed, fan, servo and LED of the car from the written frames.
+
+The car confirms none of them. Readings give evidence of its mode only, see mode.py.
+"""
+
+from dataclasses import dataclass, field, replace
+
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from schemas.words import Motion
+
+
+@dataclass(slots=True)
+class StateEstimate:
+    """The sum of the frames written since the link came up. Times: s, monotonic."""
+
+    profile: Profile
+    motion: Motion = Motion.STOP
+    """The last motion sent."""
+    repeat: bool = False
+    """True if the motion changed, and was not repeated alone yet (docs/reference/protocol.md#pacing: the 1.1 s
+    rule)."""
+    fan: bool | None = None
+    fan_at: float = float("-inf")
+    """When the fan was last toggled."""
+    fan_toggled: bool = False
+    """True if it was toggled, and no reading came since it had settled."""
+    servo_deg: int | None = None
+    led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
+    speed: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.speed = self.profile.speed.start
+
+    def on_written(self, frame: Frame, now: float) -> None:
+        """Apply a written frame."""
+        match frame:
+            case General():
+                if frame.motion is not Motion.STOP:
+                    self.repeat = self.repeat or frame.motion is not self.motion
+                self.motion = frame.motion
+                if frame.speed is not None:
+                    self.speed = self.profile.speed.step(self.speed, frame.speed)
+                if self.profile.fan_is_level:
+                    self.fan_at = now if frame.fan is not self.fan else self.fan_at
+                    self.fan = frame.fan
+                elif frame.fan:
+                    self.fan = None if self.fan is None else not self.fan
+                    self.fan_at = now
+                    self.fan_toggled = True
+            case ModeClose():
+                self.motion = Motion.STOP
+            case Ptz(deg):
+                self.servo_deg = deg
+            case ColorLed():
+                self.led = frame
+            case _:
+                pass
+
+    @property
+    def fan_may_run(self) -> bool:
+        """Return True if the fan runs, or may run: its state is unknown, and it was toggled after the last reading."""
+        return self.fan is True or (self.fan is None and self.fan_toggled)
+
+    def with_motion(self, frame: Frame) -> Frame:
+        """Return the frame with the current motion, which every general frame carries."""
+        return replace(frame, motion=self.motion) if isinstance(frame, General) else frame
+
+    def with_fan(self, frame: Frame) -> Frame:
+        """Return the frame with the level of the fan, which every general frame of some cars carries."""
+        if not isinstance(frame, General) or not self.profile.fan_is_level:
+            return frame
+        return replace(frame, fan=bool(self.fan))

@@ -1,0 +1,337 @@
+"""Detects from the car's bytes which program runs on it, and checks them against the configured profile.
+
+Two differences leave no trace in the bytes. An arduino and an stm32 send the same. And a car does not report its
+lights, such as light 1, which a raspberry_pi car cycles. A single frame may be corrupted, so it takes three in a row.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gateway.control.driver import Rejected, TextLine
+from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
+from gateway.drivers.yahboom.protocol.modes import candidate_modes, only_candidate
+from gateway.drivers.yahboom.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
+from gateway.drivers.yahboom.protocol.sensors import Sensors, head_of
+from schemas.platform_name import HEAD, NO_READINGS
+from schemas.words import Mode, Platform
+
+EVIDENCE_FRAMES: Final = 3
+"""Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
+
+OTHER_PROGRAM_FRAMES: Final = 12
+"""Number of consecutive frames of another program, or with another head, that replace the one with which the car was
+read. A link that loses or changes bytes makes such a frame now and then, and a wrong head or platform keeps every named
+frame from the car."""
+
+_MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
+_MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
+_CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
+_WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
+_WITH_MODES: Final = "arduino (or stm32: their bytes are mostly the same)"
+TWO_CELLS_V: Final = 9.0
+"""Voltage over which a battery has more than two cells: they have 8.4 V when full."""
+
+
+@dataclass(slots=True)
+class _PlatformEvidence:
+    """Debounces one observation over several frames."""
+
+    holds: bool = False
+    _run: int = 0
+
+    def update(self, *, shown: bool) -> bool:
+        """Count one frame. Return True if the observation holds from now on."""
+        self._run = self._run + 1 if shown is not self.holds else 0
+        if self._run < EVIDENCE_FRAMES:
+            return False
+        self._run = 0
+        self.holds = shown
+        return shown
+
+
+@dataclass(slots=True)
+class PlatformDetector:
+    """The profile in force, and the evidence for and against it.
+
+    With `auto` the detector sets `profile`, which is the unknown one at first.
+    """
+
+    configured: Profile
+    auto: bool = False
+    remembered: Profile | None = None
+    """With `auto`: what the car was when a mode was opened that may still be open. It counts until readings come."""
+    profile: Profile = field(init=False)
+    """The profile in force: the configured one, or with `auto` the detected one."""
+    _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
+    _with_modes: str = ""
+    _raspberry_pi: str = ""
+    """Evidence for a car with modes, and for a Raspberry Pi. If both are set, the car is of an unknown kind."""
+    _alone: int = 0
+    """Number of consecutive readings that one of the two kinds sends, and the other one does not."""
+    _alone_has_modes: bool = False
+    _options: frozenset[str] = frozenset()
+    _seen: dict[str, _PlatformEvidence] = field(
+        default_factory=lambda: {
+            word: _PlatformEvidence()
+            for word in (_MODE_READINGS, _MEASURED_READINGS, _CONSTANT_READINGS, _WIDE_READINGS)
+        }
+    )
+    _is_wide: bool = False
+    """True if the grayscale readings are those of an stm32 car."""
+    _frames: dict[str, int] = field(default_factory=dict)
+    _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
+    _extra_options: set[str] = field(default_factory=set)
+    """Contradictions that only show an option which is not configured."""
+    _readings: int = 0
+    _assumed_silent: bool = False
+    """True if the option `no_readings` of the profile comes from the silence of this link."""
+    _is_heard: bool = False
+    """True if readings have contradicted that option."""
+    _head: str = ""
+    _heads: int = 0
+    """The first word of the last sensors frames if it is none of this profile, and their number."""
+    _is_read: bool = False
+    """True if a frame with the head of this profile has arrived on this link."""
+
+    def __post_init__(self) -> None:
+        self.profile = self.remembered or self.configured
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """Return the contradictions of the profile that hold now, in words."""
+        return tuple(words for words, shown in self._against.items() if shown.holds)
+
+    @property
+    def doubted(self) -> bool:
+        """Return True if readings contradict the profile now. An option that is not configured is no contradiction."""
+        return any(shown.holds for words, shown in self._against.items() if words not in self._extra_options)
+
+    @property
+    def open_mode(self) -> bool:
+        """Return True if the last readings show a mode other than 0, so the car knows MODE frames."""
+        return self._open_mode.holds
+
+    @property
+    def is_remembered(self) -> bool:
+        """Return True if no reading of this link has settled the platform, and one from before counts."""
+        return self.profile is self.remembered
+
+    @property
+    def is_settled(self) -> bool:
+        """Return True if enough readings came to know what they can tell of the platform."""
+        return self.profile.kind is not Platform.UNKNOWN or self._readings > EVIDENCE_FRAMES
+
+    def begin_link(self) -> None:
+        """Forget what the readings of the last link showed of the mode, and of the head."""
+        self._open_mode = _PlatformEvidence()
+        self._is_read, self._heads = False, 0
+
+    @property
+    def evidence(self) -> tuple[str, ...]:
+        """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
+        return (*self._why(), *self.contradictions, *self.profile.not_observed)
+
+    def on_event(self, event: Event, *, counts: bool = True) -> tuple[str, ...]:
+        """Update the evidence, and with `auto` the profile. Return new contradictions, in words.
+
+        If a reading does not count, only its head does.
+        """
+        if isinstance(event, Sensors):
+            self._is_read, self._heads = True, 0
+            if not counts:
+                return ()
+        match event:
+            case Sensors():
+                if not self.profile.has_readings:
+                    return self._count_reading()
+                self._open_mode.update(shown=Mode.MANUAL not in candidate_modes(event))
+                new = self._check_profile(event)
+                if self.auto:
+                    self._detect(event)
+                if event.voltage_v is not None and event.voltage_v > TWO_CELLS_V:
+                    self._count_variant("3s")
+            case ArmReading() | ImuReading():
+                new = self._count_option("arm" if isinstance(event, ArmReading) else "imu")
+            case TextLine():
+                self._count_variant("text")
+                return ()
+            case Rejected(raw):
+                return self._count_head(head_of(raw))
+            case _:
+                return ()
+        return new
+
+    def on_never_heard(self) -> str:
+        """Take a raspberry_pi car that has sent nothing on this link as one that never sends readings.
+
+        Its reports show no stop in any case, so only words depend on them. Return what that contradicts, in words;
+        empty for any other car: its silence may be that of a mode.
+        """
+        if self.profile.kind is not Platform.RASPBERRY_PI or not self.profile.has_readings:
+            return ""
+        named = self.profile.name
+        self.profile = _profile_of(self.profile.kind, self.profile.options | {NO_READINGS})
+        self._assumed_silent = True
+        return f"no readings, which {named} cars send. It is treated as {self.profile.name} until one arrives"
+
+    def _count_reading(self) -> tuple[str, ...]:
+        """Count one reading of a car that counts as one without any. It counts as one with readings from the third on.
+
+        If only its silence had made it one, the first reading ends that.
+        """
+        self._frames[NO_READINGS] = self._frames.get(NO_READINGS, 0) + 1
+        if not self._assumed_silent and self._frames[NO_READINGS] < EVIDENCE_FRAMES:
+            return ()
+        named, was_named = self.profile.name, not self._assumed_silent
+        self._assumed_silent, self._is_heard = False, True
+        self.profile = _profile_of(self.profile.kind, self.profile.options - {NO_READINGS})
+        words = f"readings, which {named} cars do not send. It is treated as {self.profile.name}"
+        return (words,) if was_named and self.note(words) else ()
+
+    def note(self, words: str) -> bool:
+        """Add a contradiction that other evidence has shown. Return True if it is new."""
+        if words in self._against:
+            return False
+        self._extra_options.add(words)
+        self._against[words] = _PlatformEvidence(holds=True)
+        return True
+
+    def _count_variant(self, option: str) -> None:
+        """Count one sign of a variant of the program. Only a car whose platform is detected gets it by itself."""
+        self._frames[option] = self._frames.get(option, 0) + 1
+        if self.auto and self._frames[option] == EVIDENCE_FRAMES and option not in self.profile.options:
+            self._options |= {option}
+            self._apply_evidence()
+
+    def _check_profile(self, event: Sensors) -> tuple[str, ...]:
+        """Update the contradictions of the profile. Only a mode-0 frame can end those of mode 0."""
+        observed = self.profile.contradictions(event)
+        if not observed and not self._against:
+            return ()
+        in_manual = only_candidate(event) is Mode.MANUAL
+        for words in observed:
+            self._against.setdefault(words, _PlatformEvidence())
+        judged = [words for words in self._against if words not in self._extra_options]
+        affected = [words for words in judged if in_manual or words in observed]
+        new = tuple(words for words in affected if self._against[words].update(shown=words in observed))
+        for words in affected:
+            if words not in observed and not self._against[words].holds:
+                del self._against[words]
+        return new
+
+    def _count_option(self, option: str) -> tuple[str, ...]:
+        self._frames[option] = self._frames.get(option, 0) + 1
+        if self._frames[option] != EVIDENCE_FRAMES or option in self.profile.options:
+            return ()
+        if self.auto:
+            self._options |= {option}
+            self._apply_evidence()
+            return ()
+        words = f"{option} frames, which {self.profile.name} cars do not send. Is it {self.profile.name}+{option}?"
+        return (words,) if self.note(words) else ()
+
+    def _count_head(self, head: str | None) -> tuple[str, ...]:
+        """Count one sensors frame that begins with another word than those of this profile."""
+        if head is None or head == self.profile.dialect.head:
+            return ()
+        self._heads = self._heads + 1 if head == self._head else 1
+        self._head = head
+        if self._heads != (OTHER_PROGRAM_FRAMES if self._is_read else EVIDENCE_FRAMES):
+            return ()
+        self._is_read = False
+        option = f"{HEAD}={head}"
+        if self.auto:
+            self._options = _without_head(self._options) | {option}
+            self._apply_evidence()
+            return ()
+        # No other car sends such frames, so the option was written wrongly. With it, no reading could be read.
+        named = self.profile.name
+        self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
+        words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
+        return (words,) if self.note(words) else ()
+
+    def _detect(self, event: Sensors) -> None:
+        """Detect the platform from the first evidence."""
+        self._readings += 1
+        if len(candidate_modes(event)) > 1:
+            return
+        in_manual = only_candidate(event) is Mode.MANUAL
+        # Whole centimeters with other values than these constants may come from a Raspberry Pi that measures its
+        # battery, or from an stm32. A mode frame ends the program of the first, so such a car stays unknown.
+        whole = whole_cm(event)
+        shown = {
+            _MODE_READINGS: not in_manual,
+            _MEASURED_READINGS: in_manual and not whole,
+            _CONSTANT_READINGS: in_manual and whole and pi_constants(event),
+            _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
+        }
+        self._count_alone(with_modes=shown[_MODE_READINGS] or shown[_MEASURED_READINGS], pi=shown[_CONSTANT_READINGS])
+        for words, seen in self._seen.items():
+            if seen.update(shown=shown[words]):
+                if words is _CONSTANT_READINGS:
+                    self._raspberry_pi = words
+                elif words is _WIDE_READINGS:
+                    self._is_wide = True
+                else:
+                    self._with_modes = self._with_modes or words
+                self._apply_evidence()
+
+    def _count_alone(self, *, with_modes: bool, pi: bool) -> None:
+        """Count one reading for the kinds. Many for one kind alone end what another program has shown before."""
+        if with_modes is pi:
+            self._alone = 0
+            return
+        self._alone = self._alone + 1 if with_modes is self._alone_has_modes else 1
+        self._alone_has_modes = with_modes
+        if self._alone != OTHER_PROGRAM_FRAMES or not (self._with_modes and self._raspberry_pi):
+            return
+        if with_modes:
+            self._raspberry_pi = ""
+        else:
+            self._with_modes, self._is_wide = "", False
+        self._apply_evidence()
+
+    def forget(self) -> None:
+        """Forget what the readings have shown of the program: another one runs."""
+        self._with_modes = self._raspberry_pi = ""
+        self._is_wide, self._alone, self._readings = False, 0, 0
+        for words in self._seen:
+            self._seen[words] = _PlatformEvidence()
+        self._apply_evidence()
+
+    def _apply_evidence(self) -> None:
+        if bool(self._with_modes) is bool(self._raspberry_pi):
+            kind = self.configured.kind
+        else:
+            modes = Platform.STM32 if self._is_wide else Platform.ARDUINO
+            kind = modes if self._with_modes else Platform.RASPBERRY_PI
+        knows_head = any(each.startswith(HEAD) for each in self._options)
+        configured = self.configured.options
+        options = self._options | (_without_head(configured) if knows_head else configured)
+        profile = _profile_of(kind, options - {NO_READINGS} if self._is_heard else options)
+        if profile.name != self.profile.name:
+            self.profile = profile
+            self._against.clear()
+
+    def _why(self) -> tuple[str, ...]:
+        if not self.auto:
+            return ()
+        if self._with_modes and self._raspberry_pi:
+            return (f"both {self._with_modes} and {self._raspberry_pi}: none of the platforms that are known",)
+        if self._with_modes and self._is_wide:
+            return (f"stm32: {EVIDENCE_FRAMES} {_WIDE_READINGS}",)
+        if self._with_modes:
+            return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._with_modes}",)
+        if self._raspberry_pi:
+            return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._raspberry_pi}",)
+        if self.is_remembered:
+            return (f"{self.profile.name}: so it was detected before a mode was opened, and it may be in that mode",)
+        return (f"not settled: it takes {EVIDENCE_FRAMES} readings running",)
+
+
+def _profile_of(kind: Platform, options: frozenset[str]) -> Profile:
+    return parse_platform("+".join((kind, *sorted(options))))
+
+
+def _without_head(options: frozenset[str]) -> frozenset[str]:
+    return frozenset(each for each in options if not each.startswith(HEAD))

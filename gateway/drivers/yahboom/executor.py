@@ -1,0 +1,407 @@
+"""Sends frames to one car: one at a time, a stop before everything else. Pure.
+
+`StopExecutor` knows which frames a stop needs, `CommandQueue` what else waits, `Pacing` when a frame may be written.
+"""
+
+from typing import Final
+
+from gateway.control.command_log import Pending
+from gateway.control.command_queue import HeldMotion
+from gateway.control.commands import Fan, SetMode
+from gateway.control.driver import Desk, Driver
+from gateway.control.events import OutgoingFrame
+from gateway.control.trust import TrustEvent
+from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.estimate.learned import blocking_kind
+from gateway.drivers.yahboom.pacing import AWAKE_WAIT_S, FLIGHT_S
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen
+from gateway.drivers.yahboom.protocol.platforms import StopStyle
+from gateway.drivers.yahboom.stop_executor import StopExecutor
+from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
+from gateway.drivers.yahboom.stops.stopping import StopInProgress
+from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
+
+NO_REPEAT_S: Final = 2 * FLIGHT_S
+"""Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends
+one meanwhile loses the stop behind the repeated motion."""
+
+
+class Executor(Driver):
+    """The queued commands, the stop in progress, and the one frame in flight."""
+
+    def __init__(self, desk: Desk, model: CarModel) -> None:
+        super().__init__(desk)
+        self._model = model
+        self.stops = StopExecutor(model, desk.log)
+        self.mode_sent: tuple[Pending, float] | None = None
+        """A mode command whose effect was not seen yet, and when its frame was written."""
+        self._log = desk.log
+        self._source: StopInProgress | HeldMotion | Pending | None = None
+        """The stop, motion or command of the last frame of `poll`; None for a repetition."""
+
+    @property
+    def model(self) -> CarModel:
+        """What is claimed of the car."""
+        return self._model
+
+    # ------------------------------------------------------------------ the link
+
+    def link_up(self, now: float) -> None:
+        """Bring the car to a known state: the link is open."""
+        model = self.model
+        model.link_open = True
+        model.missed_stop = False
+        model.link_since = now
+        model.evidence.begin_link()
+        model.pacing.reset()
+        self.senders.halt_streams(now)
+        model.learn(TrustEvent.LINK_OPENED, now)
+        self.stops.begin_recovery(FrameOrigin.RECOVERY, now, [])
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail all commands: the link is down, and the state of the car is unknown."""
+        model = self.model
+        model.link_open = False
+        model.link_reason = reason
+        model.believed.repeat = False
+        model.learn(TrustEvent.LINK_LOST, now, reason)
+        self.mode_sent = self._source = None
+        self.senders.halt_streams(now)  # a press from before the loss does not drive the car after it
+        self.stops.link_down(reason, now, cause=cause)
+        self.queue.drop(Phase.FAILED, cause, reason, now)
+        model.mode.forget()
+        model.believed.fan, model.believed.fan_toggled = None, False
+
+    # ------------------------------------------------------------------ frames out
+
+    def accepts_commands(self, now: float) -> bool:
+        """Return True if a command's frame may be written: no stop runs, or a new command may take its place.
+
+        What the car has not shown delays nothing. Only the first frames of a stop do, through their worst case.
+        """
+        running = self.stops.running
+        if running is None:
+            return True
+        if self.stops.shutting_down:
+            return False
+        # Each other frame stops the motors as well as the second frame of a soft stop does.
+        is_soft = running.sequence.rank == SOFT.rank and running.index > 0
+        return is_soft or now >= running.gives_way_at
+
+    def poll(self, now: float) -> OutgoingFrame | None:
+        """Return the frame to write now, if any."""
+        if not self.model.link_open:
+            return None
+        self.expire(now)
+        stops = self.stops
+        running = stops.running
+        if running is not None and stops.is_shutdown_over(now):
+            stops.give_up(running, now)
+            return None
+        if running is not None:
+            stops.fail_late(running, now)
+            if stops.running is not running:
+                return None
+            # A new command goes before the repeats of a stop, but never before its first frames. While it waits for the
+            # car, no repeat may start: each would block the car again.
+            if not (self._has_new_command and self.accepts_commands(now)):
+                return self._next_step(running, now)
+        return self._next_command(now)
+
+    def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
+        if not self.stops.is_step_due(running, now):
+            return None
+        # A color that clears a string is the last one, also if somebody has set another one during this stop.
+        frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
+        return self._write(frame, running.why, running, running.commands[0] if running.commands else None)
+
+    def _next_command(self, now: float) -> OutgoingFrame | None:
+        model, queue = self.model, self.queue
+        if now < model.ready_at:
+            return None
+        held = queue.held
+        if held is not None and not held.pending.sent and self._is_new(held.pending):
+            self.stops.give_way(now)
+            return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
+        change = queue.mode_change
+        # A command that was queued before the mode goes first: in the mode the car would ignore it.
+        stands = model.at_rest or self._full_stop_runs
+        if change is not None and not (queue.one_shots and stands) and self._is_new(change):
+            return self._open_mode(change, now)
+        if queue.one_shots and now >= model.pacing.act_at(queue.one_shots[0].frames[0]):
+            pending = queue.one_shots[0]
+            if self._is_new(pending):
+                frame = model.believed.with_motion(pending.frames[0])
+                return self._write(frame, FrameOrigin.COMMAND, pending, pending)
+        if self.stops.running is not None:
+            return None
+        if self._repeats(now) and now >= model.pacing.repeat_at:
+            return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
+        return self._renew_stop(now)
+
+    def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
+        """Open a mode, but stop the car first: opening a mode while driving leaves the motors on."""
+        assert isinstance(pending.command.what, SetMode)
+        model = self.model
+        # The full stop before the mode has gone out if it runs and gives way; its evidence would delay the mode.
+        if not (model.rest_is_sure or self._full_stop_runs):
+            return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now, pending)
+        if now < model.pacing.open_at(now, can_show=model.can_show):
+            return None
+        self.stops.give_way(now)
+        return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+
+    def mode_wait_s(self, busy_s: float, now: float) -> float:
+        """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
+        model = self.model
+        if model.rest_is_sure and self.stops.running is None:
+            return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)
+        running, begin_s = self.stops.running, max(model.pacing.ready_at(Gate.FLIGHT) - now, 0.0)
+        if running is None or not self._full_stop_runs:
+            busy_s = max(busy_s, self.stops.worst_s(now), begin_s + self.stops.full(now).length_s)
+        # The last frame of the stop must have left the buffer of the car.
+        return busy_s + REPEAT_INTERVAL_S + (AWAKE_WAIT_S if model.can_show else 0.0)
+
+    @property
+    def _full_stop_runs(self) -> bool:
+        """Return True if a stop runs that is more than the end of a drive, and that does not give way at once."""
+        running = self.stops.running
+        if running is None or running.sequence.rank <= SOFT.rank:
+            return False
+        return running.sent_all or not running.repeats
+
+    @property
+    def _has_new_command(self) -> bool:
+        """Return True if a command waits that may go before the repeats of the running stop."""
+        held, change, one_shots = self.queue.held, self.queue.mode_change, self.queue.one_shots
+        waiting = [change, one_shots[0] if one_shots else None]
+        waiting += [held.pending] if held is not None and not held.pending.sent else []
+        return any(pending is not None and self._is_new(pending) for pending in waiting)
+
+    def _is_new(self, pending: Pending) -> bool:
+        """Return True if a command began after the running stop, or waits for that stop: only then it may go first."""
+        running = self.stops.running
+        if running is None or not self._full_stop_runs:
+            return True
+        # A stop that precedes a mode is there for that mode, and for what was queued before it. So is a mode that goes
+        # before the repeats: the commands that it waits for go with it.
+        change = self.queue.mode_change
+        newer = change if change is not None and change.received_at >= running.began_at else None
+        before = any(mode is not None and pending.received_at <= mode.received_at for mode in (running.before, newer))
+        return pending.received_at >= running.began_at or before
+
+    def _repeats(self, at: float) -> bool:
+        """Return True if the motion is repeated then: it changed, and its drive does not end just after."""
+        held = self.queue.held
+        return self.model.believed.repeat and (held is None or held.ends_at - at > NO_REPEAT_S)
+
+    def _renew_stop(self, now: float) -> OutgoingFrame | None:
+        """Repeat the stop of a car at rest that has not shown it: its frames may have been lost."""
+        model, renewal = self.model, self.stops.renewal
+        if now < renewal.due_at or not model.at_rest or model.trust.shown or self.stops.running is not None:
+            return None
+        if renewal.is_full_stop:
+            renewal.schedule(now)
+            return self._begin_stop(self.stops.full(now), FrameOrigin.REPEAT, now)
+        return self._write(renewal.take(now), FrameOrigin.REPEAT, None, None)
+
+    def _begin_stop(
+        self, sequence: StopSequence, why: FrameOrigin, now: float, before: Pending | None = None
+    ) -> OutgoingFrame | None:
+        """Begin a stop, if need be before a command. Return its first frame if that may be written now."""
+        self.stops.begin(sequence, why, now)
+        assert self.stops.running is not None
+        self.stops.running.before = before
+        self.stops.running.repeats = why is FrameOrigin.REPEAT
+        return self._next_step(self.stops.running, now)
+
+    def _write(
+        self, frame: Frame, why: FrameOrigin, source: StopInProgress | HeldMotion | Pending | None, by: Pending | None
+    ) -> OutgoingFrame:
+        self._source = source
+        if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
+            frame = self.model.believed.with_fan(frame)
+        return OutgoingFrame(frame, self.model.profile.encode(frame), why, by.command.id if by is not None else "")
+
+    # ------------------------------------------------------------------ frames written
+
+    def on_written(self, write: OutgoingFrame, now: float) -> None:
+        """Update model and queue: the link has taken the frame that `poll` returned."""
+        source, self._source = self._source, None
+        model, frame = self.model, write.frame
+        if isinstance(frame, ModeClose):
+            if not model.manual:
+                # A turn of the mode that is left may be deaf for longer than the closing takes.
+                deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
+                model.left_at, model.left_until = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
+            model.evidence.closed(now, awake=model.is_awake(now))
+        model.pacing.on_written(frame, now)
+        self._update_model(frame, now)
+        match source:
+            case StopInProgress():
+                self._step_written(source, now)
+            case HeldMotion():
+                source.begin(now, model.range_cm)
+                self._log.record_sent(source.pending, now)
+            case Pending() if source is self.queue.mode_change:
+                self.queue.mode_change = None
+                self.mode_sent = (source, now)
+                self._log.record_sent(source, now)
+            case Pending():
+                source.frames.popleft()
+                if self.stops.running is not None:
+                    self.stops.running.on_other_written(now)
+                if not source.frames:
+                    self._log.record_sent(source, now)
+                    if self.queue.one_shots and self.queue.one_shots[0] is source:
+                        self.queue.one_shots.popleft()
+            case None:
+                model.believed.repeat = False
+
+    def _step_written(self, running: StopInProgress, now: float) -> None:
+        if running.on_step_written(now):
+            for pending in running.commands:
+                self._log.record_sent(pending, now)
+                if isinstance(pending.command.what, SetMode):
+                    self.mode_sent = (pending, now)
+
+    def _update_model(self, frame: Frame, now: float) -> None:
+        """Apply the effect of a written frame to the model of the car."""
+        model = self.model
+        shown = model.trust.shown
+        model.believed.on_written(frame, now)
+        block_s = model.pacing.longest_block_s(frame)
+        match frame:
+            case ModeOpen(mode):
+                self.mode_sent = None
+                if model.auto:
+                    model.learned.opened_as = model.profile.name
+                model.mode.on_mode_sent(mode, now=now, block_s=block_s)
+                model.evidence.opened(mode, now, silent=mode in model.profile.silent_modes, shown=shown)
+                self._end_rest(TrustEvent.MODE_SENT, now)
+            case ModeClose():
+                if self.mode_sent is not None and self.mode_sent[0].command.what != SetMode(Mode.MANUAL):
+                    self.mode_sent = None
+                model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
+            case _:
+                model.mode.on_written(block_s, now=now)
+                model.evidence.blocked(blocking_kind(frame), block_s, now)
+                if isinstance(frame, General) and frame.motion is not Motion.STOP:
+                    model.evidence.sent_motion()
+                    self._end_rest(TrustEvent.MOTION_SENT, now)
+                else:
+                    model.evidence.sent_other()
+                if shown and frame != model.believed.with_fan(STOP_FRAME) and model.trust.shown:
+                    self._doubt_rest(now)
+        if model.stop_style is StopStyle.GENERAL and (model.mode.asked is None or model.mode.is_left):
+            model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
+
+    def _doubt_rest(self, now: float) -> None:
+        """Withdraw the shown rest: the car may read half of a named frame as a motion.
+
+        See docs/reference/protocol.md#hazards.
+        """
+        self.model.rest = StopCase.ACTED
+        words = EVIDENCE[StopCase.ACTED].words.format(car=self.model.name)
+        self.model.learn(TrustEvent.STOP_SENT, now, words)
+        self.stops.renewal.schedule(now)
+
+    def _end_rest(self, event: TrustEvent, now: float) -> None:
+        self.stops.renewal.reset()
+        self.model.learn(event, now)
+
+    # ------------------------------------------------------------------ stops
+
+    def shut_down(self, now: float) -> None:
+        """Stop the car and reject all later commands: the gateway ends."""
+        if self.stops.shutting_down:
+            return
+        self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
+        self.stops.shut_down(now)
+
+    @property
+    def is_stopping(self) -> bool:
+        """Return True if a stop is in progress."""
+        return self.stops.running is not None
+
+    @property
+    def shutting_down(self) -> bool:
+        """Return True after `shut_down`."""
+        return self.stops.shutting_down
+
+    @property
+    def not_stopped(self) -> str:
+        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+        return self.stops.not_stopped
+
+    def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
+        """Stop the car by all means."""
+        self.stops.begin(self.stops.full(now), why, now, pending)
+
+    def end_motion(self, now: float, pending: Pending | None = None) -> None:
+        """Stop the car at the end of a drive."""
+        self.stops.begin(self.stops.soft(now), FrameOrigin.STOP, now, pending)
+
+    def resume_motion(self, words: str, now: float) -> None:
+        """End a soft stop: the car moves again, and the rest of the stop would only jerk it."""
+        running = self.stops.running
+        if running is None or running.sequence.rank != SOFT.rank:
+            return
+        self.stops.running = None
+        for other in running.commands:
+            self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+
+    def worst_s(self, now: float) -> float:
+        """Return the longest time until the motors are off if a stop is asked now and its frames arrive."""
+        return self.stops.worst_s(now)
+
+    def free_at(self, now: float) -> float:
+        """Return when the car can take a motion, as far as that is known."""
+        return self.stops.free_at(now)
+
+    @property
+    def doubt_of_drive(self) -> str:
+        """Return why the car may have ignored a drive; empty if there is no reason to think so."""
+        model = self.model
+        if model.is_deaf and model.missed_stop:
+            return "it has not reacted to the last stop"
+        if model.profile.kind is Platform.UNKNOWN and model.mode.verdict is not Verdict.CONFIRMED:
+            return "no reading shows its mode, and in some modes it ignores drives. Name its platform to leave them"
+        return ""
+
+    # ------------------------------------------------------------------ time
+
+    def next_at(self, now: float) -> float:
+        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        if not self.model.link_open:
+            return float("inf")
+        times = self.queue.deadlines()
+        running = self.stops.running
+        if running is not None:
+            waits = self._has_new_command and self.accepts_commands(now)
+            times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
+        times.extend(self._command_times(now))
+        return max(now, min(times, default=float("inf")))
+
+    def _command_times(self, now: float) -> list[float]:
+        model, queue = self.model, self.queue
+        times: list[float] = []
+        running = self.stops.running
+        stopped = running is None
+        if running is not None and self.stops.shutting_down:
+            return times
+        free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
+        if queue.one_shots and self._is_new(queue.one_shots[0]):
+            times.append(max(model.pacing.act_at(queue.one_shots[0].frames[0]), model.left_until, free_at))
+        if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
+            times.append(max(model.ready_at, free_at))
+        if queue.mode_change is not None and self._is_new(queue.mode_change):
+            opens = model.rest_is_sure or self._full_stop_runs
+            open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
+            times.append(max(open_at, model.ready_at, free_at))
+        if stopped and self._repeats(model.pacing.repeat_at):
+            times.append(max(model.pacing.repeat_at, model.left_until))
+        if model.at_rest and not model.trust.shown and stopped and queue.mode_change is None:
+            times.append(max(self.stops.renewal.due_at, model.ready_at))
+        return times

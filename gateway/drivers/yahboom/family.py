@@ -1,0 +1,34 @@
+"""The family of cars that speak the `$...#` protocol, for `gateway.drivers`."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
+from schemas.platform_name import AUTO_PLATFORMS, OPTIONS, parse_option
+from schemas.words import Platform
+
+if TYPE_CHECKING:
+    from gateway.control.driver import Desk
+    from gateway.drivers.yahboom.driver import YahboomDriver
+
+PLATFORMS: Final = tuple(map(str, Platform))
+
+
+def profile_of(name: str) -> Profile:
+    """Return what cars of a platform can do; raise ValueError."""
+    return parse_platform(name)
+
+
+def profiles() -> tuple[Profile, ...]:
+    """Return the profile of each known platform, with an arm and an IMU."""
+    return tuple(parse_platform("+".join((kind, *sorted(OPTIONS)))) for kind in AUTO_PLATFORMS)
+
+
+def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], YahboomDriver]":
+    """Return the driver of a car. It finds out the platform of an `auto` one; raise ValueError."""
+    # A program that only asks for a profile needs no driver.
+    from gateway.drivers.yahboom.driver import yahboom
+    from gateway.drivers.yahboom.estimate.learned import Learned
+
+    start, auto = parse_option(name)
+    return yahboom(parse_platform(start), auto=auto, learned=Learned.restore(kept) if kept else Learned())

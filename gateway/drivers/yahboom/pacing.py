@@ -1,0 +1,160 @@
+"""Decides when the next frame may be written, from the blocks of the last frames and the car's buffer.
+
+It knows frames and times, no commands. `Executor` decides which frame is written.
+"""
+
+from typing import Final
+
+from gateway.drivers.yahboom.estimate.learned import Learned, blocking_kind
+from gateway.drivers.yahboom.protocol.frames import ArmSet, Frame, General, Reset
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.stops.sequences import NAMED_GAP_S, REPEAT_INTERVAL_S, Gate
+from schemas.words import Platform, ServoAction
+
+FLIGHT_S: Final = 0.06
+"""Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""
+FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
+AWAKE_S: Final = 0.6
+"""Maximum time after a report in which the car reads a frame at once: it ranges again an interval later."""
+LINK_DELAY_S: Final = 0.3
+"""Maximum delay of a report by the link, which shortens that time."""
+AWAKE_WAIT_S: Final = 1.25
+"""Maximum wait for a report before a mode is opened: the ranging that the car may be in, and a margin."""
+
+
+class Pacing:
+    """Tracks the last written frame. Times: s, monotonic."""
+
+    # A ranging without an echo blocks the car for 1.0 s, less than `REPEAT_INTERVAL_S`. A frame then waits unread in
+    # the buffer. The car reads it earlier if it was awake at the write, or has sent a report since. Frames that waited
+    # before it may then block the car once more. An echo in the last ranging does not predict the next one.
+
+    def __init__(self, profile: Profile, learned: Learned) -> None:
+        self.profile = profile
+        self.learned = learned
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the link is new."""
+        self._written_at = self._framed_at = float("-inf")
+        self._block_s = 0.0
+        self._sure_s = 0.0
+        self._before_s = 0.0
+        self._read_by = float("-inf")
+        self._reported_at = float("-inf")
+
+    def on_written(self, frame: Frame, now: float) -> None:
+        """Record a written frame."""
+        awake_at = max(now, self.block_until) if now <= self.awake_until else float("inf")
+        self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
+        self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_INTERVAL_S, self.block_until))
+        self._written_at = now
+        if not isinstance(frame, Reset):
+            self._framed_at = now
+        self._block_s = self.longest_block_s(frame)
+        self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
+
+    def longest_block_s(self, frame: Frame) -> float:
+        """Return the maximum block of a frame, as expected and as this car has shown."""
+        expected_s, kind = self.profile.block_s(frame), blocking_kind(frame)
+        return expected_s if kind is None else max(expected_s, self.learned.block_s(kind, expected_s))
+
+    def _surely_blocks(self, frame: Frame) -> bool:
+        """Return True if the block of this frame is certain on this platform. Other blocks are only possible.
+
+        docs/reference/protocol.md#blocking-times has the certain ones.
+        """
+        if isinstance(frame, General):
+            slow = frame.servo is None or frame.servo in FRONT_SERVO
+            return slow and not (frame.fan and self.profile.kind is Platform.UNKNOWN)
+        return not isinstance(frame, ArmSet)
+
+    def on_report(self, at: float) -> None:
+        """Record a report of mode 0: after it the car reads the waiting frames."""
+        self._reported_at = at
+        if at >= self._written_at + FLIGHT_S:  # an earlier report was under way when the frame was written
+            self._read_by = min(self._read_by, at + self._before_s)
+
+    @property
+    def _interval_s(self) -> float:
+        """The interval of the reports, without the ranging, as far as it is known."""
+        expected_s, no_echo = self.profile.interval_s, self.learned.no_echo
+        if no_echo.is_known:  # without an echo a report takes longer by the whole ranging
+            expected_s = min(expected_s, no_echo.median_s - self.profile.ranging_s)
+        return self.learned.interval_s(expected_s)
+
+    @property
+    def awake_until(self) -> float:
+        """Return until when the car reads a frame at once, as its last report shows; -inf if nothing shows it."""
+        if not (self.learned.echo.is_known or self.learned.no_echo.is_known):
+            return float("-inf")  # it may range again at once
+        return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
+
+    def named_at(self, frame: Frame) -> float:
+        """Return the earliest time for this frame if it is a named one: behind another frame it must not be read."""
+        return float("-inf") if isinstance(frame, General | Reset) else self._framed_at + NAMED_GAP_S
+
+    @property
+    def written_at(self) -> float:
+        """Return when the last frame was written; -inf if none was."""
+        return self._written_at
+
+    @property
+    def flight_until(self) -> float:
+        """Return the end of the last frame's flight."""
+        return self._written_at + max(FLIGHT_S, self._block_s)
+
+    @property
+    def buffer_until(self) -> float:
+        """Return until when the last frame may be unread, or the next frame may join it in the car's buffer."""
+        # A longer block does not matter: after the car has read the frame, the next one is alone in the buffer.
+        return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_INTERVAL_S))
+
+    @property
+    def block_from(self) -> float:
+        """Return the earliest end of the last frame's block."""
+        return self._written_at + self._block_s
+
+    @property
+    def block_until(self) -> float:
+        """Return the latest end of the last frame's block."""
+        return self._read_by + self._block_s
+
+    def blocked_at(self, now: float) -> bool:
+        """Return True if the car is certainly busy with our last frame, and not ranging with that frame unread."""
+        running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
+        return running and self._before_s == 0.0 and self.clear_at(now)
+
+    def clear_at(self, now: float) -> bool:
+        """Return True if the car will have read all our frames before the next one is sent."""
+        return self._read_by <= max(now, self.ready_at(Gate.FLIGHT))
+
+    def ready_at(self, gate: Gate) -> float:
+        """Return the earliest time for a frame that waits for `gate`."""
+        match gate:
+            case Gate.NOTHING:
+                return float("-inf")
+            case Gate.FLIGHT:
+                return self._written_at + max(FLIGHT_S, self._sure_s)  # a merely possible block does not delay it
+            case Gate.ALONE:
+                return self.buffer_until
+
+    def act_at(self, frame: Frame) -> float:
+        """Return the earliest time for the frame of a one-shot."""
+        if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
+            return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
+        return max(self.flight_until, self.named_at(frame))
+
+    def open_at(self, now: float, *, can_show: bool) -> float:
+        """Return when a mode may be opened."""
+        # On a car that is awake the block begins at once, and the end of the mode can be shown. A car that cannot show
+        # it need not wait, and no other waits for long.
+        alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
+        if alone <= self.awake_until or not can_show:
+            return alone
+        return max(now, self.buffer_until + AWAKE_WAIT_S)
+
+    @property
+    def repeat_at(self) -> float:
+        """Return the earliest time for a repetition: `REPEAT_INTERVAL_S` after the last frame, and after its block."""
+        return max(self._written_at + REPEAT_INTERVAL_S, self.flight_until)

@@ -1,0 +1,33 @@
+"""The events of a decoder, one value each.
+
+`Sensors`, the event of a sensors frame, is in `sensors`; what is no reading is an event of every family.
+Everything that depends on the platform is in `platforms`.
+"""
+
+from dataclasses import dataclass
+
+from gateway.control.driver import Echo, Rejected, TextLine
+from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
+
+
+@dataclass(frozen=True, slots=True)
+class ArmReading:
+    """Six joints, 0..180 degrees; None where the joint was rejected. `at` is the time of the last byte."""
+
+    raw: bytes
+    at: float
+    joint_deg: tuple[float | None, ...]
+    rejects: tuple[Reject, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReading:
+    """Gyro and acceleration x, y, z in raw counts (the table gives no unit). `at` is the time of the last byte."""
+
+    raw: bytes
+    at: float
+    gyro: tuple[float, float, float]
+    accel: tuple[float, float, float]
+
+
+Event = Sensors | ArmReading | ImuReading | Echo | Rejected | TextLine

@@ -1,0 +1,450 @@
+"""Carries out the stops of one car: sends each again until the car shows it, or cannot show it. Pure.
+
+`Executor` writes the frames. `CarMonitor` reports what the car's readings show.
+"""
+
+from typing import Final
+
+from gateway.control.command_log import CommandLog, Pending
+from gateway.control.commands import SetMode
+from gateway.control.trust import STOP_GOES_ON, TrustEvent
+from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.pacing import FLIGHT_S
+from gateway.drivers.yahboom.protocol.frames import ModeClose
+from gateway.drivers.yahboom.protocol.platforms import StopStyle
+from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
+from gateway.drivers.yahboom.stop_renewal import StopRenewal
+from gateway.drivers.yahboom.stops import sequences, stopping
+from gateway.drivers.yahboom.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
+from gateway.drivers.yahboom.stops.sequences import Gate, StopSequence
+from gateway.drivers.yahboom.stops.stopping import StopInProgress
+from schemas.limits import SHUTDOWN_S
+from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Platform, Reason, Shows
+
+DOUBTED_PROBES: Final = 2
+"""Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
+
+
+_PROBED: Final = (Finding.REPORT, Finding.PAUSE, Finding.CONTROL)
+"""The reports after which a stop that the car may still show goes on with its next frame."""
+
+
+class StopExecutor:
+    """The stop in progress, if any, and the renewals after it."""
+
+    def __init__(self, model: CarModel, log: CommandLog) -> None:
+        self.model = model
+        self.running: StopInProgress | None = None
+        self.renewal = StopRenewal(model)
+        self.shutting_down = False
+        self.not_stopped = ""
+        """Why the gateway ends without a stop of the car; empty if the car is stopped."""
+        self._log = log
+        self._shutdown_until = float("inf")
+
+    # ------------------------------------------------------------------ begin
+
+    def soft(self, now: float) -> StopSequence:
+        """Return the stop that ends a drive."""
+        return stopping.soft(self.model.for_stop(now))
+
+    def full(self, now: float) -> StopSequence:
+        """Return the stop that `stop`, `estop` and a shutdown send."""
+        return stopping.full(self.model.for_stop(now))
+
+    def begin(self, sequence: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
+        """Begin a stop, or join the running one if that is no weaker."""
+        model = self.model
+        model.believed.repeat = False
+        joining = [pending] if pending is not None else []
+        running = self.running
+        if running is None or running.sequence.rank < sequence.rank or running.at_rest:
+            self._start(sequence, why, now, [*(running.commands if running is not None else ()), *joining])
+            return
+        running.commands.extend(joining)
+        if joining:
+            running.repeats = False
+        if why is FrameOrigin.SHUTDOWN:
+            running.why = why
+        # A new command need not wait for the next try, but only after this silence the next frame is certain.
+        if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
+            running.begin_try(self.full(now), now)
+        if running.first_at is not None and pending is not None:
+            self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
+
+    def begin_full(self, now: float) -> None:
+        """Begin a full stop, unless the link is down or the gateway shuts down."""
+        if self.model.link_open and not self.shutting_down:
+            self.begin(self.full(now), FrameOrigin.STOP, now)
+
+    def stop_again(self, now: float) -> None:
+        """Send general stops to a car that had shown that it stands, and is silent now."""
+        self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
+        assert self.running is not None
+        self.running.at_rest = True
+
+    def leave_open_mode(self, now: float) -> None:
+        """Send `MODE00` to a car whose readings show an open mode, and that got only general stops until now."""
+        running = self.running
+        got_mode_frame = running is not None and any(
+            isinstance(step.frame, ModeClose) for step in running.sequence.steps
+        )
+        if not got_mode_frame and not self.shutting_down:
+            self.recover(
+                now, f"{self.model.name} sends readings of a mode other than 0, which general stops do not end"
+            )
+
+    def recover(self, now: float, words: str) -> None:
+        """Bring the car to a known state. Commands that wait for a running stop wait for this one."""
+        before = self.running
+        why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
+        self.model.learn(TrustEvent.DOUBTED, now, words)
+        self.begin_recovery(why, now, commands)
+
+    def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
+        """Begin the recovery sequence, in place of any running stop."""
+        self._start(stopping.recovery(self.model.for_stop(now)), why, now, commands)
+
+    def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
+        model = self.model
+        worst_s = stopping.worst_s(sequence, model.for_stop(now), model.pacing, now)
+        timeout_s = min(worst_s, stopping.MAX_ANNOUNCED_WORST_S) + stopping.evidence_s(model.profile, model.learned)
+        self.running = StopInProgress(
+            sequence,
+            why,
+            now,
+            now,
+            commands,
+            worst_at=now + worst_s,
+            timeout_s=timeout_s,
+            reported_s=stopping.reported_s(model.profile, model.learned),
+            case=self._case(sequence),
+        )
+        model.evidence.begin_stop()
+        model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
+
+    def _case(self, sequence: StopSequence) -> StopCase:
+        """Return what this stop rests on if the car does not show it."""
+        model = self.model
+        if not model.profile.has_readings:
+            return StopCase.NO_READINGS
+        match model.stop_style:
+            case StopStyle.GENERAL if model.profile.kind is Platform.RASPBERRY_PI:
+                return StopCase.RASPBERRY_PI
+            case StopStyle.GENERAL:
+                return StopCase.UNKNOWN_PLATFORM
+            case _ if sequence.rank == sequences.SOFT.rank:
+                return StopCase.SOFT
+            case StopStyle.BOTH:
+                return StopCase.WRONG_PLATFORM
+            case _:
+                return StopCase.MANUAL if model.can_show else StopCase.NO_REACTION
+
+    def change_case(self) -> None:
+        """Judge the running stop by the profile that is in force now."""
+        if self.running is not None:
+            self.running.case = self._case(self.running.sequence)
+
+    # ------------------------------------------------------------------ link, shutdown
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail the commands of the running stop: the link is down."""
+        self.renewal.suspend()
+        running, self.running = self.running, None
+        words = (
+            f"NOT CONFIRMED: {self.model.name} became unreachable during the stop ({reason}). Look at the car. "
+            "The gateway stops it as soon as the link is back."
+        )
+        for pending in running.commands if running else ():
+            self._log.record(pending, Phase.FAILED, now, reason=cause, words=words)
+        if self.shutting_down and running is not None:
+            self._end_unstopped(f"is unreachable ({reason})", now)
+
+    def shut_down(self, now: float) -> None:
+        """Stop the car for the last time."""
+        self.shutting_down = True
+        self._shutdown_until = now + SHUTDOWN_S
+        if not self.model.link_open:
+            self._end_unstopped(f"is unreachable ({self.model.link_reason})", now)
+        elif not (self.model.at_rest and self.model.trust.shown) or self.running is not None:
+            self.begin(self.full(now), FrameOrigin.SHUTDOWN, now)
+
+    @property
+    def finished(self) -> bool:
+        """Return True after `shut_down` if the stop is over, or the car did not show it in time."""
+        return self.shutting_down and self.running is None
+
+    def is_shutdown_over(self, now: float) -> bool:
+        """Return True if the gateway waits no longer for the car to show the stop."""
+        return self.shutting_down and now >= self._shutdown_until
+
+    def give_up(self, running: StopInProgress, now: float) -> None:
+        """End without a stop that the car showed."""
+        self.running = None
+        self._end_unstopped("has not reacted to the stop", now)
+        for pending in running.commands:
+            self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self.not_stopped)
+
+    def _end_unstopped(self, why: str, now: float) -> None:
+        car = self.model.name
+        self.not_stopped = why
+        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
+
+    # ------------------------------------------------------------------ tries
+
+    def is_step_due(self, running: StopInProgress, now: float) -> bool:
+        """Return True if the next frame of the stop is due. After the last frame, wait for evidence."""
+        if self.model.evidence.settle(now):
+            self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
+            return False
+        if running.frames_sent:
+            self._await(running, now)
+            if self.running is not running or running.frames_sent:
+                return False
+        return now >= running.due_at(self.model.pacing)
+
+    def _await(self, running: StopInProgress, now: float) -> None:
+        """End a stop that the car cannot show. If the car can show it, and did not in time, send the stop again."""
+        case = self._ends_as_sent(running, now)
+        if case is StopCase.SOFT and self.model.is_deaf:
+            self._doubt_soft(running, now)
+            return
+        if case is not None:
+            self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
+            return
+        if self.model.evidence.settles_at is None and now >= max(running.next_try_at, self.model.pacing.flight_until):
+            self._try_again(running, now)
+
+    def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
+        """Return why the stop ends without evidence; None if the car may still show it."""
+        model = self.model
+        if running.at_rest or model.trust.state is CarTrust.UNHEARD:
+            return None
+        reported = running.report_at > running.last_at
+        is_time_up = now >= running.obeyed_at
+        if not running.frames_sent or not (is_time_up or reported):
+            return None
+        match running.case:
+            case StopCase.SOFT | StopCase.NO_READINGS:
+                return running.case if is_time_up else None
+            case StopCase.RASPBERRY_PI | StopCase.UNKNOWN_PLATFORM:
+                has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
+                if is_time_up and has_report:
+                    return running.case
+            case StopCase.WRONG_PLATFORM if reported and running.probes >= DOUBTED_PROBES:
+                return StopCase.WRONG_PLATFORM
+            case _:
+                pass
+        if is_time_up and model.believed.fan_may_run and model.profile.fan_silences:
+            return StopCase.FAN
+        if running.case in (StopCase.RASPBERRY_PI, StopCase.UNKNOWN_PLATFORM):
+            return None
+        if running.no_echo_at > running.closed_at:
+            return StopCase.NO_ECHO if model.can_show else StopCase.NO_REACTION
+        if running.case is StopCase.MANUAL or running.case is StopCase.NO_REACTION:
+            return StopCase.NO_REACTION if not model.can_show and running.report_at > running.try_at else None
+        return None
+
+    def _doubt_soft(self, running: StopInProgress, now: float) -> None:
+        """Go on with full stops after a soft one: the car has not reacted to the last full stop."""
+        what = (
+            "and has not reacted to the last stop" if self.model.missed_stop else "before it could show its last stop"
+        )
+        words = f"{self.model.name} was driven again, {what}"
+        for pending in running.commands:
+            self._log.record(pending, Phase.SENT, now, words=words, basis=Basis.SENT)
+        self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
+        assert self.running is not None
+        self.running.overdue = self.running.repeats = True  # the next drive need not wait for the evidence
+        self.model.learn(TrustEvent.NOT_SHOWN, now, words)
+
+    def _try_again(self, running: StopInProgress, now: float) -> None:
+        running.tries += 1
+        context = self.model.for_stop(now)
+        running.begin_try(stopping.soft(context) if running.at_rest else stopping.recovery(context), now)
+        self.model.evidence.tried_again()
+
+    def fail_late(self, running: StopInProgress, now: float) -> None:
+        """Fail the commands that have waited too long for evidence. The stop goes on."""
+        car = self.model.name
+        is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
+        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
+            self._finish_unknown(running, now)
+            return
+        goes_on = f"The gateway keeps stopping it.{self.model.silent_program}"
+        words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. {goes_on}"
+        waiting: list[Pending] = []
+        for pending in running.commands:
+            if now < pending.received_at + running.timeout_s:
+                waiting.append(pending)
+            else:
+                self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
+        running.commands[:] = waiting
+        if now >= running.gives_up_at and not running.overdue:
+            running.overdue = True
+            if self.model.mode.heard_at > running.began_at:
+                self.model.evidence.reacted_at = None
+                self.model.missed_stop = True
+                self.model.learned.doubted = self.model.learned.shows is Shows.YES
+                self.model.learn(TrustEvent.NOT_SHOWN, now)
+                self._log.log(Level.ERROR, "not_shown", words, now)
+            elif self.model.trust.state is not CarTrust.UNHEARD:
+                words = f"{car} may still be moving: silent since the stop began. {goes_on}"
+                self.model.learn(TrustEvent.SILENT, now, words)
+                self._log.log(Level.WARNING, "unheard", words, now)
+
+    def _is_new(self, running: StopInProgress) -> bool:
+        """Return True if the car reports in mode 0 since the stop, and was never seen to react to a frame."""
+        is_unknown = self.model.learned.shows is Shows.UNKNOWN
+        return is_unknown and running.report_at > running.began_at and self.model.is_heard
+
+    def _finish_unknown(self, running: StopInProgress, now: float) -> None:
+        """End a stop of a car that reports in mode 0, and that was never seen to react to a frame: as sent."""
+        words = EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.model.name)
+        self._finish(running, Basis.SENT, words, now, StopCase.NOT_KNOWN)
+
+    def end_doubt(self, now: float) -> None:
+        """End the doubt of a person about a car that has shown its stops before: a person says that it is fine."""
+        self.model.learned.forget_reactions()
+        if self.running is not None and self.running.overdue and self.model.trust.state is CarTrust.UNPROVEN:
+            self._finish_unknown(self.running, now)
+
+    def give_way(self, now: float) -> None:
+        """End a stop that the car has not shown yet: a new command takes the place of its repeats."""
+        running, self.running = self.running, None
+        words = f"{self.model.name} was commanded again before its readings could show the stop, which was sent"
+        for pending in running.commands if running is not None else ():
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+
+    # ------------------------------------------------------------------ evidence
+
+    def on_finding(self, finding: Finding, at: float, now: float) -> None:
+        """Apply what a reading of mode 0 shows to the running stop."""
+        running = self.running
+        if running is None or running.first_at is None:
+            return
+        evidence = self.model.evidence
+        if finding is not Finding.NOTHING and at > running.closed_at + FLIGHT_S and at > running.first_at + FLIGHT_S:
+            running.report_at = at
+            if at >= running.closed_at + evidence.close_s - EARLY_S > float("-inf"):
+                running.sent_all = True  # it is in mode 0, and reads
+        match finding:
+            case Finding.SHOWN:
+                self._finish(running, Basis.SHOWN, evidence.words, now)
+            case Finding.NO_ECHO if at > running.closed_at + evidence.close_s - EARLY_S:
+                running.without_echo += 1
+                if max(running.without_echo, evidence.without_echo) >= 2:
+                    running.no_echo_at = at
+            case Finding.LOST:
+                self._handle_loss(running, now)
+            case _:
+                pass
+        if finding is Finding.UNJUDGED:  # let the next interval be undisturbed, so that the rhythm can be learned
+            running.reported_s = stopping.reported_s(self.model.profile, self.model.learned, slowest=True)
+            if self.model.learned.echo.is_known:  # and it is another one now
+                next_s = at - running.last_at + stopping.SLOWEST_S + stopping.REPORT_MARGIN_S
+                running.reported_s = max(running.reported_s, next_s)
+        if self.running is running and running.frames_sent:
+            self._await(running, now)
+        # A probe counts only on a car that is awake, so directly after a report. If it must wait, let it wait for one.
+        is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
+        if self.running is running and finding in _PROBED and is_ready and self._may_probe(running):
+            running.probes += 1
+            is_control = finding is Finding.CONTROL
+            interval_s = self.model.evidence.interval_s
+            running.begin_try(sequences.control(interval_s) if is_control else sequences.PROBE, now)
+
+    def on_contact(self, now: float, words: str) -> None:
+        """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""
+        running = self.running
+        if running is None or running.at_rest:
+            self.recover(now, words)
+        else:
+            self._try_again(running, now)
+
+    def on_sleep(self, now: float) -> None:
+        """Stop the car first after a sleep of the computer. A stop from before goes on, with its next try at once."""
+        running = self.running
+        if running is not None and running.sequence.rank > sequences.SOFT.rank and not running.at_rest:
+            if running.frames_sent:
+                self._try_again(running, now)
+        elif running is not None or not self.shutting_down:
+            self.begin(self.full(now), FrameOrigin.STOP, now)
+
+    def _may_probe(self, running: StopInProgress) -> bool:
+        """Return True if the car could react to a `MODE00` now, and show it."""
+        if running.case is StopCase.WRONG_PLATFORM:
+            return running.frames_sent and running.probes < DOUBTED_PROBES
+        # The first frames of a stop always go out, unless the car is in mode 0 and reads.
+        return running.case is StopCase.MANUAL and self.model.can_show and running.sent_all
+
+    def _handle_loss(self, running: StopInProgress, now: float) -> None:
+        """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""
+        running.probes += 1
+        doubted = running.case is StopCase.WRONG_PLATFORM
+        if not doubted and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
+            self._try_again(running, now)
+            if running.sequence.is_recovery:
+                # The reports of a car that blocks may come by a timer. Then the block of the last frame may run still,
+                # and a `#` that arrives before its end is read as one string with the `MODE00` after it.
+                running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
+
+    def _finish(
+        self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL
+    ) -> None:
+        """End the stop: the car showed it, or cannot show it."""
+        model, shown = self.model, basis is Basis.SHOWN
+        self.running = None
+        recovered = model.trust.state in STOP_GOES_ON and not model.known
+        model.rest = case
+        model.cut_write = False
+        self.renewal.left_mode = model.left_at >= running.began_at
+        model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
+        if recovered:
+            how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
+            self._log.log(Level.INFO, "recovered", f"{model.name} {how}, mode manual", now)
+        if not shown:
+            self.renewal.restart(now)
+        phase, reason, evidence = (Phase.COMPLETE, "", (words,)) if shown else (Phase.SENT, words, ())
+        for pending in running.commands:
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, phase, now, words=reason, evidence=evidence, basis=basis)
+
+    # ------------------------------------------------------------------ times
+
+    def deadlines(self, running: StopInProgress, now: float) -> list[float]:
+        """Return when the running stop needs attention."""
+        times = self.timeouts(running)
+        if self.model.evidence.settles_at is not None:
+            times.append(self.model.evidence.settles_at)
+        elif running.frames_sent:
+            times.append(max(running.next_try_at, self.model.pacing.flight_until))
+        if running.frames_sent and running.obeyed_at > now:
+            times.append(running.obeyed_at)
+        if not running.frames_sent:
+            times.append(running.due_at(self.model.pacing))
+        return times
+
+    def timeouts(self, running: StopInProgress) -> list[float]:
+        """Return when the running stop, or a command that waits for it, fails."""
+        times = [pending.received_at + running.timeout_s for pending in running.commands]
+        if not running.overdue:
+            times.append(running.gives_up_at)
+        if self.shutting_down:
+            times.append(self._shutdown_until)
+        return times
+
+    def worst_s(self, now: float) -> float:
+        """Return the longest time until the motors are off if a stop is requested now and its frames arrive."""
+        sequence, running = self.full(now), self.running
+        if running is not None and running.sequence.rank >= sequence.rank:
+            return running.worst_s(now)
+        return stopping.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
+
+    def free_at(self, now: float) -> float:
+        """Return when the car can take a motion, as far as that is known."""
+        running, ready_at = self.running, self.model.ready_at
+        if running is None or running.sequence.rank == sequences.SOFT.rank:
+            return ready_at
+        return max(running.over_at(self.model.pacing, now), ready_at)

@@ -1,0 +1,80 @@
+"""Repeats the stop of a car at rest that has not shown it, because its frames may have been lost. Pure."""
+
+from typing import Final
+
+from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose
+from gateway.drivers.yahboom.stops import sequences
+from gateway.drivers.yahboom.stops.evidence import StopCase
+from gateway.drivers.yahboom.stops.sequences import STOP_FRAME, Gate
+
+RENEWAL_INTERVALS_S: Final = (2.2, 4.0, 6.0)
+"""Intervals between renewals. The last one repeats."""
+CLEARING_RENEWALS: Final = 4
+"""Maximum renewals by `MODE00` after one stop. `MODE00` beeps, so there are no more."""
+
+
+class StopRenewal:
+    """The schedule of renewals, and the frame of the next one."""
+
+    def __init__(self, model: CarModel) -> None:
+        self.left_mode = False
+        """True if the last stop left a mode, in which a general stop is ignored."""
+        self._model = model
+        self._count = 0
+        self._next_at = float("inf")
+        self._general_stop_follows = False
+        """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop follows alone."""
+
+    def suspend(self) -> None:
+        """Send no more renewals until the next `schedule`."""
+        self._next_at = float("inf")
+
+    def reset(self) -> None:
+        """Suspend the renewals, and begin with the shortest interval next time."""
+        self._count = 0
+        self.suspend()
+
+    def restart(self, now: float) -> None:
+        """Schedule the first renewal after a stop."""
+        self._count, self._general_stop_follows = 0, False
+        self.schedule(now)
+
+    def schedule(self, now: float) -> None:
+        """Schedule the next renewal."""
+        self._next_at = now + RENEWAL_INTERVALS_S[min(self._count, len(RENEWAL_INTERVALS_S) - 1)]
+        self._count += 1
+
+    @property
+    def due_at(self) -> float:
+        """Return when the next frame of a renewal is due; inf if never."""
+        if self._general_stop_follows:
+            return self._model.pacing.written_at + sequences.REPEAT_INTERVAL_S
+        # In one string behind a servo frame `MODE00` would open a mode: its digits are read out of that frame.
+        return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
+
+    @property
+    def is_full_stop(self) -> bool:
+        """Return True if the whole stop is sent again: the car may still be in the mode that it should leave."""
+        return not self._general_stop_follows and self._model.rest is StopCase.FAN and self.left_mode
+
+    def take(self, now: float) -> Frame:
+        """Return the frame that is due, and schedule the next one."""
+        if self._general_stop_follows:
+            self._general_stop_follows = False
+            return STOP_FRAME
+        self._general_stop_follows = self._clears
+        self.schedule(now)
+        return ModeClose() if self._general_stop_follows else STOP_FRAME
+
+    @property
+    def _clears(self) -> bool:
+        """Return True if the next renewal is a `MODE00`.
+
+        A general stop does nothing to a car that keeps half a named frame (docs/reference/protocol.md#hazards).
+        `MODE00` clears it.
+        """
+        model = self._model
+        if model.profile.refusal(ModeClose()) is not None:
+            return False  # some programs end at a named frame
+        return model.rest in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS

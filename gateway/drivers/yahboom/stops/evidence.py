@@ -1,0 +1,657 @@
+"""Detects from the car's readings whether a stop arrived; a table lists the cases. Pure.
+
+The car acknowledges nothing. All that a gateway has is the frames that it wrote, and the moments at which readings
+arrived. This essay is about what those moments can prove, what they cannot, and what is still doubtful.
+
+*Why pauses.* On most cars `MODE00` blocks the program for about a second: it beeps. Meanwhile the car sends nothing, so
+the next report comes late by just that second. That lateness is the acknowledgement which the protocol lacks. The
+general stop does not block, so no reading ever shows it. That is why a stop that wants to be shown ends with a `MODE00`
+alone, and why no other frame of ours may follow it: a general stop written after the evidence could be flipped into a
+motion by the link, and nobody would look again. The frame that is judged is the last one.
+
+*Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
+(docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
+another. So nothing here compares a car with a constant: `Learned` has its own rhythm and its own blocks, and a pause
+is an interval that is longer than the rhythm by just the block. A car whose reports come by a timer never pauses. For
+it nothing is ever shown here, which costs it nothing else: stops end as `sent`, and the words say why.
+
+*Why not one pause.* A link that swallows both `MODE00` and the report after it leaves a gap, too: two intervals instead
+of one. If the interval is about as long as the block, that gap equals a pause. Half of all outages of 0.6 s around a
+stop do that on a car that reports every second. So two pauses are needed, each around a `MODE00` of its own. If one of
+them is in doubt, three are: if it is longer than it should be (a slow link, or a report that the link held), or if it
+differs from the block by more than the intervals have spread so far, and these are few.
+
+*Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
+`MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length
+tells. Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop a
+third of an interval after a report. It does not block, so the next report must come on time. A link that was mute from
+a `MODE00` until the report after it is mute for so long again. So it hides this one for certain, however the intervals
+spread. If the report is missing or damaged, the pauses were the link's.
+
+*Why silence follows.* A link that holds reports makes gaps of any length. But the held report comes late, and the next
+one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
+such a report would have come.
+
+*Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. On a car that was
+seen to block, that needs one report only, but the report must begin after `MODE00` was obeyed, and come before a
+`MODE00` that lost its digits would let one through: without its digits the frame opens mode 0 with the motors on, which
+blocks longer. A silent mode shows nothing by its silence. If it was opened from a shown rest, the end of the silence
+shows that it was left.
+
+*What a car can forge.* Its reports have no checksum. A damaged frame of another mode can look like mode 0, so a report
+counts only after a silence that no such mode has. The start of one frame and the end of another can join. The decoder
+ends a frame at a silence, and damage of any kind ends the comparison of intervals.
+
+*What is still doubtful.* A link that flips bits can turn the judged `MODE00` into another frame that blocks as long; no
+such frame is known. A car that pauses by itself just when it should, twice, would be believed. And a half-duplex link
+whose mute time changes from write to write can pass the control by chance.
+
+The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+from gateway.drivers.yahboom.estimate.learned import SAME_S, Learned, Rhythm
+from gateway.drivers.yahboom.protocol.modes import candidate_modes
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.protocol.timing import FRAME_S
+from schemas.words import Blocking, Mode, Shows
+
+SETTLED_SHARE: Final = 0.6
+SETTLED_S: Final = 0.8
+"""Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. A reporting mode
+sends 20 frames a second; a damaged one that looks like mode 0 has no silence before it."""
+FASTEST_S: Final = 0.3
+"""Interval of the fastest car, until that of the car is known."""
+BUNCHED_SHARE: Final = 0.3
+BUNCHED_S: Final = 0.4
+"""Maximum interval of reports that the link has delayed: this share of the interval, at most this time."""
+EARLY_S: Final = 0.05
+"""How much earlier than the end of a block a report may seem to come."""
+WIRE_S: Final = 0.02
+"""Time from the end of a block to the report after it: less than the wire takes for a report of 41 bytes."""
+LATE_S: Final = 0.2
+"""Additional time of the report that shows the end of a mode, on a slow link. It counts as a pause only."""
+SHAPE_UNTIL_S: Final = 1.0
+"""Maximum time that readings of a mode go on after the `MODE00` that ends it."""
+LONGER_S: Final = 0.65
+"""Maximum by which a pause may be longer than the block. It is in doubt then."""
+PAUSES: Final = 2
+"""Number of pauses that show a stop in mode 0."""
+PAUSES_IN_DOUBT: Final = 3
+"""Number of pauses that are needed if one of them is in doubt."""
+MISFITS: Final = 2
+"""Number of intervals that fit nothing, after which the rhythm is looked at again without a `MODE00`."""
+SETTLING_S: Final = 0.25
+"""Minimum time without a reading after the last pause, before the pauses count."""
+SHAPES: Final = 2
+"""Number of consecutive readings with the shape of another mode that show that mode."""
+ROUND_TRIP_S: Final = 2.5
+"""Round trip of a slow link, from the second try on: the car may have sent earlier reports before `MODE00`."""
+READ_LATE_S: Final = 0.3
+"""Maximum time from a frame to a report that was under way before the car read the frame."""
+IN_FLIGHT_S: Final = 0.1
+"""Minimum time from a frame to a report that the car sent after it could have read the frame."""
+
+
+class StopCase(StrEnum):
+    """The basis of a stop, by what was stopped and what the car can report."""
+
+    LEFT_SHAPE = "left_shape"
+    LEFT_SILENT = "left_silent"
+    MANUAL = "manual"
+    NO_REACTION = "no_reaction"
+    NO_READINGS = "no_readings"
+    NO_ECHO = "no_echo"
+    FAN = "fan"
+    SOFT = "soft"
+    ACTED = "acted"
+    RASPBERRY_PI = "raspberry_pi"
+    UNKNOWN_PLATFORM = "unknown_platform"
+    WRONG_PLATFORM = "wrong_platform"
+    NOT_KNOWN = "not_known"
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceRow:
+    """One row of the table. `shown_by` is empty if the car cannot show the stop."""
+
+    stop: str
+    shown_by: str
+    otherwise: str
+    words: str = ""
+    """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
+
+
+EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
+    StopCase.LEFT_SHAPE: EvidenceRow(
+        "full, out of a mode in which the car reported",
+        "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
+        "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in "
+        "mode 0",
+        "the stop goes on",
+    ),
+    StopCase.LEFT_SILENT: EvidenceRow(
+        "full, out of a silent mode",
+        "the same, after the silence of the opening, when the mode was opened from a rest that was shown; else as in "
+        "mode 0",
+        "the stop goes on",
+    ),
+    StopCase.MANUAL: EvidenceRow(
+        "full or recovery, in mode 0 with a sonar echo",
+        "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
+        "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
+        "the stop goes on, and a command may take its place",
+    ),
+    StopCase.NO_REACTION: EvidenceRow(
+        "full or recovery, the reports of this car do not react to frames",
+        "",
+        "`sent` after a report; a general stop every 6 s",
+        "{car}'s reports do not react to frames: nothing shows that a stop arrived",
+    ),
+    StopCase.NO_READINGS: EvidenceRow(
+        "any, a car that sends no readings",
+        "",
+        "`sent`; a general stop every 6 s",
+        "{car} sends no readings: nothing shows that a stop arrived",
+    ),
+    StopCase.NO_ECHO: EvidenceRow(
+        "full or recovery, in mode 0 without an echo",
+        "",
+        "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
+        "{car} has no sonar echo, so its readings cannot show a stop now",
+    ),
+    StopCase.FAN: EvidenceRow(
+        "full or recovery, the fan runs (not Raspberry Pi)",
+        "",
+        "`sent`; the stop again every 6 s",
+        "{car} sends nothing while its fan runs",
+    ),
+    StopCase.SOFT: EvidenceRow(
+        "soft (a drive's end, or its sender lost)",
+        "",
+        "`sent`; a general stop every 6 s",
+        "readings do not show the end of a drive; `fleet stop {car}` checks it",
+    ),
+    StopCase.ACTED: EvidenceRow(
+        "none: a light, servo, whistle or LED frame at a rest that was shown",
+        "",
+        "`sent`; a general stop every 6 s",
+        "{car} got another frame after its confirmed stop; a link that loses bytes can turn it into a motion",
+    ),
+    StopCase.RASPBERRY_PI: EvidenceRow(
+        "any, Raspberry Pi",
+        "",
+        "`sent` after a report; a general stop every 6 s",
+        "a Raspberry Pi car never confirms a stop",
+    ),
+    StopCase.UNKNOWN_PLATFORM: EvidenceRow(
+        "any, platform unknown",
+        "",
+        "`sent` after a report; a general stop every 6 s",
+        "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
+    ),
+    StopCase.WRONG_PLATFORM: EvidenceRow(
+        "full or recovery, readings contradict the platform",
+        "as in mode 0",
+        "`sent` if it reports on in mode 0; then as without an echo",
+        "the readings of {car} contradict its platform, and nothing in them shows the stop",
+    ),
+    StopCase.NOT_KNOWN: EvidenceRow(
+        "full or recovery, it is not known yet whether the reports of this car react to frames",
+        "as in mode 0",
+        "the stop goes on until it has taken too long; then `sent`, and a general stop every 6 s",
+        "it is not known yet whether {car}'s reports show that a stop arrived",
+    ),
+}
+
+
+class Finding(StrEnum):
+    """The result of one reading, about the last `MODE00`."""
+
+    NOTHING = "nothing"
+    REPORT = "report"
+    """A report of mode 0 with an echo that judges no `MODE00`. The car can react to a `MODE00` now."""
+    UNJUDGED = "unjudged"
+    """The same, while the rhythm of the car is not known: a `MODE00` now would show nothing."""
+    PAUSE = "pause"
+    """A pause; more are needed."""
+    CONTROL = "control"
+    """A pause that a link could forge: the next frame must be one that does not block."""
+    SETTLING = "settling"
+    """The last pause that is needed. The stop is shown if no reading follows too early."""
+    LOST = "lost"
+    """Reports went on without a pause."""
+    NO_ECHO = "no_echo"
+    """A report of mode 0 without an echo."""
+    SHOWN = "shown"
+    """The car obeyed."""
+
+
+_NEVER: Final = float("-inf")
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """A frame that blocks the car: its kind, its maximum block, and when it was written."""
+
+    kind: Blocking | None
+    block_s: float
+    at: float
+
+
+@dataclass(slots=True)
+class StopEvidence:
+    """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
+
+    profile: Profile
+    learned: Learned = field(default_factory=Learned)
+    reacted_at: float | None = None
+    """When the car last reacted to a frame; None if never on this link, or not to the last stop."""
+    words: str = ""
+    """The evidence for `SHOWN`."""
+    settles_at: float | None = None
+    """When the pauses count, unless a reading comes before; None if they do not suffice."""
+    without_echo: int = 0
+    """Number of consecutive reports without an echo."""
+    found_out: bool = False
+    """True if the last reading made this car one that cannot show a stop, or gave it another rhythm."""
+    _last_at: float = _NEVER
+    """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
+    _foreign_at: float = _NEVER
+    """When the last frame arrived, whole or corrupted, that is no report of mode 0."""
+    _before: float | None = None
+    """When the last report with an echo arrived, if nothing else has arrived since."""
+    _before_no_echo: float | None = None
+    _pending: float | None = None
+    """When the last `MODE00` without a result was written."""
+    _delay_s: float | None = None
+    """The delay of the first report after that `MODE00`, if it is known."""
+    _delayed: int = 0
+    """Number of `MODE00` frames of this stop after which the first report was late, but not by the block."""
+    _pauses: int = 0
+    _pauses_needed: int = PAUSES
+    _unjudged: bool = False
+    """True if a frame was written after the `MODE00` that the next pause would judge."""
+    _controlled: bool = False
+    """True if a general frame of this stop did not delay a report."""
+    _blocking: list[_Block] = field(default_factory=list)
+    """The other frames that block, since the last report."""
+    _misfits: int = 0
+    """Number of intervals with a `MODE00` that neither were normal nor had a pause: this may be another program."""
+    _fast_before: bool = False
+    """True if the last bytes were a report with an echo, however soon it came."""
+    _general: bool = False
+    """True if a general frame that does not block was written since the last report."""
+    _window_s: float = 0.0
+    _shapes: int = 0
+    _shape_at: float | None = None
+    """When the last reading of another mode arrived, since the last motion or opening."""
+    _silent_mode: Mode | None = None
+    """The silent mode that was opened from a shown rest."""
+    _opened_at: float = _NEVER
+    """When the last mode was opened."""
+    _closed_at: float | None = None
+    """When the first `MODE00` since then was written; None if none was."""
+    _plain: bool = False
+    """True if no other frame was written before that `MODE00`."""
+
+    # ------------------------------------------------------------------ the car's own numbers
+
+    @property
+    def close_s(self) -> float:
+        """Return by how much `MODE00` delays this car's next report, s."""
+        return self.learned.close_s(self.profile.close_s)
+
+    @property
+    def _rhythm(self) -> Rhythm:
+        return self.learned.echo
+
+    @property
+    def interval_s(self) -> float:
+        """Return the interval of this car's reports with an echo, s."""
+        return self.learned.interval_s(self.profile.interval_s)
+
+    @property
+    def settled_s(self) -> float:
+        """Return the minimum silence before a mode-0 report that counts."""
+        return min(SETTLED_S, SETTLED_SHARE * self.learned.interval_s(FASTEST_S))
+
+    @property
+    def _left_s(self) -> float:
+        """Return the maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
+        latest_s = self.close_s + self.interval_s + self._rhythm.tolerance_s
+        return min(latest_s + EARLY_S, self.profile.reopened_s + WIRE_S)
+
+    @property
+    def settling_s(self) -> float:
+        """Return the time after the last pause in which a report that a link had held would be followed by another."""
+        return max(0.0, self.interval_s - self.close_s) + SETTLING_S
+
+    # ------------------------------------------------------------------ frames
+
+    def begin_link(self) -> None:
+        """Forget everything but what was learned: the link is new."""
+        self.reacted_at = None
+        self._last_at = self._foreign_at = _NEVER
+        self._window_s = 0.0
+        self.reset_times()
+        self.sent_motion()
+
+    def begin_stop(self) -> None:
+        """Prepare for another stop. Pauses of the one before stay, the control does not."""
+        self.settles_at = None
+        self._controlled = False
+        self._delayed = 0
+
+    def sent_motion(self) -> None:
+        """Drop the evidence: the car may drive."""
+        self._drop_pauses()
+        if self._pending is not None:  # nobody judges it any more, but it blocks the car
+            self._blocking.append(_Block(None, self.close_s, self._pending))
+        self._pending = self.settles_at = None
+        self._general = True
+        self._leave_nothing()
+
+    def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
+        """Record the opening of a mode. `shown`: the car had shown its rest before."""
+        self.sent_motion()
+        self._before = self._before_no_echo = None
+        self._opened_at = now
+        self._plain = True
+        self._silent_mode = mode if silent and shown else None
+
+    def sent_other(self) -> None:
+        """Record a frame that neither moves the car nor closes a mode."""
+        self._general = self._unjudged = True
+        self.settles_at = None
+        if self._closed_at is None:
+            self._plain = False
+
+    def blocked(self, kind: Blocking | None, block_s: float, now: float) -> None:
+        """Record a frame that blocks the car for at most so long: the next report comes later."""
+        if block_s > FRAME_S:
+            self._blocking.append(_Block(kind, block_s, now))
+
+    def closed(self, now: float, *, awake: bool) -> None:
+        """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly its block."""
+        self._pending = now if awake else None
+        if not awake:
+            self._blocking.append(_Block(None, self.close_s, now))  # this interval is no measure
+        self._delay_s = None
+        self._unjudged = False
+        self.settles_at = None
+        if self._closed_at is None:
+            self._closed_at = now
+        else:
+            self._plain = False
+
+    def tried_again(self) -> None:
+        """Allow for a slow link from now on."""
+        self._window_s = ROUND_TRIP_S
+
+    # ------------------------------------------------------------------ readings
+
+    def on_noise(self, at: float, *, damaged: bool = True) -> None:
+        """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
+        self._last_at = at
+        self._before = self._before_no_echo = self.settles_at = None
+        self._fast_before = False
+        if damaged:
+            self._foreign_at = at
+
+    def reset_times(self) -> None:
+        """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
+        self._before = self._before_no_echo = self._pending = self.settles_at = None
+        self._drop_pauses()
+
+    def is_settled(self, event: Sensors) -> bool:
+        """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
+        return event.at - self._foreign_at >= self.settled_s or Mode.MANUAL not in candidate_modes(event)
+
+    def on_reading(self, event: Sensors) -> Finding:
+        """Record a reading. Return what it shows."""
+        at, quiet_s = event.at, event.at - self._last_at
+        self._last_at = at
+        self.found_out = False
+        # A report that comes a normal interval after the last pause was not held back by the link.
+        on_time = self.settles_at is not None and quiet_s >= self.interval_s - self._rhythm.tolerance_s
+        if on_time and Mode.MANUAL in candidate_modes(event):
+            self._before, self._blocking, self._general = at if event.range_cm else None, [], False
+            self._fast_before = bool(event.range_cm)
+            return self._obeyed(at)
+        self.settles_at = None
+        if Mode.MANUAL not in candidate_modes(event):
+            self._other_mode(at)
+            return Finding.NOTHING
+        self._shapes = 0
+        if quiet_s < self.settled_s:
+            self._learn_faster(event, quiet_s)
+            self._before = self._before_no_echo = None
+            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * self.learned.interval_s(FASTEST_S)):
+                self._drop_pauses()
+            return Finding.NOTHING
+        self._fast_before = bool(event.range_cm)
+        if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
+            self._before = self._before_no_echo = None
+            return Finding.NOTHING
+        before, self._before = self._before, at if event.range_cm else None
+        before_no_echo, self._before_no_echo = self._before_no_echo, None if event.range_cm else at
+        blocking = self._blocking
+        # A frame that was written just before this report, or in the ranging before it, may be read after it.
+        read_late_s = READ_LATE_S + (0.0 if event.range_cm else self.profile.ranging_s)
+        self._blocking = [each for each in blocking if at - each.at < read_late_s]
+        general, self._general = self._general, False
+        self.without_echo = 0 if event.range_cm else self.without_echo + 1
+        within_s = self._left_s if event.range_cm else self._left_s + self.profile.ranging_s
+        left = self._left(at, quiet_s, within_s)
+        if left is Finding.SHOWN:
+            return self._obeyed(at)
+        if left is Finding.PAUSE and event.range_cm:
+            return self._left_late(at)
+        pending = self._pending
+        if not event.range_cm:
+            if before_no_echo is not None and pending is None and not blocking:
+                self.learned.add_interval(at - before_no_echo, echo=False)
+            if pending is not None and at > pending + self.close_s + self.profile.ranging_s:
+                self._pending = None  # it blocked this report or none
+            return Finding.NO_ECHO
+        if pending is None:
+            return self._without_mode_00(before, at, blocking, general=general)
+        if before is None:
+            if at <= pending + self.close_s - EARLY_S:
+                return Finding.NOTHING
+            self._pending = None
+            return self._report
+        if not self._rhythm.is_known:
+            if at > pending + self.close_s - EARLY_S:
+                self._pending = None
+            return Finding.UNJUDGED
+        return self._compare(before, pending, at, blocking)
+
+    def settle(self, now: float) -> bool:
+        """Return True if the pauses count from now on: no reading came just after them."""
+        if self.settles_at is None or now < self.settles_at:
+            return False
+        self.settles_at = None
+        self._obeyed(self._last_at)
+        return True
+
+    @property
+    def _report(self) -> Finding:
+        is_judged = self._rhythm.is_known and not (self._misfits >= MISFITS and self._rhythm.is_changing)
+        return Finding.REPORT if is_judged else Finding.UNJUDGED
+
+    def _without_mode_00(self, before: float | None, at: float, blocking: list[_Block], *, general: bool) -> Finding:
+        """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
+        if before is None:
+            if general:
+                self._drop_pauses()  # the control has shown damage instead of a report
+            return self._report
+        gap_s = at - before
+        if not blocking:
+            if general and self._rhythm.is_known:
+                self._controlled = self._rhythm.fits(gap_s)
+                if not self._controlled:
+                    self._drop_pauses()  # the link loses reports when it is written to
+                    return self._report
+            self._learn_interval(gap_s)
+        elif len(blocking) == 1 and (kind := blocking[0].kind) is not None and self._rhythm.is_known:
+            expected_s = blocking[0].block_s
+            delay_s = gap_s - self._rhythm.median_s
+            self.learned.add_delay(kind, delay_s, self.profile.reopened_s, controlled=True)
+            if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
+                self.learned.on_reaction(sure=True)
+                self.reacted_at = at
+            elif self._rhythm.fits(gap_s) and expected_s > 2 * self._rhythm.tolerance_s:
+                self.found_out = self.learned.on_no_reaction()
+        return self._report
+
+    def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
+        """Learn the rhythm of a car that reports faster than it did."""
+        if self._pending is not None and event.at > self._pending + self._left_s + ROUND_TRIP_S:
+            self._pending = None  # its block is over, and no report in the rhythm of before came to show it
+        clean = self._fast_before and self._pending is None and not self._blocking
+        self._fast_before = bool(event.range_cm)
+        if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:
+            self._learn_interval(quiet_s)
+
+    def _learn_interval(self, gap_s: float) -> None:
+        if self.learned.add_interval(gap_s, echo=True):
+            self.found_out = True
+            self._misfits = 0
+            self._drop_pauses()
+
+    def _compare(self, before: float, pending: float, at: float, blocking: list[_Block]) -> Finding:
+        """Judge the interval of two reports. `MODE00` was written at `pending`."""
+        gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
+        delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
+        blocked_s = sum(each.block_s for each in blocking)
+        # A block ends no sooner after its frame than it lasts: a longer delay is the link's.
+        is_possible = after_s > IN_FLIGHT_S and delay_s <= after_s + EARLY_S
+        if pending >= before and is_possible and not blocking:
+            self._delay_s = delay_s
+        if after_s <= close_s - EARLY_S:
+            return Finding.NOTHING
+        matches = -tolerance_s <= delay_s - close_s <= blocked_s + tolerance_s
+        longer = -tolerance_s <= delay_s - close_s <= LONGER_S
+        if close_s > 2 * tolerance_s and (matches or longer):
+            self._pending = None
+            # Few intervals do not show how far they spread. And nobody has judged an earlier `MODE00` that may have
+            # delayed this report.
+            seen_s = rhythm.seen_tolerance_s
+            is_close = -seen_s <= delay_s - close_s <= blocked_s + seen_s
+            if not is_close or any(each.kind is None for each in blocking):
+                self._pauses_needed = PAUSES_IN_DOUBT
+            return self._pause(at, delay_s, learn=not matches)
+        if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:
+            return Finding.NOTHING
+        self._pending = None
+        first_delay_s, self._delay_s = self._delay_s, None
+        if first_delay_s is not None and self._agrees(first_delay_s):
+            self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
+            return self._pause(at, first_delay_s)
+        # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
+        other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
+        # A delay that is no longer than this is none.
+        none_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
+        if abs(delay_s) > none_s:
+            self._drop_pauses()
+            self._misfits += 1
+            return Finding.UNJUDGED if self._misfits >= MISFITS else other
+        if first_delay_s is not None and abs(first_delay_s) > none_s:
+            return other
+        self._misfits = 0
+        self._drop_pauses()
+        if not blocking and rhythm.fits(gap_s):
+            self._learn_interval(gap_s)
+        if self.profile.close_s > 2 * tolerance_s:
+            self.found_out = self.learned.on_no_reaction() or self.found_out
+        return Finding.LOST
+
+    def _agrees(self, delay_s: float) -> bool:
+        """Count a delay other than the expected block. Return True if the last ones agree, with enough of this stop."""
+        self._delayed += 1
+        return self._add_close(delay_s) and self._delayed >= PAUSES
+
+    def _add_close(self, delay_s: float) -> bool:
+        """Learn from the delay after a `MODE00`. Return True if the last delays agree."""
+        kind, longest_s = Blocking.MODE_CLOSE, self.profile.reopened_s
+        return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
+
+    def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
+        """Count a pause. `learn`: it is not as long as expected, and may be the block of this car."""
+        self._pauses += 1
+        self.reacted_at = at
+        self._delay_s = None
+        self._misfits = 0
+        self.learned.on_reaction(sure=self._controlled or not self.learned.is_confusable(delay_s))
+        if learn:
+            self._add_close(delay_s)
+        if not self._controlled and self.learned.is_confusable(delay_s):
+            return Finding.CONTROL
+        if self._pauses < self._pauses_needed or self._unjudged:
+            return Finding.PAUSE
+        self.words = f"{self._pauses} pauses in its reports, each after MODE00"
+        self.settles_at = at + self.settling_s
+        return Finding.SETTLING
+
+    def _drop_pauses(self) -> None:
+        self._pauses, self._pauses_needed, self._controlled = 0, PAUSES, False
+
+    def _other_mode(self, at: float) -> None:
+        self._shapes += 1
+        self._foreign_at = at
+        self._before = self._before_no_echo = None
+        self._fast_before = False
+        self._drop_pauses()
+        if self._shapes >= SHAPES or self._shape_at is not None:
+            self._shape_at = at
+            self._silent_mode = None
+
+    def _left(self, at: float, quiet_s: float, within_s: float) -> Finding:
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode of the car, PAUSE if it is late."""
+        closed_at = self._closed_at
+        shape_at, silent = self._shape_at, self._silent_mode
+        if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
+            return Finding.NOTHING
+        opening_s = self.profile.shortest_opening_s
+        # Opening alone blocks for so long. During it a slow link delivers older reports: less silence is no evidence.
+        earliest_at = self._opened_at + opening_s + self.close_s - EARLY_S
+        if silent is not None and (quiet_s < opening_s - LATE_S or at < earliest_at):
+            return Finding.NOTHING
+        self._shape_at = self._silent_mode = None
+        if not self._plain or at > closed_at + within_s + LATE_S:
+            return Finding.NOTHING
+        if silent is None and (shape_at is None or shape_at > closed_at + SHAPE_UNTIL_S):
+            return Finding.NOTHING
+        mode = "the mode that it reported" if silent is None else silent
+        self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
+        # On a car that was never seen to block, a report may come in the middle of a block, with the motors on.
+        is_judged = at <= closed_at + within_s and not self._unjudged and self.learned.shows is Shows.YES
+        return Finding.SHOWN if is_judged else Finding.PAUSE
+
+    def _left_late(self, at: float) -> Finding:
+        self.reacted_at = at
+        self._pending = None
+        self._drop_pauses()
+        self._pauses = 1
+        return Finding.PAUSE
+
+    def _obeyed(self, at: float) -> Finding:
+        self.reacted_at = at
+        self._pending = None
+        self.settles_at = None
+        self._drop_pauses()
+        self._window_s = 0.0
+        self._leave_nothing()
+        self.learned.on_shown()
+        return Finding.SHOWN
+
+    def _leave_nothing(self) -> None:
+        self._shapes = 0
+        self._shape_at = self._silent_mode = self._closed_at = None
+        self._plain = False

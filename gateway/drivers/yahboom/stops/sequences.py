@@ -1,0 +1,160 @@
+"""The stop sequences as tables of frames and times, by docs/reference/protocol.md#stops. No state."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Reset
+from gateway.drivers.yahboom.protocol.timing import COLOR_S, FRAME_S, RECOVERY_SILENCE_S
+from schemas.words import Motion
+
+REPEAT_INTERVAL_S: Final = 1.1
+"""Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
+STOP_REPORT_TIMEOUT_S: Final = 4.5
+"""Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
+# On the STM32 a named frame that arrives while a report is sent lies over a general frame that was not read yet, and
+# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one
+# report of 48 ms.
+NAMED_GAP_S: Final = 0.13
+"""Minimum time from any frame to a named one."""
+# While the car may still show that it left its mode, a general stop would follow the evidence unjudged. A `MODE00`
+# that lost its digits blocks for 2.0 s or more, so an earlier general stop would not be read earlier.
+JUDGED_S: Final = 2.3
+"""Time from `MODE00` to the general stop if the car was in another mode than 0."""
+
+
+class Gate(IntEnum):
+    """The condition for writing a frame."""
+
+    NOTHING = 0
+    FLIGHT = 1
+    """No frame of ours is in flight."""
+    ALONE = 2
+    """No frame of ours is in flight or in the car's buffer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One frame of a sequence. `after_s`: the minimum time since the previous frame was written, or the try began."""
+
+    frame: Frame
+    gate: Gate = Gate.NOTHING
+    after_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StopSequence:
+    """A way to stop. `rank`: only a sequence of a higher rank replaces the running one."""
+
+    name: str
+    rank: int
+    steps: tuple[Step, ...]
+
+    @property
+    def length_s(self) -> float:
+        """Return the minimum time from the first frame to the last, s."""
+        return sum(step.after_s for step in self.steps)
+
+    @property
+    def is_recovery(self) -> bool:
+        """Return True if it brings a car in an unknown state to rest by a lone `#` and `MODE00`."""
+        return self.name == RECOVERY.name
+
+
+STOP_FRAME: Final = General(Motion.STOP)
+_MANUAL: Final = ModeClose()
+
+# docs/reference/protocol.md#stops, stopping, soft
+SOFT: Final = StopSequence(
+    "soft", 1, (Step(STOP_FRAME, Gate.FLIGHT), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
+)
+
+# docs/reference/protocol.md#stops, stopping, full
+FULL: Final = StopSequence(
+    "full", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
+)
+
+# The same out of another mode than 0, in which a general stop is ignored.
+FULL_MODE: Final = StopSequence(
+    "full_mode", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=JUDGED_S))
+)
+
+# The same if a frame of ours may be unread. Behind that frame the car would read `MODE00` at the wrong place, so it
+# waits. The general stop does not wait: behind an unread frame it is lost without harm, and mostly there is none.
+FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(STOP_FRAME, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
+
+# docs/reference/protocol.md#stops, general stops only
+_GENERAL_STEPS: Final = (
+    Step(STOP_FRAME, Gate.FLIGHT),
+    Step(STOP_FRAME, after_s=FRAME_S),
+    Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
+)
+GENERAL_SOFT: Final = StopSequence("general_soft", 1, _GENERAL_STEPS)
+GENERAL: Final = StopSequence("general", 2, _GENERAL_STEPS)
+
+# docs/reference/protocol.md#stops, recovery
+RECOVERY: Final = StopSequence(
+    "recovery",
+    3,
+    (
+        Step(Reset()),
+        Step(_MANUAL, after_s=0.05),
+        Step(_MANUAL, after_s=RECOVERY_SILENCE_S - 0.05),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
+    ),
+)
+
+# docs/reference/protocol.md#stops, readings contradict the platform
+BOTH: Final = StopSequence(
+    "both",
+    3,
+    (
+        Step(STOP_FRAME, Gate.FLIGHT),
+        Step(_MANUAL, after_s=NAMED_GAP_S),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
+        Step(_MANUAL, after_s=RECOVERY_SILENCE_S - REPEAT_INTERVAL_S - NAMED_GAP_S),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
+    ),
+)
+
+# The same if mode 0 is certain. General stops then stop every platform, even behind an unread frame of ours.
+# `MODE00` comes last and alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
+BOTH_MANUAL: Final = StopSequence(
+    "both_manual",
+    3,
+    (
+        Step(STOP_FRAME, Gate.FLIGHT),
+        Step(STOP_FRAME, after_s=FRAME_S),
+        Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
+        Step(_MANUAL, Gate.ALONE, after_s=REPEAT_INTERVAL_S),
+        Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
+    ),
+)
+
+# Tests whether a car in mode 0 receives frames: if so, its reports pause for the block of `MODE00`. Nothing follows
+# it, so the frame that is judged is the last one.
+PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE),))
+
+CONTROL_SHARE: Final = 0.35
+"""Part of an interval after which the control is written."""
+
+
+def control(interval_s: float) -> StopSequence:
+    """Return the test whether the link loses reports when it is written to: this frame does not block.
+
+    It comes later after a report than the `MODE00` that it controls. A mute time that hid a report from then until the
+    next one is due hides that one, too, however the intervals spread.
+    """
+    return StopSequence("control", 3, (Step(STOP_FRAME, Gate.FLIGHT, after_s=CONTROL_SHARE * interval_s),))
+
+
+def clearing(color: ColorLed) -> StopSequence:
+    """Return a recovery that also clears a string which begins with `4WD,`: only a named frame of its own kind does.
+
+    See docs/reference/protocol.md#hazards. A PTZ frame would clear it, too, but moves a servo.
+    """
+    reset, manual, last, stop = RECOVERY.steps
+    color_step = Step(color, after_s=last.after_s)
+    # The color frame may wait for a ranging before it is read. `MODE00` must not join it in the buffer.
+    last = Step(_MANUAL, after_s=REPEAT_INTERVAL_S + COLOR_S)
+    return StopSequence(RECOVERY.name, RECOVERY.rank, (reset, manual, color_step, last, stop))

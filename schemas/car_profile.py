@@ -1,0 +1,62 @@
+"""What cars of one platform can do, as their driver describes it. Pure; `gateway.drivers` has the profiles."""
+
+from typing import Protocol
+
+from schemas.words import Light, Mode, ServoAction
+
+
+class CarProfile(Protocol):
+    """What cars of one kind can do. One object for each name of a platform."""
+
+    def __hash__(self) -> int:
+        """Profiles are values: the same for the same name."""
+
+    @property
+    def name(self) -> str:
+        """The text in the fleet file, with its options: `arduino+arm`."""
+
+    @property
+    def capabilities(self) -> frozenset[str]:
+        """The verbs that the car takes, and parts such as `arm`, `imu`, `servo_vertical`."""
+
+    @property
+    def modes(self) -> frozenset[Mode]:
+        """The modes that the car can be brought into. Every car has `Mode.MANUAL`."""
+
+    @property
+    def silent_modes(self) -> frozenset[Mode]:
+        """The modes in which the car sends no readings."""
+
+    @property
+    def possible_modes(self) -> frozenset[Mode]:
+        """The modes that the car may be in, whoever opened them."""
+
+    @property
+    def lights(self) -> frozenset[Light]:
+        """The colors of its light."""
+
+    @property
+    def servos(self) -> frozenset[ServoAction]:
+        """The steps of its servos."""
+
+    @property
+    def has_readings(self) -> bool:
+        """False if the car never sends a reading."""
+
+    @property
+    def cells(self) -> int:
+        """The number of cells of its battery."""
+
+    @property
+    def dead_man_s(self) -> float | None:
+        """The time after which the car stops by itself if nothing drives it; None if it drives on."""
+
+    @property
+    def not_observed(self) -> tuple[str, ...]:
+        """What was only read or assumed about such cars, for a person. Empty if all was observed."""
+
+    def measurable(self, mode: Mode) -> frozenset[str]:
+        """Return everything that such a car can measure in this mode: `range`, `battery`, `line`, `wheels`."""
+
+    def why_lacking(self, capability: str) -> str | None:
+        """Return why the car lacks a capability, for a person. None if it has it, or if every car has it."""
