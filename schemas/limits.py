@@ -15,7 +15,7 @@ MAX_QUEUE_TIME_S: Final = 15.0
 nothing (`stopping.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
 MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
 """Maximum time for the evidence of a stop, in addition to its announced worst case: four intervals of the slowest car,
-one every 3 s with the longest `MODE00` (`stopping.SLOWEST_S`)."""
+one every 3 s with the longest `MODE00` (`stopping.SLOWEST_S`). A car of 2.5 s or less has time for five."""
 # Without the pause the next sample of a held joystick would restart the car 50 ms after another person's stop.
 STREAM_PAUSE_S: Final = 0.5
 """Minimum pause of a drive stream after a stop. A release ends the pause at once."""

@@ -16,7 +16,7 @@ from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
 from gateway.control import battery
 from gateway.control.controller import Controller
-from gateway.control.driver import Claims, Driver, Event, Fields
+from gateway.control.driver import Driver, DriverClaims, Event, Fields
 from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.link_health import LinkHealth
 from schemas import bus, keys, messages, topics
@@ -279,7 +279,7 @@ class CarPublisher:
                     yield
 
 
-def _fill_findings(message: pb.Health, model: Claims) -> None:
+def _fill_findings(message: pb.Health, model: DriverClaims) -> None:
     findings = model.findings
     message.platform_evidence.extend(findings.platform_evidence)
     message.platform_contradictions.extend(findings.platform_contradictions)

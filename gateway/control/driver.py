@@ -5,7 +5,7 @@ It decides when a frame may be written, how the car is stopped, and what may be 
 else is the gateway's: who may command the car, the queue, the records, the link, the bus.
 
 The two meet in three places. `Desk` is what the gateway shares with its driver: the queue of commands and the log.
-`Claims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls `poll`,
+`DriverClaims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls `poll`,
 writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more than one
 frame in flight.
 
@@ -28,6 +28,7 @@ from schemas.words import (
     Basis,
     Cause,
     FrameOrigin,
+    Level,
     Mode,
     Motion,
     Motors,
@@ -37,6 +38,9 @@ from schemas.words import (
     Verdict,
 )
 
+STALL_S: Final = 0.5
+"""Maximum gap of the loop during a held motion. After a longer one it stops the car
+(docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
 """Report that a drive has waited if its frame goes out later than this."""
 
@@ -148,7 +152,7 @@ class Findings:
     """Other fields of fleet.v1.Health."""
 
 
-class Claims(Protocol):
+class DriverClaims(Protocol):
     """What may be said of the car now. A gateway publishes it, and refuses or delays commands by it."""
 
     name: str
@@ -255,7 +259,7 @@ class Driver(ABC):
 
     @property
     @abstractmethod
-    def model(self) -> Claims:
+    def model(self) -> DriverClaims:
         """What is claimed of the car."""
 
     @property
@@ -316,13 +320,29 @@ class Driver(ABC):
     def tick(self, now: float) -> None:
         """Check for silence. The gateway calls it a few times a second."""
 
-    @abstractmethod
     def on_stall(self, gap_s: float, now: float) -> None:
-        """Handle a gap of the loop."""
+        """Stop a driven car after a gap of the loop."""
+        if gap_s > STALL_S and self.queue.held is not None:
+            words = f"{self.desk.car} is stopped: its gateway stalled for {gap_s:.1f} s during a drive"
+            self.desk.log.log(Level.ERROR, "stalled", words, now)
+            self.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
-    @abstractmethod
     def on_sleep(self, slept_s: float, now: float) -> None:
-        """Handle a sleep of the computer: stop the car first, begin nothing again."""
+        """Stop the car first after a sleep of the computer, unless it has shown that it stands. Begin nothing again."""
+        model, car = self.model, self.desk.car
+        stands = model.at_rest and model.trust.shown and not self.is_stopping
+        then = f"{car} stood before, and stands" if stands else f"{car} is stopped first"
+        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
+        self.desk.log.log(Level.WARNING, "slept", words, now)
+        self.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
+        self.senders.halt(now)  # a joystick that is still pushed restarts no car
+        if model.link_open and not stands:
+            self.stop_after_sleep(now)
+
+    def stop_after_sleep(self, now: float) -> None:
+        """Stop the car. A stop from before the sleep goes on."""
+        if not self.shutting_down or self.is_stopping:
+            self.stop(FrameOrigin.STOP, now)
 
     # ------------------------------------------------------------------ frames out
 

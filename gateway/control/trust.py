@@ -67,6 +67,9 @@ TRANSITIONS: Final[dict[tuple[CarTrust, TrustEvent], CarTrust]] = {
 STOP_GOES_ON: Final = frozenset({_T.RECOVERING, _T.STOPPING, _T.UNHEARD, _T.UNPROVEN})
 """States in which the gateway sends stops until the car shows one."""
 
+KNOWN: Final = frozenset({_T.STOPPING, _T.STOPPED, _T.DRIVING, _T.IN_MODE})
+"""States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
+
 _MOTORS: Final = {
     _T.UNKNOWN: Motors.UNKNOWN,
     _T.RECOVERING: Motors.UNKNOWN,

@@ -9,7 +9,7 @@ from typing import Any, Final
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog
 from gateway.control.driver import Findings, Outputs
-from gateway.control.trust import TrustEvent, TrustState
+from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
@@ -24,8 +24,6 @@ from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Motors
 
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
-KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
-"""States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
 
 
 @dataclass(slots=True)

@@ -32,11 +32,6 @@ from schemas.words import (
     Verdict,
 )
 
-STALL_S: Final = 0.5
-"""Maximum gap of the loop during a held motion. After a longer one it stops the car
-(docs/explanation/how-it-works.md#processes-and-threads)."""
-STALE_TIMES_S: Final = 0.5
-"""Maximum gap of the loop. After a longer one report times do not count: a normal gap may look like a pause."""
 FAN_SETTLED_S: Final = 2.0
 """Minimum time from a fan toggle to a reading that shows the new state of the fan."""
 
@@ -266,29 +261,6 @@ class CarMonitor:
         self._executor.senders.halt_streams(now)
         self.model.learn(TrustEvent.HEARD, now, words)
         self._stops.on_contact(now, words)
-
-    def on_stall(self, gap_s: float, now: float) -> None:
-        """Stop a driven car after a gap of the loop."""
-        if gap_s > STALE_TIMES_S:
-            self.model.evidence.reset_times()
-        if gap_s > STALL_S and self._executor.queue.held is not None:
-            words = f"{self.model.name} is stopped: its gateway stalled for {gap_s:.1f} s during a drive"
-            self._log.log(Level.ERROR, "stalled", words, now)
-            self._executor.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
-
-    def on_sleep(self, slept_s: float, now: float) -> None:
-        """Stop the car first after a sleep of the computer, unless it has shown that it stands. Begin nothing again."""
-        model, stops = self.model, self._stops
-        model.evidence.reset_times()
-        model.mode.excuse_silence(now)
-        stands = model.at_rest and model.trust.shown and stops.running is None
-        then = f"{model.name} stood before, and stands" if stands else f"{model.name} is stopped first"
-        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
-        self._log.log(Level.WARNING, "slept", words, now)
-        self._executor.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
-        self._executor.senders.halt(now)  # a joystick that is still pushed restarts no car
-        if model.link_open and not stands:
-            stops.on_sleep(now)
 
     def _log_contradiction(self, before: Verdict, now: float) -> None:
         mode = self.model.mode

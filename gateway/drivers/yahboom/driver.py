@@ -5,7 +5,7 @@ written frame. `StopExecutor` carries out the stops. Here they become one driver
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from gateway.control.commands import (
     Action,
@@ -34,6 +34,9 @@ from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
+
+STALE_TIMES_S: Final = 0.5
+"""Maximum gap of the loop. After a longer one report times do not count: a normal gap may look like a pause."""
 
 
 class YahboomDriver(Executor):
@@ -110,12 +113,20 @@ class YahboomDriver(Executor):
         self._monitor.tick(now)
 
     def on_stall(self, gap_s: float, now: float) -> None:
-        """Stop a driven car after a gap of the loop."""
-        self._monitor.on_stall(gap_s, now)
+        """Stop a driven car after a gap of the loop. The times of its reports do not count then."""
+        if gap_s > STALE_TIMES_S:
+            self.model.evidence.reset_times()
+        super().on_stall(gap_s, now)
 
     def on_sleep(self, slept_s: float, now: float) -> None:
         """Stop the car first after a sleep of the computer."""
-        self._monitor.on_sleep(slept_s, now)
+        self.model.evidence.reset_times()
+        self.model.mode.excuse_silence(now)
+        super().on_sleep(slept_s, now)
+
+    def stop_after_sleep(self, now: float) -> None:
+        """Stop the car. A stop from before the sleep goes on, with its next try at once."""
+        self.stops.on_sleep(now)
 
     # ------------------------------------------------------------------ commands
 

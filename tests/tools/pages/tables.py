@@ -9,9 +9,9 @@ from typing import Any
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions.fields import LAST, fields_of
+from gateway.control.driver import STALL_S
 from gateway.control.senders import SENDER_GONE_S
 from gateway.control.trust import TRANSITIONS, TrustEvent, TrustState
-from gateway.drivers.yahboom.car_monitor import STALL_S
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S

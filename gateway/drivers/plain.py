@@ -1,0 +1,676 @@
+"""A driver to build on, for families of cars that need no theory of their own. Pure.
+
+Such a car takes a motion until it gets another one, or until its dead-man stops it. Its stop is one sequence of frames.
+It has no modes. A family says with class attributes and a few methods what its frames are, and what its readings show;
+everything that waits, repeats, fails and is recorded is here (docs/how-to/write-a-driver.md).
+
+*What is claimed.* A stop ends as `sent` when its frames are written and the time is over in which a car that got them
+has stopped. A family whose readings show more calls `show_rest`: then the stop ends as `shown`. If its cars could show
+a stop (`can_show`) and do not in time, the stop counts as not confirmed, and goes on.
+
+*What makes a motion safe.* Where a car has a dead-man, a held motion is sent again well before that ends, so that a
+lost frame stops nobody, and a lost link stops the car. Where it has none, a stop that nothing shows is sent again every
+few seconds: its frames may have been lost.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final
+
+from gateway.control.battery import Battery
+from gateway.control.command_log import Pending
+from gateway.control.command_queue import HeldMotion
+from gateway.control.commands import Action, ChangeSpeed, Find, PartAction, SetMode
+from gateway.control.driver import Desk, Driver, Echo, Event, Findings, Outputs, Rejected, TextLine
+from gateway.control.events import OutgoingFrame
+from gateway.control.trust import KNOWN, TrustEvent, TrustState
+from schemas.car_profile import CarProfile
+from schemas.limits import SHUTDOWN_S
+from schemas.words import (
+    CAPABILITIES,
+    Basis,
+    BatteryAction,
+    BatteryLevel,
+    CarTrust,
+    FrameOrigin,
+    FrameVerdict,
+    Level,
+    Light,
+    Mode,
+    Motion,
+    Motors,
+    Phase,
+    Reason,
+    ServoAction,
+    Shows,
+    SpeedStep,
+    Verdict,
+)
+
+RENEWAL_S: Final = 6.0
+"""Interval of the repeats of a stop that nothing shows, on a car without a dead-man: as on the first family's cars."""
+SPEED_STEP: Final = 0.1
+"""One step of the speed, a share of full speed."""
+
+
+# ---------------------------------------------------------------------- what a car can do, and what is claimed
+
+
+@dataclass(frozen=True, slots=True)
+class PlainProfile:
+    """What cars of one platform can do: a `CarProfile` without modes."""
+
+    name: str
+    capabilities: frozenset[str]
+    measures: frozenset[str]
+    """The sensor topics that it publishes, without `sensor/`."""
+    lights: frozenset[Light] = frozenset()
+    servos: frozenset[ServoAction] = frozenset()
+    cells: int = 2
+    dead_man_s: float | None = None
+    not_observed: tuple[str, ...] = ()
+    modes: frozenset[Mode] = frozenset({Mode.MANUAL})
+    silent_modes: frozenset[Mode] = frozenset()
+
+    @property
+    def possible_modes(self) -> frozenset[Mode]:
+        """The modes that it may be in."""
+        return self.modes
+
+    @property
+    def has_readings(self) -> bool:
+        """False if it never sends a reading."""
+        return bool(self.measures)
+
+    def measurable(self, mode: Mode) -> frozenset[str]:
+        """Return everything that such a car can measure in this mode."""
+        return self.measures if mode in self.modes else frozenset()
+
+    def why_lacking(self, capability: str) -> str | None:
+        """Return why the car lacks a capability, for a person."""
+        known = capability in self.capabilities or capability not in CAPABILITIES
+        return None if known else f"{self.name} cars have no {capability}"
+
+
+@dataclass(slots=True)
+class PlainMode:
+    """The mode of a car that has one mode."""
+
+    asked: Mode | None = Mode.MANUAL
+    inferred: Mode | None = None
+    verdict: Verdict = Verdict.ASSUMED
+    evidence: str = "this car has one mode"
+    evidence_at: float | None = None
+    since: float | None = None
+    candidates: tuple[Mode, ...] = ()
+    is_left: bool = False
+
+
+@dataclass(slots=True)
+class PlainModel:
+    """What is claimed of a car. Times: s, monotonic."""
+
+    name: str
+    profile: CarProfile
+    battery: Battery
+    silence_limit_s: float | None
+    trust: TrustState = field(default_factory=TrustState)
+    mode: PlainMode = field(default_factory=PlainMode)
+    link_open: bool = False
+    link_reason: str = "not connected yet"
+    range_cm: float | None = None
+    range_at: float = float("-inf")
+    sent_motion: Motion = Motion.STOP
+    """The last motion written."""
+    speed: float = 0.5
+    """Share of full speed, 0..1."""
+    heard_at: float | None = None
+    """When the last reading came."""
+    link_since: float = float("-inf")
+    shows: Shows = Shows.NO
+    shows_words: str = "its readings do not show a stop"
+    findings: Findings = field(default_factory=Findings)
+    doubted: bool = False
+    why_quiet: str = ""
+
+    @property
+    def known(self) -> bool:
+        """True if the first stop is over, and no write has failed since."""
+        return self.trust.state in KNOWN
+
+    @property
+    def at_rest(self) -> bool:
+        """True if the car stands after a stop."""
+        return self.trust.state is CarTrust.STOPPED
+
+    @property
+    def is_heard(self) -> bool:
+        """False if the car is silent for longer than any normal silence."""
+        return self.trust.state is not CarTrust.UNHEARD
+
+    @property
+    def motors(self) -> Motors:
+        """What is claimed of the motors."""
+        return self.trust.motors
+
+    @property
+    def basis(self) -> Basis | None:
+        """What the claim that the motors are off rests on."""
+        return self.trust.basis
+
+    @property
+    def motion(self) -> Motion | None:
+        """The last motion sent; None if the state is unknown."""
+        return self.sent_motion if self.known else None
+
+    @property
+    def outputs(self) -> Outputs:
+        """The estimated state of speed, fan and servo."""
+        return Outputs(self.speed)
+
+    @property
+    def shows_stops(self) -> tuple[Shows, str]:
+        """Whether its readings show that a stop arrived, with the reason."""
+        return self.shows, f"{self.name}: {self.shows_words}"
+
+    def unheard_s(self, now: float) -> float:
+        """Return for how long the car has sent no reading on this link."""
+        return now - max(self.link_since, self.link_since if self.heard_at is None else self.heard_at)
+
+    def moved_since(self, range_cm: float | None, since: float) -> str:
+        """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
+        if range_cm is None or self.range_cm is None or self.range_at < since or abs(self.range_cm - range_cm) < 5.0:
+            return ""
+        return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
+
+
+# ---------------------------------------------------------------------- the driver
+
+
+@dataclass(slots=True)
+class PlainStop:
+    """A stop in progress. Times: s, monotonic."""
+
+    why: FrameOrigin
+    began_at: float
+    next_at: float
+    """When its next frame is due, or its next try."""
+    commands: list[Pending]
+    is_soft: bool
+    index: int = 0
+    """Number of frames of this try that are written."""
+    last_at: float = float("-inf")
+    """When the last frame of the first whole try was written; -inf before."""
+    is_late: bool = False
+    """True if the car did not show it in time. The stop goes on."""
+
+
+class PlainDriver(Driver):
+    """One car of a plain family. A family gives the class attributes and the abstract methods."""
+
+    BYTES_PER_S: ClassVar[float]
+    """The rate of the car's own wire."""
+    STOP: ClassVar[tuple[bytes, ...]]
+    """The frames of a stop, in their order. Each try sends all of them."""
+    STOP_GAP_S: ClassVar[float] = 0.1
+    """Time between two frames of a stop."""
+    STOPS_WITHIN_S: ClassVar[float]
+    """Time after the last frame of a stop in which a car that got it has stopped."""
+    RETRY_S: ClassVar[float] = 2.0
+    """Time from one try of a stop that the car could show to the next."""
+    EVIDENCE_S: ClassVar[float] = 5.0
+    """Time after the last frame in which a car that can show its stop has shown it."""
+    RESEND_S: ClassVar[float | None] = None
+    """Interval at which a held motion is sent again: well under the dead-man. None: it is sent once."""
+    SILENCE_S: ClassVar[float | None] = None
+    """The longest normal silence; None if silence says nothing."""
+
+    def __init__(self, desk: Desk, profile: CarProfile) -> None:
+        super().__init__(desk)
+        battery = Battery(desk.battery_policy.of_cells(profile.cells), profile.cells)
+        self._model = PlainModel(desk.car, profile, battery, self.SILENCE_S)
+        self._log = desk.log
+        self._stop: PlainStop | None = None
+        self._source: PlainStop | HeldMotion | Pending | None = None
+        self._resend_at = float("inf")
+        """When the held motion is sent again."""
+        self._renew_at = float("inf")
+        self._shutting_down = False
+        self._ends_at = float("inf")
+        self._not_stopped = ""
+
+    # ------------------------------------------------------------------ what a family says
+
+    @abstractmethod
+    def motion_frame(self, motion: Motion) -> bytes:
+        """Return the frame of a motion, at `self.model.speed`."""
+
+    @abstractmethod
+    def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
+        """Return the frames of an action on a part of the car; None if the car cannot do it."""
+
+    @property
+    def can_show(self) -> bool:
+        """Return True if the readings of this car would show a stop now."""
+        return False
+
+    def wait_words(self, now: float) -> str:
+        """Return what must happen before the car may be driven, for a person; empty if it may."""
+        del now
+        return ""
+
+    def setup_frame(self, now: float) -> bytes | None:
+        """Return the next frame that prepares the car, if one is due."""
+        del now
+        return None
+
+    def setup_at(self) -> float:
+        """Return when `setup_frame` may have something to do; inf if never."""
+        return float("inf")
+
+    def on_reading(self, event: Event, now: float) -> None:
+        """Take an event that is a reading."""
+
+    def on_stop_written(self, data: bytes, now: float) -> None:
+        """Note that a frame of a stop was written."""
+
+    # ------------------------------------------------------------------ the seam
+
+    @property
+    def model(self) -> PlainModel:
+        """What is claimed of the car."""
+        return self._model
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Return the rate of the car's own wire, bytes/s."""
+        return self.BYTES_PER_S
+
+    def verdict(self, event: Event) -> str:
+        """Return what kind of bytes these are."""
+        match event:
+            case Echo():
+                return FrameVerdict.ECHO
+            case TextLine():
+                return FrameVerdict.TEXT
+            case Rejected(cause=cause):
+                return str(cause)
+            case _:
+                return FrameVerdict.SENSORS
+
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the state with an event."""
+        model = self._model
+        if isinstance(event, Echo | Rejected | TextLine):
+            return
+        model.heard_at = event.at
+        if model.trust.state is CarTrust.UNHEARD:
+            words = f"{model.name} sends readings again. The gateway stops it first."
+            self._log.log(Level.INFO, "answers_again", words, now)
+            self._begin_again(words, TrustEvent.HEARD, now)
+        self.on_reading(event, now)
+
+    def on_voltage(self, voltage_v: float, now: float) -> None:
+        """Update the battery, and stop the car if the policy requires it."""
+        model = self._model
+        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
+            return
+        level, words = model.battery.level, f"{model.name}: {model.battery.words}"
+        severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
+        self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
+        if model.battery.action is BatteryAction.STOP and not model.at_rest:
+            self.halt(words, now)
+            self.stop_if_open(now)
+
+    # ------------------------------------------------------------------ the link, and time
+
+    def link_up(self, now: float) -> None:
+        """Stop the car: the link is open."""
+        model = self._model
+        model.link_open, model.link_since, model.heard_at = True, now, None
+        self.senders.halt_streams(now)
+        self._learn(TrustEvent.LINK_OPENED, now)
+        self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail all commands: the link is down."""
+        model = self._model
+        model.link_open, model.link_reason, self._renew_at = False, reason, float("inf")
+        self._learn(TrustEvent.LINK_LOST, now, reason)
+        self._source = None
+        stop, self._stop = self._stop, None
+        words = f"NOT CONFIRMED: {model.name} became unreachable during the stop ({reason}). {self._when_cut}"
+        for pending in stop.commands if stop is not None else ():
+            self._log.record(pending, Phase.FAILED, now, reason=cause, words=words)
+        if self._shutting_down and stop is not None:
+            self._end_unstopped(f"is unreachable ({reason})", now)
+        self.queue.drop(Phase.FAILED, cause, reason, now)
+        self.senders.halt_streams(now)
+
+    @property
+    def _when_cut(self) -> str:
+        dead_man_s = self._model.profile.dead_man_s
+        if dead_man_s is None:
+            return "Look at the car. The gateway stops it as soon as the link is back."
+        return f"Its dead-man stops it within {dead_man_s:g} s, unless something else drives it. Look at the car."
+
+    def tick(self, now: float) -> None:
+        """Stop a car that is silent for too long."""
+        model, limit_s = self._model, self.SILENCE_S
+        if not model.link_open or limit_s is None or not model.is_heard or model.unheard_s(now) <= limit_s:
+            return
+        words = f"{model.name} may be moving: no reading for {model.unheard_s(now):.1f} s. Is it on, and in range?"
+        self._log.log(Level.WARNING, "unheard", words, now)
+        self._begin_again(words, TrustEvent.SILENT, now)
+
+    def _begin_again(self, words: str, event: TrustEvent, now: float) -> None:
+        """Drop what waits, and bring the car to a known state."""
+        self.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self.senders.halt_streams(now)
+        self._learn(event, now, words)
+        if self._stop is None or self._stop.is_soft:
+            self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
+        else:  # the frames of the running one may be lost
+            self._stop.index, self._stop.next_at, self._stop.last_at = 0, now, float("-inf")
+
+    def recover(self, words: str, now: float) -> None:
+        """Bring the car to a known state: it does what nobody commanded."""
+        self._begin_again(words, TrustEvent.DOUBTED, now)
+
+    # ------------------------------------------------------------------ frames out
+
+    def poll(self, now: float) -> OutgoingFrame | None:
+        """Return the frame to write now, if any."""
+        if not self._model.link_open:
+            return None
+        self.expire(now)
+        if (stop := self._stop) is not None:
+            write = self._next_of_stop(stop, now)
+            if write is not None or self._stop is stop:
+                return write
+        if (data := self.setup_frame(now)) is not None:
+            return self._write(data, FrameOrigin.RECOVERY, None)
+        return None if self.wait_words(now) else self._next_command(now)
+
+    def _next_of_stop(self, stop: PlainStop, now: float) -> OutgoingFrame | None:
+        if self._shutting_down and now >= self._ends_at:
+            self._stop = None
+            self._end_unstopped("has not shown the stop", now)
+            for pending in stop.commands:
+                self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self._not_stopped)
+            return None
+        if stop.index < len(self.STOP):
+            return self._write(self.STOP[stop.index], stop.why, stop) if now >= stop.next_at else None
+        if self._has_new_command(stop) and self.accepts_commands(now):
+            self._give_way(stop, now)
+            return None
+        if not self.can_show:
+            if now >= stop.last_at + self.STOPS_WITHIN_S and self._model.is_heard:
+                self._finish(stop, Basis.SENT, self._model.shows_words, now)
+                return None
+        elif now >= stop.last_at + self.EVIDENCE_S and not stop.is_late:
+            self._fail_late(stop, now)
+        if now >= stop.next_at:
+            stop.index = 0
+            return self._write(self.STOP[0], stop.why, stop)
+        data = self.setup_frame(now)
+        return None if data is None else self._write(data, FrameOrigin.RECOVERY, None)
+
+    def _next_command(self, now: float) -> OutgoingFrame | None:
+        queue, model, held = self.queue, self._model, self.queue.held
+        if held is not None and not held.pending.sent:
+            return self._write(self.motion_frame(held.motion), FrameOrigin.COMMAND, held)
+        if queue.one_shots:
+            return self._write(queue.one_shots[0].frames[0], FrameOrigin.COMMAND, queue.one_shots[0])
+        if held is not None and now >= self._resend_at:
+            return self._write(self.motion_frame(held.motion), FrameOrigin.REPEAT, held)
+        if now >= self._renew_at and model.at_rest and not model.trust.shown:
+            self._renew_at = now + RENEWAL_S
+            return self._write(self.STOP[-1], FrameOrigin.REPEAT, None)
+        return None
+
+    def _write(self, data: bytes, why: FrameOrigin, source: PlainStop | HeldMotion | Pending | None) -> OutgoingFrame:
+        self._source = source
+        match source:
+            case PlainStop(commands=[first, *_]):
+                by = first.command.id
+            case HeldMotion(pending=pending) | (Pending() as pending):
+                by = pending.command.id
+            case _:
+                by = ""
+        return OutgoingFrame(data, data, why, by)
+
+    def on_written(self, write: OutgoingFrame, now: float) -> None:
+        """Update the state: the link has taken the frame."""
+        source, self._source = self._source, None
+        match source:
+            case PlainStop():
+                self._on_stop_frame(source, write.data, now)
+            case HeldMotion() as held:
+                self._resend_at = float("inf") if self.RESEND_S is None else now + self.RESEND_S
+                self._renew_at = float("inf")
+                self._model.sent_motion = held.motion
+                self._learn(TrustEvent.MOTION_SENT, now)
+                if not held.pending.sent:
+                    held.begin(now, self._model.range_cm)
+                    self._log.record_sent(held.pending, now)
+            case Pending():
+                source.frames.popleft()
+                self._apply(source.command.what, now)
+                if not source.frames:
+                    self._log.record_sent(source, now)
+                    if self.queue.one_shots and self.queue.one_shots[0] is source:
+                        self.queue.one_shots.popleft()
+            case None:
+                pass
+
+    def _on_stop_frame(self, stop: PlainStop, data: bytes, now: float) -> None:
+        self._model.sent_motion = Motion.STOP
+        for pending in stop.commands:
+            self._log.record_sent(pending, now)
+        stop.index += 1
+        is_last = stop.index >= len(self.STOP)
+        stop.next_at = now + (self.RETRY_S if is_last else self.STOP_GAP_S)
+        if is_last and stop.last_at == float("-inf"):
+            stop.last_at = now
+        self.on_stop_written(data, now)
+
+    def next_at(self, now: float) -> float:
+        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        if not self._model.link_open:
+            return float("inf")
+        times = [*self.queue.deadlines(), self.setup_at()]
+        stop, held = self._stop, self.queue.held
+        if stop is not None:
+            later = [self._ends_at]  # what is over by now was looked at by the last poll
+            if stop.index >= len(self.STOP):
+                later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
+            times += [stop.next_at, *(each for each in later if each > now)]
+            if self._has_new_command(stop) and not self.wait_words(now):
+                times.append(self.free_at(now))
+        elif not self.wait_words(now):
+            if self.queue.one_shots or (held is not None and not held.pending.sent):
+                times.append(now)
+            if held is not None:
+                times.append(self._resend_at)
+            if self._model.at_rest and not self._model.trust.shown:
+                times.append(self._renew_at)
+        return max(now, min(times, default=float("inf")))
+
+    # ------------------------------------------------------------------ commands
+
+    def refusal(self, what: Action) -> str | None:
+        """Return why this car cannot do it in any state; None if it can."""
+        car, model = self.desk.car, self._model
+        match what:
+            case SetMode(mode) if mode not in model.profile.modes:
+                return f"{car} ({model.profile.name}) has no mode {mode}. It has: manual."
+            case ChangeSpeed(step):
+                share = model.speed + (SPEED_STEP if step is SpeedStep.UP else -SPEED_STEP)
+                if share > self.desk.speed_max + 1e-9 and step is SpeedStep.UP:
+                    maximum = self.desk.speed_max
+                    return f"{car} would drive at {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
+                return None
+            case Find():
+                return None
+            case PartAction() if self.part_frames(what) is None:
+                has = ", ".join(sorted(model.profile.capabilities))
+                return f"{car} ({model.profile.name}) cannot do that. It has: {has}."
+            case _:
+                return None
+
+    def frames(self, what: Action) -> tuple[bytes, ...]:
+        """Return the frames of an action on a part of the car. One that is no frame still takes its turn."""
+        if isinstance(what, ChangeSpeed):
+            return (self.motion_frame(self._model.sent_motion),)
+        return self.part_frames(what) or ()
+
+    def _apply(self, what: Action, now: float) -> None:
+        """Note the effect of a written action. Another speed counts at once for a car that drives."""
+        if isinstance(what, ChangeSpeed):
+            self._model.speed = min(1.0, max(SPEED_STEP, self._model.speed + _STEPS[what.step]))
+            self._resend_at = now
+
+    def accepts_commands(self, now: float) -> bool:
+        """Return True if a command's frame may be written."""
+        stop = self._stop
+        if self._shutting_down or self.wait_words(now):
+            return False
+        return stop is None or (stop.is_soft and stop.index > 0) or now >= self._gives_way_at(stop)
+
+    def _gives_way_at(self, stop: PlainStop) -> float:
+        """Return when a newer command may take the place of a stop: all frames are out, and the car has stopped."""
+        return stop.last_at + self.STOPS_WITHIN_S if stop.last_at > float("-inf") else float("inf")
+
+    def _has_new_command(self, stop: PlainStop) -> bool:
+        held, one_shots = self.queue.held, self.queue.one_shots
+        waiting = [*([held.pending] if held is not None and not held.pending.sent else []), *list(one_shots)[:1]]
+        return any(pending.received_at >= stop.began_at or stop.is_soft for pending in waiting)
+
+    def free_at(self, now: float) -> float:
+        """Return when the car can take a motion, as far as that is known."""
+        stop = self._stop
+        if stop is None or (stop.is_soft and stop.index > 0):
+            return now
+        if stop.last_at > float("-inf"):
+            return max(now, self._gives_way_at(stop))
+        return now + self._length_s(stop.index) + self.STOPS_WITHIN_S
+
+    def _length_s(self, index: int = 0) -> float:
+        return max(0, len(self.STOP) - 1 - index) * self.STOP_GAP_S
+
+    # ------------------------------------------------------------------ stops
+
+    @property
+    def is_stopping(self) -> bool:
+        """Return True if a stop is in progress."""
+        return self._stop is not None
+
+    @property
+    def shutting_down(self) -> bool:
+        """Return True after `shut_down`."""
+        return self._shutting_down
+
+    @property
+    def not_stopped(self) -> str:
+        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+        return self._not_stopped
+
+    def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
+        """Stop the car by all means."""
+        self._begin(why, now, [pending] if pending is not None else [], is_soft=False)
+
+    def end_motion(self, now: float, pending: Pending | None = None) -> None:
+        """Stop the car at the end of a drive."""
+        self._begin(FrameOrigin.STOP, now, [pending] if pending is not None else [], is_soft=True)
+
+    def resume_motion(self, words: str, now: float) -> None:
+        """End the stop at the end of a drive: the car drives again."""
+        if self._stop is not None and self._stop.is_soft:
+            self._give_way(self._stop, now, words)
+
+    def _give_way(self, stop: PlainStop, now: float, words: str = "") -> None:
+        self._stop = None
+        words = words or f"{self._model.name} was commanded again before the stop was over, which was sent"
+        for pending in stop.commands:
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+
+    def _begin(self, why: FrameOrigin, now: float, commands: list[Pending], *, is_soft: bool) -> None:
+        running = self._stop
+        if running is not None and (is_soft or not running.is_soft):
+            running.commands.extend(commands)
+            running.why = why if why is FrameOrigin.SHUTDOWN else running.why
+            if running.last_at > float("-inf") and commands:  # its frames are out: send them again for this command
+                running.index, running.next_at, running.last_at = 0, now, float("-inf")
+                running.began_at, running.is_late = now, False
+            return
+        self._stop = PlainStop(why, now, now, [*(running.commands if running is not None else ()), *commands], is_soft)
+        self._learn(TrustEvent.STOP_BEGUN, now, f"stop ({why})")
+
+    def show_rest(self, words: str, now: float) -> None:
+        """End the running stop: the readings have shown that the car stands."""
+        if self._stop is not None and self._stop.last_at > float("-inf"):
+            self._finish(self._stop, Basis.SHOWN, words, now)
+        elif self._model.at_rest and not self._model.trust.shown:
+            self._learn(TrustEvent.STOP_SHOWN, now, words)
+
+    def _finish(self, stop: PlainStop, basis: Basis, words: str, now: float) -> None:
+        model, shown = self._model, basis is Basis.SHOWN
+        recovered, self._stop = not model.known, None
+        self._learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
+        if recovered:
+            how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
+            self._log.log(Level.INFO, "recovered", f"{model.name} {how}, mode manual", now)
+        self._renew_at = float("inf") if shown or model.profile.dead_man_s is not None else now + RENEWAL_S
+        phase, told, evidence = (Phase.COMPLETE, "", (words,)) if shown else (Phase.SENT, words, ())
+        for pending in stop.commands:
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, phase, now, words=told, evidence=evidence, basis=basis)
+
+    def _fail_late(self, stop: PlainStop, now: float) -> None:
+        """Fail the commands of a stop that the car could have shown. The stop goes on."""
+        model = self._model
+        stop.is_late = True
+        words = f"NOT CONFIRMED: {model.name} has not shown the stop. Look at the car. The gateway keeps stopping it."
+        for pending in stop.commands:
+            self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
+        stop.commands.clear()
+        self._learn(TrustEvent.NOT_SHOWN, now)
+        self._log.log(Level.ERROR, "not_shown", words, now)
+
+    def worst_s(self, now: float) -> float:
+        """Return the longest time until the motors are off if a stop is asked now and its frames arrive."""
+        stop = self._stop
+        if stop is not None and stop.last_at > float("-inf"):
+            return max(0.0, self._gives_way_at(stop) - now)
+        return self._length_s(stop.index if stop is not None else 0) + self.STOPS_WITHIN_S
+
+    def shut_down(self, now: float) -> None:
+        """Stop the car for the last time."""
+        if self._shutting_down:
+            return
+        self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
+        self._shutting_down, self._ends_at = True, now + SHUTDOWN_S
+        model = self._model
+        if not model.link_open:
+            self._end_unstopped(f"is unreachable ({model.link_reason})", now)
+        elif self._stop is not None or not (model.at_rest and model.trust.shown):
+            self.stop(FrameOrigin.SHUTDOWN, now)
+
+    def _end_unstopped(self, why: str, now: float) -> None:
+        car = self._model.name
+        self._not_stopped = why
+        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
+
+    def _learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
+        """Update the trust state, and log each change."""
+        if self._model.trust.take(event, now, evidence):
+            trust = self._model.trust
+            basis = f" ({trust.basis})" if trust.basis is not None else ""
+            words = f"{self._model.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
+            self._log.log(Level.DEBUG, "trust", words, now)
+
+
+_STEPS: Final[Mapping[Any, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
