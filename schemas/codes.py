@@ -28,6 +28,7 @@ REASONS: Final[dict[str, str]] = {
     Reason.DUPLICATE: "A command with this id was accepted before.",
     Reason.STALE: "The command arrived too late, or its time is in the future.",
     Reason.NOT_SHOWN: "The car could have confirmed the stop and did not.",
+    Reason.STUCK: "A wheel stood during the drive, so the gateway ended it.",
     "no_answer": "No gateway answered for this car.",
     "no_result": "The gateway took the command, and its result did not arrive.",
 }
@@ -64,6 +65,11 @@ EVENTS: Final[dict[str, EventCode]] = {
     "not_stopped": EventCode(Level.ERROR, "The gateway ended, and the car has not confirmed its stop."),
     "stalled": EventCode(Level.ERROR, "The gateway stood still during a drive, and stops the car."),
     "slept": EventCode(Level.WARNING, "The computer slept, and the gateway stops the car first."),
+    "car_restarted": EventCode(
+        Level.WARNING, "The car has restarted. The gateway stops it first, and sets it up again."
+    ),
+    "moves_unasked": EventCode(Level.WARNING, "The car moves, and nobody here drives it. The gateway stops it."),
+    "wheel_stands": EventCode(Level.WARNING, "A wheel stands in a drive. The gateway stops the car."),
     "battery_ok": EventCode(Level.INFO, "The battery is above both limits again."),
     "battery_low": EventCode(Level.WARNING, "The battery is below the first limit."),
     "battery_critical": EventCode(Level.ERROR, "The battery is below the second limit."),

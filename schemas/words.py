@@ -187,6 +187,8 @@ class Reason(StrEnum):
     STALE = "stale"
     NOT_SHOWN = "not_shown"
     """The car could have shown the stop and did not."""
+    STUCK = "stuck"
+    """A wheel stood in the drive."""
 
 
 # ------------------------------------------------------------------ states

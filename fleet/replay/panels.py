@@ -150,6 +150,12 @@ MAIN_PANELS: Final = (
 _SENSOR_PANELS: Final = (
     Panel("Gyroscope", curves=tuple(Curve("sensor/imu", f"gyro_{a}_raw", f"{a} (raw)") for a in "xyz")),
     Panel("Acceleration", curves=tuple(Curve("sensor/imu", f"accel_{a}_raw", f"{a} (raw)") for a in "xyz")),
+    Panel("Wheels", curves=tuple(Curve("sensor/wheels", f"{side}_m_s", f"{side} (m/s)") for side in ("left", "right"))),
+    Panel("Odometer", curves=tuple(Curve("sensor/odometer", f"{side}_m", f"{side} (m)") for side in ("left", "right"))),
+    Panel(
+        "Attitude",
+        curves=tuple(Curve("sensor/attitude", f"{axis}_rad", f"{axis} (rad)") for axis in ("roll", "pitch", "yaw")),
+    ),
     Panel("Arm", curves=tuple(Curve("sensor/arm", f"joint_deg[{n}]", f"J{n + 1} (deg)") for n in range(6))),
 )
 _STATE_PANELS: Final = (

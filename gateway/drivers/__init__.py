@@ -18,7 +18,10 @@ from schemas.words import Platform
 if TYPE_CHECKING:
     from gateway.control.driver import Desk, Driver
 
-BUILT_IN: Final = {"yahboom": "gateway.drivers.yahboom.family"}
+BUILT_IN: Final = {
+    "yahboom": "gateway.drivers.yahboom.family",
+    "waveshare": "gateway.drivers.waveshare.family",
+}
 """Module of each family that comes with the gateway."""
 GROUP: Final = "zenoh_car_fleet.drivers"
 

@@ -211,8 +211,8 @@ class PlainDriver(Driver):
 
     BYTES_PER_S: ClassVar[float]
     """The rate of the car's own wire."""
-    STOP: ClassVar[tuple[bytes, ...]]
-    """The frames of a stop, in their order. Each try sends all of them."""
+    STOP_FRAMES: ClassVar[int] = 1
+    """Number of frames of a stop. Each try sends all of them."""
     STOP_GAP_S: ClassVar[float] = 0.1
     """Time between two frames of a stop."""
     STOPS_WITHIN_S: ClassVar[float]
@@ -245,6 +245,11 @@ class PlainDriver(Driver):
     @abstractmethod
     def motion_frame(self, motion: Motion) -> bytes:
         """Return the frame of a motion, at `self.model.speed`."""
+
+    def stop_frame(self, index: int) -> bytes:
+        """Return one frame of a stop, by its place."""
+        del index
+        return self.motion_frame(Motion.STOP)
 
     @abstractmethod
     def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
@@ -400,20 +405,22 @@ class PlainDriver(Driver):
             for pending in stop.commands:
                 self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self._not_stopped)
             return None
-        if stop.index < len(self.STOP):
-            return self._write(self.STOP[stop.index], stop.why, stop) if now >= stop.next_at else None
+        if stop.index < self.STOP_FRAMES:
+            return self._write(self.stop_frame(stop.index), stop.why, stop) if now >= stop.next_at else None
         if self._has_new_command(stop) and self.accepts_commands(now):
             self._give_way(stop, now)
             return None
-        if not self.can_show:
-            if now >= stop.last_at + self.STOPS_WITHIN_S and self._model.is_heard:
-                self._finish(stop, Basis.SENT, self._model.shows_words, now)
+        model = self._model
+        answers = model.is_heard and (model.heard_at is not None or not model.profile.has_readings)
+        if not self.can_show and answers:
+            if now >= stop.last_at + self.STOPS_WITHIN_S:
+                self._finish(stop, Basis.SENT, f"{model.name}: {model.shows_words}", now)
                 return None
         elif now >= stop.last_at + self.EVIDENCE_S and not stop.is_late:
             self._fail_late(stop, now)
         if now >= stop.next_at:
             stop.index = 0
-            return self._write(self.STOP[0], stop.why, stop)
+            return self._write(self.stop_frame(0), stop.why, stop)
         data = self.setup_frame(now)
         return None if data is None else self._write(data, FrameOrigin.RECOVERY, None)
 
@@ -427,7 +434,7 @@ class PlainDriver(Driver):
             return self._write(self.motion_frame(held.motion), FrameOrigin.REPEAT, held)
         if now >= self._renew_at and model.at_rest and not model.trust.shown:
             self._renew_at = now + RENEWAL_S
-            return self._write(self.STOP[-1], FrameOrigin.REPEAT, None)
+            return self._write(self.stop_frame(self.STOP_FRAMES - 1), FrameOrigin.REPEAT, None)
         return None
 
     def _write(self, data: bytes, why: FrameOrigin, source: PlainStop | HeldMotion | Pending | None) -> OutgoingFrame:
@@ -470,7 +477,7 @@ class PlainDriver(Driver):
         for pending in stop.commands:
             self._log.record_sent(pending, now)
         stop.index += 1
-        is_last = stop.index >= len(self.STOP)
+        is_last = stop.index >= self.STOP_FRAMES
         stop.next_at = now + (self.RETRY_S if is_last else self.STOP_GAP_S)
         if is_last and stop.last_at == float("-inf"):
             stop.last_at = now
@@ -484,7 +491,7 @@ class PlainDriver(Driver):
         stop, held = self._stop, self.queue.held
         if stop is not None:
             later = [self._ends_at]  # what is over by now was looked at by the last poll
-            if stop.index >= len(self.STOP):
+            if stop.index >= self.STOP_FRAMES:
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
             times += [stop.next_at, *(each for each in later if each > now)]
             if self._has_new_command(stop) and not self.wait_words(now):
@@ -558,7 +565,7 @@ class PlainDriver(Driver):
         return now + self._length_s(stop.index) + self.STOPS_WITHIN_S
 
     def _length_s(self, index: int = 0) -> float:
-        return max(0, len(self.STOP) - 1 - index) * self.STOP_GAP_S
+        return max(0, self.STOP_FRAMES - 1 - index) * self.STOP_GAP_S
 
     # ------------------------------------------------------------------ stops
 

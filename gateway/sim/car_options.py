@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits
+from gateway.sim.model.ugv import UGV_BUILDS
 from schemas.platform_name import HEAD, OPTION_WORDS, OPTIONS, VARIANTS, check_head
 from schemas.words import Mode, Platform
 
@@ -38,6 +39,8 @@ SIMULATED: Final[Mapping[str, tuple[str, ...]]] = {
     "raspberry_pi": _REPORTS,
     "course": (),
 }
+UGV_OPTIONS: Final = ("mission", "no_encoder", "quiet")
+"""The options of the second family's cars: see `UgvCar`."""
 """For each platform the options that only the simulator knows."""
 _PLACEHOLDERS: Final = {"interval": "S", "spread": "S", "close": "S", "gray": "MAX", SILENT: "MODE"}
 
@@ -48,6 +51,11 @@ class BadOption(ValueError):
 
 def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
     """Return the traits of a car with these options, None if they are those of its platform; raise BadOption."""
+    if platform in UGV_BUILDS:
+        for option in options:
+            if option not in UGV_OPTIONS:
+                raise BadOption(f"option '+{option}' of {platform} is not allowed: use {allowed_options(platform)}")
+        return None
     base = STM32_TRAITS if platform == Platform.STM32 else CarTraits()
     traits = base
     for option in options:
@@ -60,6 +68,8 @@ def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
 
 def allowed_options(platform: str) -> str:
     """Return the options of a platform, for a person."""
+    if platform in UGV_BUILDS:
+        return ", ".join(f"+{word}" for word in UGV_OPTIONS)
     own = [f"+{word}={_PLACEHOLDERS[word]}" if word in _PLACEHOLDERS else f"+{word}" for word in SIMULATED[platform]]
     return "none" if platform == "course" else ", ".join((OPTION_WORDS, *own))
 

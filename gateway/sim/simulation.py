@@ -13,11 +13,12 @@ from gateway.sim.car_spec import CarSpec, PtyPath, ReplaySpec
 from gateway.sim.endpoints import EndpointError, PtyEndpoint, SimEndpoint, TcpEndpoint
 from gateway.sim.faults import Fault, FaultKind, Press, targets
 from gateway.sim.model.capture_car import CaptureCar
-from gateway.sim.model.factory import build
+from gateway.sim.model.factory import build, build_ugv
 from gateway.sim.model.faulty_link import Direction, FaultyLink
 from gateway.sim.model.firmware import Firmware, Pose, Truth
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.raspberry_pi import PI_BOOT_S, RaspberryPiCar, Transport
+from gateway.sim.model.ugv import UGV_BUILDS, UgvCar
 from gateway.sim.model.world import World
 from gateway.sim.world_commands import Change, WorldState, as_it_is
 
@@ -212,7 +213,7 @@ class SimCar:
 
     def press(self, button: Button) -> bool:
         """Press a button of the infrared remote; return True if the car obeys it."""
-        obeyed = isinstance(self.firmware, Firmware) and self.firmware.press(button, self._loop.time())
+        obeyed = isinstance(self.firmware, Firmware | UgvCar) and self.firmware.press(button, self._loop.time())
         self._pump()
         return obeyed
 
@@ -259,7 +260,7 @@ class SimCar:
         if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpEndpoint):
             # The whole machine goes down with its sockets, before the program starts without a client.
             await self._drop(PI_BOOT_S)
-        if isinstance(self.firmware, Firmware):
+        if isinstance(self.firmware, Firmware | UgvCar):
             self.firmware.brown_out(self._loop.time())
 
     def _stick(self, for_s: float | None) -> None:
@@ -323,17 +324,21 @@ class Simulation:
             seeded = f"{seed}:{spec.name}"
             transport = Transport.SERIAL if isinstance(spec.link, PtyPath) else Transport.TCP
             rng, options = _rng(seeded), spec.options
-            firmware = build(
-                spec.platform,
-                self.world,
-                index,
-                rng,
-                options=options,
-                transport=transport,
-                now=now,
-                name=spec.name,
-                traits=spec.traits,
-            )
+            firmware: Machine
+            if spec.platform in UGV_BUILDS:
+                firmware = build_ugv(spec.platform, self.world, index, rng, options=options, now=now, name=spec.name)
+            else:
+                firmware = build(
+                    spec.platform,
+                    self.world,
+                    index,
+                    rng,
+                    options=options,
+                    transport=transport,
+                    now=now,
+                    name=spec.name,
+                    traits=spec.traits,
+                )
             self.cars[spec.name] = SimCar(spec, firmware, seeded)
         for replay, played in replays:
             self.cars[replay.name] = SimCar(replay, played, f"{seed}:{replay.name}")

@@ -149,6 +149,56 @@ class Arm(_message.Message):
     joint_deg: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., joint_deg: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Wheels(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "left_m_s", "right_m_s")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LEFT_M_S_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_M_S_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    left_m_s: float
+    right_m_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., left_m_s: _Optional[float] = ..., right_m_s: _Optional[float] = ...) -> None: ...
+
+class Odometer(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "left_m", "right_m")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LEFT_M_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_M_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    left_m: float
+    right_m: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., left_m: _Optional[float] = ..., right_m: _Optional[float] = ...) -> None: ...
+
+class Attitude(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "roll_rad", "pitch_rad", "yaw_rad")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ROLL_RAD_FIELD_NUMBER: _ClassVar[int]
+    PITCH_RAD_FIELD_NUMBER: _ClassVar[int]
+    YAW_RAD_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roll_rad: _Optional[float] = ..., pitch_rad: _Optional[float] = ..., yaw_rad: _Optional[float] = ...) -> None: ...
+
 class Link(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "state", "reason", "url", "rx_bytes", "tx_bytes", "rx_frames", "tx_frames", "rejects", "reconnects", "tx_airtime", "since_s", "last_rx_s")
     class RejectsEntry(_message.Message):

@@ -7,10 +7,11 @@ from gateway.sim.model.firmware import Firmware, Rng
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.stm32 import Stm32Car
 from gateway.sim.model.traits import CarTraits
+from gateway.sim.model.ugv import UGV_BUILDS, UgvCar
 from gateway.sim.model.world import World
 from schemas.words import Platform
 
-PLATFORMS = ("arduino", "stm32", "raspberry_pi", "course")
+PLATFORMS = ("arduino", "stm32", "raspberry_pi", "course", *UGV_BUILDS)
 
 
 def build(
@@ -42,6 +43,25 @@ def build(
             car = Stm32Car(body, rng, options=options, traits=traits, now=now)
         case _:
             car = ArduinoCar(body, rng, options=options, traits=traits, now=now)
+    if world.lively:
+        car.scheduler = world.scheduler
+        world.scheduler.join(car)
+    return car
+
+
+def build_ugv(
+    platform: str,
+    world: World,
+    index: int,
+    rng: Rng,
+    *,
+    options: frozenset[str] = frozenset(),
+    now: float = 0.0,
+    name: str = "",
+) -> UgvCar:
+    """Return a car of the second family. It has run for a while, without a gateway."""
+    body = CarBody(world, world.start_pose(index, name), rng, now, name)
+    car = UgvCar(UGV_BUILDS[platform], body, rng, options=options, now=now)
     if world.lively:
         car.scheduler = world.scheduler
         world.scheduler.join(car)

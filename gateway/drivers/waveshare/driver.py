@@ -1,0 +1,505 @@
+"""Drives one car of Waveshare's UGV family. Pure.
+
+These cars take JSON, one object a line, over a UART. They acknowledge nothing by themselves, but they have two things
+that the first family lacks: a dead-man, and on some chassis encoders. This essay is about what may rest on them.
+
+*One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
+on one without, and nearly nothing on the factory's first program. Nothing in the command tells them apart. So no motion
+goes out before the car has said by its feedback which firmware it has, and has got the number of its chassis (`T:900`)
+from us. A reset forgets that number on one of the firmwares. So the text of a boot, or a silence in the stream of
+feedback, takes the permission back, and all begins anew.
+
+*The dead-man.* Three seconds after the last `T:1` the motors stop. On one firmware `T:13` drives without feeding it,
+and nothing ever stops such a car; `T:136` below zero turns it off. So `T:1` alone drives here, sent again four times
+within the second that we set the dead-man to, and clamped before it is sent: beyond 2.0 the car ignores the numbers and
+takes the line as a sign of life. A list of what may be sent stands below, and nothing else is ever written.
+
+*What a stop can show.* The car repeats each line that it could parse, if asked to (`T:143`). That is no proof that it
+obeys. But it puts an order into what we read: a feedback after the repeated stop was made after the stop. If its wheel
+speeds are measured, and are zero from then on for a quarter of a second, the car stands. Measured means three things:
+the chassis has encoders, the configuration is ours, and both wheels were seen to turn in a drive of ours since then,
+for an encoder with a loose wire reports zero for ever. Everything else is `sent`, and the dead-man is what it rests on.
+
+*What got lost.* A setting that a link swallows would go unnoticed. So the chassis and the dead-man count when the car
+has repeated them, and are sent until then. A car that repeats nothing gets them three times, while its feedback comes
+at the interval that we asked for, or ten times: it is not locked out for what it cannot show.
+
+*The first bytes.* Each boot plays a mission of its owner, and any byte that waits on the UART aborts it. So after the
+link is open we listen for a moment before we write, and wait for the end of a boot. The stop of a person waits for
+nothing.
+
+*Who else drives.* The car has a web page with a known password, and takes commands by radio. Both feed the dead-man. So
+wheels that turn while our last command is a stop are noticed, named, and stopped.
+"""
+
+import json
+import re
+from collections import deque
+from collections.abc import Mapping
+from enum import Enum, auto
+from typing import Any, ClassVar, Final
+
+from gateway.control.commands import Action, Drive, Find, SetLight
+from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
+from gateway.control.events import OutgoingFrame
+from gateway.drivers.lines import Lines
+from gateway.drivers.plain import PlainDriver, PlainProfile
+from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, Firmware
+from gateway.drivers.waveshare.feedback import Feedback, read_line
+from schemas.words import FrameOrigin, Level, Light, Motion, Motors, Phase, Reason, Shows
+
+DRIVE: Final = 1
+PWM: Final = 11
+POLL: Final = 130
+STREAM: Final = 131
+OUTPUTS: Final = 132
+DEAD_MAN: Final = 136
+STREAM_GAP: Final = 142
+ECHO: Final = 143
+CHASSIS: Final = 900
+ALLOWED: Final = frozenset({DRIVE, PWM, POLL, STREAM, OUTPUTS, DEAD_MAN, STREAM_GAP, ECHO, CHASSIS})
+"""The commands that a gateway sends, by their `T`. Of `PWM` only zero."""
+
+DEAD_MAN_MS: Final = 1000
+"""The dead-man that a gateway sets: four times `RESEND_S`."""
+STREAM_MS: Final = 100
+"""Interval of the feedback: that of the firmwares' own speed loop."""
+LISTEN_S: Final = 0.5
+"""Silence after the opening of a link before the first byte of ours. A car that resets then begins to print sooner."""
+BOOT_QUIET_S: Final = 2.5
+"""Silence that ends a boot. Its longest pause is that of a search for the IMU, 2.2 s."""
+PROBE_S: Final = 1.0
+"""Interval of the questions to a car that has not answered."""
+SETUP_GAP_S: Final = 0.03
+"""Minimum time between two frames of the set-up."""
+CONFIRM_S: Final = 0.3
+"""Time in which a car repeats a setting: the longest turn of its loop, and a slow link."""
+SILENT_TRIES: Final = 3
+BLIND_TRIES: Final = 10
+"""Number of times that the settings go to a car that repeats no line: if its feedback comes at the interval that we
+set, so that our lines arrive, and if not even that is shown."""
+STANDS_S: Final = 0.25
+STANDS_REPORTS: Final = 3
+"""Minimum time and number of feedbacks with standing wheels that show a stop: two turns of the speed loop."""
+TURNS_M_S: Final = 0.02
+"""Minimum speed of a wheel that turns: two encoder pulses in a turn of the firmware's loop of some 10 ms."""
+UNASKED_REPORTS: Final = 3
+"""Number of feedbacks in a row with turning wheels that show a motion which nobody commanded here."""
+UNASKED_LOG_S: Final = 30.0
+"""Minimum time between two log records about that. The stops go on meanwhile."""
+IN_FLIGHT_S: Final = 2.0
+"""Maximum time that a line of ours is on its way to the car, over a slow link."""
+STUCK_S: Final = 1.0
+"""Maximum time that a wheel stands in a drive: by then the speed loop has wound up to full power twice."""
+VOLTAGE_S: Final = 10.0
+"""Interval at which the car measures its voltage. Each feedback repeats the last value."""
+ECHO_S: Final = 2.0
+"""Maximum time from a line of ours to its echo."""
+INNER: Final = 0.4
+"""Share of the inner wheel in a curve."""
+_SIDES: Final[Mapping[Motion, tuple[float, float]]] = {
+    Motion.STOP: (0.0, 0.0),
+    Motion.FORWARD: (1.0, 1.0),
+    Motion.BACK: (-1.0, -1.0),
+    Motion.LEFT: (INNER, 1.0),
+    Motion.RIGHT: (1.0, INNER),
+    Motion.SPIN_LEFT: (-1.0, 1.0),
+    Motion.SPIN_RIGHT: (1.0, -1.0),
+}
+"""Shares of the left and the right wheel."""
+_BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]")
+"""Text of the ESP32's own boot program."""
+
+
+class Setup(Enum):
+    """What a car still needs before it may be driven."""
+
+    LISTEN = auto()
+    PROBE = auto()
+    CONFIGURE = auto()
+    READY = auto()
+
+
+def line(command: int, **fields: Any) -> bytes:
+    """Return the line of a command."""
+    assert command in ALLOWED
+    assert command != PWM or not any(fields[side] for side in "LR")
+    return json.dumps({"T": command, **fields}, separators=(",", ":")).encode() + b"\n"
+
+
+class WaveshareDriver(PlainDriver):
+    """One car of this family."""
+
+    BYTES_PER_S: ClassVar[float] = 11520.0
+    STOP_FRAMES: ClassVar[int] = 3
+    STOPS_WITHIN_S: ClassVar[float] = 0.7
+    """Twice the longest turn of the firmware's loop (two searches for a servo, 0.2 s), and a brake from 0.5 m/s."""
+    RETRY_S: ClassVar[float] = 1.0
+    EVIDENCE_S: ClassVar[float] = 4.0
+    RESEND_S: ClassVar[float | None] = 0.25
+    SILENCE_S: ClassVar[float | None] = 1.5
+
+    def __init__(self, desk: Desk, profile: PlainProfile) -> None:
+        super().__init__(desk, profile)
+        self._chassis = PLATFORMS[profile.name]
+        self._lines = Lines()
+        self._sent: deque[tuple[bytes, float]] = deque(maxlen=64)
+        self._number = 0
+        """Number of the last stop frame, which tells its echo from others."""
+        self._firmware: Firmware | None = None
+        self._moved_at = float("-inf")
+        """When the last motion was written."""
+        self._named_at = float("-inf")
+        """When a motion that nobody commanded was last logged."""
+        self._forget_car(float("-inf"))
+
+    def _forget_car(self, listen_until: float) -> None:
+        """Forget everything that a reset of the car changes."""
+        self._setup = Setup.LISTEN
+        self._setup_at = listen_until
+        self._frames: deque[bytes] = deque()
+        self._unsure: list[bytes] = []
+        """The settings that the car has not repeated yet."""
+        self._tries = 0
+        """Number of times that they were sent while feedback came."""
+        self._was_heard = False
+        self._feedback_at = float("-inf")
+        self._in_rhythm = 0
+        """Number of feedbacks in a row that came at the interval that we set."""
+        self._turned = [False, False]
+        """Whether each wheel was seen to turn in a drive of ours since the set-up."""
+        self._echoes = False
+        self._wanted = b""
+        """The last line of the last stop, until it was repeated."""
+        self._stands_since: float | None = None
+        self._stands = 0
+        self._unasked = 0
+        self._stuck_since: float | None = None
+        self._odometer_m: tuple[float, float] | None = None
+        self._voltage: tuple[float, float] = (0.0, float("-inf"))
+        """The last published voltage, and when."""
+
+    # ------------------------------------------------------------------ bytes in
+
+    def feed(self, data: bytes, now: float) -> list[Event]:
+        """Return the events in the bytes."""
+        return [event for each in self._lines.feed(data) for event in self._events(each, now)]
+
+    def _events(self, text: bytes, now: float) -> list[Event]:
+        while self._sent and now > self._sent[0][1] + ECHO_S:
+            self._sent.popleft()
+        if any(text == each for each, _ in self._sent):
+            return [Echo(text, now)]
+        return read_line(text, now)
+
+    def flush(self, now: float) -> list[Event]:
+        """Return nothing: only a line end ends a line."""
+        del now
+        return []
+
+    def flush_at(self) -> float:
+        """Return inf: no silence ends a line."""
+        return float("inf")
+
+    def drop_bytes(self) -> list[Event]:
+        """Forget the unfinished line."""
+        rest = self._lines.take_rest()
+        return [TextLine(rest, self._model.heard_at or 0.0)] if rest else []
+
+    def sends(self, data: bytes, now: float) -> None:
+        """Remember a line that the car may repeat."""
+        self._sent.append((data.strip(), now))
+
+    def measured(self, event: Event) -> Mapping[str, Fields]:
+        """Return the measured values of a feedback by topic."""
+        if not isinstance(event, Feedback):
+            return {}
+        topics: dict[str, Fields] = {}
+        if self._is_measured:
+            topics["sensor/wheels"] = {"left_m_s": event.left_m_s, "right_m_s": event.right_m_s}
+        if event.odometer_m is not None:
+            topics["sensor/odometer"] = dict(zip(("left_m", "right_m"), event.odometer_m, strict=True))
+        if event.attitude_rad is not None:
+            topics["sensor/attitude"] = dict(zip(("roll_rad", "pitch_rad", "yaw_rad"), event.attitude_rad, strict=True))
+        if event.imu_raw is not None:
+            names = [f"{part}_{axis}_raw" for part in ("gyro", "accel") for axis in "xyz"]
+            topics["sensor/imu"] = dict(zip(names, event.imu_raw, strict=True))
+        if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
+            topics["sensor/battery"] = {"voltage_v": event.voltage_v}
+        return topics
+
+    def _is_new_voltage(self, volts: float, at: float) -> bool:
+        """Return True if the car has measured its voltage again, as far as one can tell."""
+        before, measured_at = self._voltage
+        if volts == before and at < measured_at + VOLTAGE_S:
+            return False
+        self._voltage = volts, at
+        return True
+
+    @property
+    def _here(self) -> Chassis | None:
+        """The chassis with the firmware that the car has shown; None if this platform has none with it."""
+        return None if self._firmware is None else self._chassis.get(self._firmware)
+
+    @property
+    def _is_measured(self) -> bool:
+        """True if the wheel speeds of the feedback are measured: encoders, and a chassis that we have configured."""
+        return self._setup is Setup.READY and self._here is not None and self._here.has_encoders
+
+    # ------------------------------------------------------------------ what the car says
+
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the state with an event."""
+        if isinstance(event, Echo):
+            self._on_echo(event)
+        elif isinstance(event, TextLine):
+            self._on_text(event, now)
+        super().on_event(event, now)
+
+    def _on_echo(self, event: Echo) -> None:
+        self._echoes = True
+        self._unsure = [each for each in self._unsure if each.strip() != event.raw]
+        if self._wanted and event.raw == self._wanted:
+            self._wanted = b""
+            self._stands, self._stands_since = 0, event.at
+
+    def _on_text(self, event: TextLine, now: float) -> None:
+        if _BOOT.search(event.raw):
+            if self._setup is not Setup.LISTEN:
+                self._on_restart("it prints the text of a boot", now)
+            self._setup_at = max(self._setup_at, now + BOOT_QUIET_S)
+        elif self._setup is Setup.LISTEN:  # a boot goes on
+            self._setup_at = max(self._setup_at, now + BOOT_QUIET_S if self._setup_at > now + LISTEN_S else now)
+
+    def _on_restart(self, why: str, now: float) -> None:
+        """Take the permission to drive back: a reset has forgotten the chassis, the dead-man and the stream."""
+        words = f"{self._model.name} has restarted: {why}. The gateway sets it up again, and stops it first."
+        self._log.log(Level.WARNING, "car_restarted", words, now)
+        self._forget_car(now + BOOT_QUIET_S)
+        self.recover(words, now)
+        if now > self._moved_at + IN_FLIGHT_S:
+            self._wait_for_setup()  # else the car may read a motion of ours when it has started: the stop comes behind
+
+    def on_reading(self, event: Event, now: float) -> None:
+        """Take a feedback: the firmware, the wheels, the voltage."""
+        if not isinstance(event, Feedback):
+            return
+        if event.firmware is not None and event.firmware is not self._firmware:
+            self._on_firmware(event.firmware, now)
+        self._say_what_it_shows()
+        self._was_heard = True
+        gap_s, self._feedback_at = event.at - self._feedback_at, event.at
+        self._in_rhythm = self._in_rhythm + 1 if 0.8 < 1000 * gap_s / STREAM_MS < 1.5 else 0
+        if self._is_reset(event):
+            self._on_restart("the way of its wheels began at zero again", now)
+            return
+        if event.voltage_v is not None:
+            self.on_voltage(event.voltage_v, now)
+        if self._is_measured:
+            self._on_wheels(event, now)
+
+    def _say_what_it_shows(self) -> None:
+        if self._here is None or not self._here.has_encoders:
+            words = "its wheel speeds are not measured; its dead-man stops it if nothing drives it"
+        elif not all(self._turned):
+            words = "it was not driven since its set-up, so nothing shows that its encoders count"
+        elif not self._echoes:
+            words = "it does not repeat our lines, so nothing shows when it got the stop"
+        else:
+            words = "its wheel speeds show that it stands"
+        self._model.shows_words = words
+
+    def _is_reset(self, event: Feedback) -> bool:
+        before, self._odometer_m = self._odometer_m, event.odometer_m or self._odometer_m
+        return before is not None and max(map(abs, before)) > 0.5 and event.odometer_m == (0.0, 0.0)
+
+    def _on_firmware(self, firmware: Firmware, now: float) -> None:
+        model = self._model
+        self._firmware = firmware
+        name, here = model.profile.name, self._here
+        evidence = (f"its feedback is that of {firmware}",)
+        contradictions = () if here is not None else (f"{name} cars do not have {firmware}",)
+        model.findings = Findings(evidence, contradictions)
+        if here is None:
+            fits = ", ".join(each for each, row in PLATFORMS.items() if firmware in row)
+            words = f"{model.name} runs {firmware}, which {name} cars do not: it is not driven. With it: {fits}."
+            self._log.log(Level.WARNING, "platform_contradicted", words, now)
+        model.shows = Shows.UNKNOWN if here is not None and here.has_encoders else Shows.NO
+        if self._setup is Setup.PROBE:
+            self._setup_at = now
+
+    def _on_wheels(self, event: Feedback, now: float) -> None:
+        """Take measured wheel speeds: as evidence of a stop, of encoders, or of a motion that nobody commanded."""
+        model = self._model
+        turning = [abs(speed) >= TURNS_M_S for speed in (event.left_m_s, event.right_m_s)]
+        if model.motors is Motors.ON:
+            self._turned = [seen or turns for seen, turns in zip(self._turned, turning, strict=True)]
+        self._check_stuck(turning, now)
+        stands = event.left_m_s == 0.0 and event.right_m_s == 0.0
+        if stands and self._stands_since is not None and not self._wanted and event.at > self._stands_since:
+            self._stands += 1
+            if self._stands >= STANDS_REPORTS and event.at >= self._stands_since + STANDS_S and all(self._turned):
+                model.shows = Shows.YES
+                self.show_rest(f"{self._stands} feedbacks of standing wheels since it repeated the stop", now)
+        elif not stands and self._stands_since is not None:
+            self._stands, self._stands_since = 0, event.at
+        self._unasked = self._unasked + 1 if any(turning) and model.at_rest else 0
+        if self._unasked >= UNASKED_REPORTS:
+            self._unasked = 0
+            words = (
+                f"{model.name} moves, and nobody here drives it. Its own web page, a remote by radio or a mission may: "
+                "close the page, and change the password of its Wi-Fi. The gateway stops it."
+            )
+            if now >= self._named_at + UNASKED_LOG_S:
+                self._named_at = now
+                self._log.log(Level.WARNING, "moves_unasked", words, now)
+            self.recover(words, now)
+
+    def _check_stuck(self, turning: list[bool], now: float) -> None:
+        """End a drive in which a wheel stands: the speed control gives it more and more power until it turns."""
+        held, model = self.queue.held, self._model
+        drives = model.motors is Motors.ON and held is not None and held.began_at is not None
+        if not drives or all(turning):
+            self._stuck_since = None
+            return
+        self._stuck_since = now if self._stuck_since is None else self._stuck_since
+        if now < self._stuck_since + STUCK_S:
+            return
+        self._stuck_since = None
+        sides = " and ".join(side for side, turns in zip(("left", "right"), turning, strict=True) if not turns)
+        words = f"{model.name} is stopped: its {sides} wheel stands in a drive. Is it blocked, or an encoder loose?"
+        self._log.log(Level.WARNING, "wheel_stands", words, now)
+        self.release(Phase.FAILED, Reason.STUCK, words, now)
+
+    # ------------------------------------------------------------------ set-up
+
+    def link_up(self, now: float) -> None:
+        """Listen first: the link is open."""
+        self._lines = Lines()
+        self._sent.clear()
+        self._firmware = None
+        self._forget_car(now + LISTEN_S)
+        super().link_up(now)
+        self._wait_for_setup()
+
+    def _wait_for_setup(self) -> None:
+        """Let the gateway's own stop wait for the end of a boot, unless a person asked for it."""
+        if self._stop is not None and not self._stop.commands:
+            self._stop.next_at = max(self._stop.next_at, self._setup_at)
+
+    def stop(self, why: FrameOrigin, now: float, pending: Any = None) -> None:
+        """Stop the car by all means. A stop that somebody asked for waits for nothing."""
+        super().stop(why, now, pending)
+        if self._stop is not None and self._stop.index == 0:
+            self._stop.next_at = now
+
+    def tick(self, now: float) -> None:
+        """Stop a car that is silent for too long, and set it up again."""
+        if self._setup is Setup.LISTEN:
+            self._wait_for_setup()
+            return
+        was_heard = self._model.is_heard
+        super().tick(now)
+        if was_heard and not self._model.is_heard:
+            self._forget_car(now)
+            self._firmware = None
+
+    def wait_words(self, now: float) -> str:
+        """Return what must happen before the car may be driven."""
+        del now
+        if self._setup is Setup.READY:
+            return ""
+        return "its answer" if self._setup is Setup.PROBE else "its set-up"
+
+    def setup_at(self) -> float:
+        """Return when the next frame of the set-up is due."""
+        return float("inf") if self._setup is Setup.READY else self._setup_at
+
+    def setup_frame(self, now: float) -> bytes | None:
+        """Return the next question or setting, if one is due."""
+        if now < self.setup_at():
+            return None
+        if self._setup is Setup.LISTEN:
+            self._setup = Setup.PROBE
+        if self._setup is Setup.PROBE:
+            here = self._here
+            if here is None:
+                self._setup_at = now + PROBE_S
+                return b"\n" + line(POLL)
+            self._setup, self._tries = Setup.CONFIGURE, 0
+            self._unsure = [line(CHASSIS, main=here.main, module=0), line(DEAD_MAN, cmd=DEAD_MAN_MS)]
+            self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
+            self._frames.extend(self._unsure)
+        if self._frames:
+            # After the last one, time for its echo.
+            self._setup_at = now + (SETUP_GAP_S if len(self._frames) > 1 else CONFIRM_S)
+            return self._frames.popleft()
+        self._tries += self._was_heard
+        self._was_heard = False
+        is_enough = self._tries >= (SILENT_TRIES if self._in_rhythm >= STANDS_REPORTS else BLIND_TRIES)
+        if self._unsure and (self._echoes or not is_enough):
+            self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
+            self._frames.extend(self._unsure)
+            return None
+        self._setup = Setup.READY
+        self._model.heard_at = max(now, self._model.heard_at or now)  # the stream begins now
+        return None
+
+    # ------------------------------------------------------------------ frames out
+
+    def refusal(self, what: Action) -> str | None:
+        """Return why this car cannot do it in any state; None if it can."""
+        if isinstance(what, Drive) and self._firmware is not None and self._here is None:
+            name = self._model.profile.name
+            return f"{self.desk.car} runs {self._firmware}, which {name} cars do not. Correct `platform:`."
+        return super().refusal(what)
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        """Return the line of a motion. Zero is sent as such; nothing exceeds FULL_SPEED."""
+        speed = min(FULL_SPEED, max(0.0, FULL_SPEED * min(self._model.speed, self.desk.speed_max)))
+        left, right = (round(speed * share, 3) for share in _SIDES[motion])
+        return line(DRIVE, L=left, R=right)
+
+    def on_written(self, write: OutgoingFrame, now: float) -> None:
+        """Note a motion that is on its way."""
+        super().on_written(write, now)
+        if self._model.motors is Motors.ON:
+            self._moved_at = now
+
+    def stop_frame(self, index: int) -> bytes:
+        """Return a line of a stop: the duty to zero at once, then the speed, twice. The number marks its echo."""
+        self._number += 1
+        if index == 0:
+            return b"\n" + line(PWM, L=0, R=0, n=self._number)  # ends a line that a lost link has cut
+        return line(DRIVE, L=0, R=0, n=self._number)
+
+    def on_stop_written(self, data: bytes, now: float) -> None:
+        """Wait for the echo of the last line of a stop."""
+        del now
+        self._wanted, self._stands_since, self._stands = data.strip(), None, 0
+
+    @property
+    def can_show(self) -> bool:
+        """Return True if standing wheels would show a stop now."""
+        return self._is_measured and all(self._turned) and self._echoes
+
+    def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
+        """Return the lines for the lights, which are the two switched outputs."""
+        match what:
+            case SetLight(Light.WHITE | Light.OFF as light):
+                return (_light(is_on=light is Light.WHITE),)
+            case Find():
+                return tuple(_light(is_on=index % 2 == 0) for index in range(6))
+            case _:
+                return None
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail all commands: the link is down."""
+        super().link_down(reason, now, cause=cause)
+        self._firmware = None
+        self._forget_car(now)
+
+
+def _light(*, is_on: bool) -> bytes:
+    value = 255 if is_on else 0
+    return line(OUTPUTS, IO4=value, IO5=value)

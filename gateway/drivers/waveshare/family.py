@@ -1,0 +1,30 @@
+"""Waveshare's UGV family, for `gateway.drivers`."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from gateway.drivers.plain import PlainProfile
+from gateway.drivers.waveshare import chassis
+from gateway.drivers.waveshare.chassis import profile_of
+
+if TYPE_CHECKING:
+    from gateway.control.driver import Desk
+    from gateway.drivers.waveshare.driver import WaveshareDriver
+
+__all__ = ["PLATFORMS", "driver_of", "profile_of", "profiles"]
+
+PLATFORMS: Final = tuple(chassis.PLATFORMS)
+
+
+def profiles() -> tuple[PlainProfile, ...]:
+    """Return the profile of each platform."""
+    return tuple(profile_of(name) for name in PLATFORMS)
+
+
+def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], WaveshareDriver]":
+    """Return the driver of a car. Nothing of these cars is kept; raise ValueError."""
+    from gateway.drivers.waveshare.driver import WaveshareDriver
+
+    del kept
+    profile = profile_of(name)
+    return lambda desk: WaveshareDriver(desk, profile)

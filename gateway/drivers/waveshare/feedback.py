@@ -1,0 +1,116 @@
+"""Turns one line of such a car into events. Pure; any bytes are allowed.
+
+The firmwares mix JSON with text, and print some JSON without a line end. So a line may hold text, several objects, and
+the begin of one that the link has cut. Each becomes an event of its own.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+from gateway.control.driver import Event, Rejected, TextLine
+from gateway.drivers.waveshare.chassis import Firmware
+from schemas.words import Cause
+
+FEEDBACK: Final = 1001
+"""`T` of a feedback."""
+MAX_M_S: Final = 5.0
+MAX_V: Final = 13.0
+"""Maximum speed of a wheel, and of the voltage of three cells. A greater number is no measurement."""
+_IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
+_DECODER: Final = json.JSONDecoder()
+
+
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """One report. None: it has no such field. `at` is the time of the last byte."""
+
+    raw: bytes
+    at: float
+    firmware: Firmware | None
+    """None if its fields are those of neither, or of both."""
+    left_m_s: float
+    right_m_s: float
+    """Speeds of the wheels as the car says them. `Chassis.has_encoders` decides whether they are measured."""
+    voltage_v: float | None
+    attitude_rad: tuple[float, float, float] | None
+    """Roll, pitch, yaw."""
+    odometer_m: tuple[float, float] | None
+    imu_raw: tuple[float, ...] | None
+    """Gyroscope and acceleration x, y, z, without a unit."""
+
+
+def read_line(line: bytes, at: float) -> list[Event]:
+    """Return the events in one line, without its end."""
+    text = line.decode("latin-1")
+    events: list[Event] = []
+    place = 0
+    while place < len(text):
+        start = text.find("{", place)
+        plain = text[place : start if start >= 0 else len(text)]
+        if plain.strip(" .\r\t"):
+            events.append(TextLine(plain.encode("latin-1"), at))
+        if start < 0:
+            break
+        try:
+            found, place = _DECODER.raw_decode(text, start)
+        except (ValueError, RecursionError):
+            # What follows may be whole: a cut object and the next one can share a line.
+            place = text.find("{", start + 1)
+            place = place if place >= 0 else len(text)
+            events.append(Rejected(text[start:place].encode("latin-1"), at, Cause.TRUNCATED))
+            continue
+        events.append(_event(found, text[start:place].encode("latin-1"), at))
+    return events
+
+
+def _event(found: Any, raw: bytes, at: float) -> Event:
+    if not isinstance(found, dict) or found.get("T") != FEEDBACK:
+        return TextLine(raw, at)
+    left, right = _number(found, "L"), _number(found, "R")
+    if left is None or right is None:
+        return Rejected(raw, at, Cause.BAD_NUMBER if "L" in found and "R" in found else Cause.MISSING_WORD)
+    if max(abs(left), abs(right)) > MAX_M_S:
+        return Rejected(raw, at, Cause.OUT_OF_RANGE)
+    firmware = _firmware(found)
+    return Feedback(
+        raw,
+        at,
+        firmware,
+        left,
+        right,
+        _voltage(found, firmware),
+        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is Firmware.GENERAL else None,
+        _tuple(found, ("odl", "odr"), 0.01) if firmware is Firmware.ROS else None,
+        _tuple(found, _IMU, 1.0) if firmware is Firmware.ROS else None,
+    )
+
+
+def _firmware(found: dict[str, Any]) -> Firmware | None:
+    """Return which firmware reports like this: one has a temperature, the other the way of its wheels."""
+    is_general, is_ros = "temp" in found, "odl" in found and "odr" in found
+    if is_general is is_ros:
+        return None
+    return Firmware.GENERAL if is_general else Firmware.ROS
+
+
+def _voltage(found: dict[str, Any], firmware: Firmware | None) -> float | None:
+    """Return the voltage. One firmware sends volts, the other hundredths of a volt."""
+    value = _number(found, "v")
+    if value is None or firmware is None:
+        return None
+    volts = value if firmware is Firmware.GENERAL else value / 100
+    return volts if 0.0 < volts <= MAX_V else None
+
+
+def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:
+    values = [_number(found, name) for name in names]
+    return None if any(each is None for each in values) else tuple(unit * (each or 0.0) for each in values)
+
+
+def _number(found: dict[str, Any], name: str) -> float | None:
+    value = found.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # nor NaN
+        return None
+    return float(value)

@@ -1,0 +1,456 @@
+"""A car of Waveshare's UGV family: its two firmwares, with what makes them dangerous. Pure.
+
+docs/reference/waveshare.md has what the programs do, each with its place in their source. Nobody has measured these
+cars. What the source does not say is a guess here: the time of one turn of the program's loop, how fast the motors
+follow, and the pauses of a boot.
+
+The program is one loop: take the lines that wait, control the speed, report, check the dead-man. Whatever blocks the
+loop (a delay, a mission) keeps the dead-man from being checked, too.
+"""
+
+import json
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import degrees, inf
+from typing import Any, Final
+
+from gateway.sim.model.car_body import TOP_SPEED_M_S, CarBody
+from gateway.sim.model.firmware import Pose, Rng, Truth
+from gateway.sim.model.ir_remote import SIGNS, Button
+from gateway.sim.model.scheduler import EventScheduler
+from schemas.words import Mode
+
+UGV_BYTES_PER_S: Final = 11520.0
+LOOP_S: Final = 0.01
+SPEED_LOOP_S: Final = 0.1
+FOLLOW: Final = 0.35
+"""Share of the way to the new speed that the motors go in one turn of the loop: they stand after some 0.1 s."""
+UGV_DEAD_MAN_S: Final = 3.0
+UGV_LIMIT_M_S: Final = 2.0
+"""Beyond it a closed loop ignores the whole command, and is fed by it all the same."""
+MAX_DOCUMENT: Final = 256
+BATTERY_S: Final = 10.0
+PAGE_S: Final = 1.5
+"""Interval at which the car's own web page drives it on, for as long as it is open."""
+KP: Final = 20.0
+KI_PER_TURN: Final = 200.0
+DEAD_DUTY: Final = 23.0
+"""Duty below this is zero."""
+_ROM: Final = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805e4\r\n"
+_SETUP: Final = (
+    (0.3, b"INA219 initialized.\r\n"),
+    (0.6, b"LittleFS mounted.\r\n"),
+    (1.2, b"All bus servos status checked.\r\n"),
+    (1.3, b"AP SSID: UGV\r\n......"),
+    (1.9, b"\r\nServer Starts.\r\n"),
+)
+"""What a boot prints, by the time since the ROM's text."""
+BOOT_S: Final = 2.0
+"""Time from a reset until the loop runs."""
+UART_S: Final = 0.3
+"""Time from a reset until the program has its UART. Bytes that arrive before are lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class UgvBuild:
+    """One product: its firmware, and the chassis that it really is."""
+
+    is_ros: bool
+    main: int
+    has_encoders: bool
+
+
+UGV_BUILDS: Final[Mapping[str, UgvBuild]] = {
+    "wave_rover": UgvBuild(is_ros=False, main=1, has_encoders=False),
+    "ugv01": UgvBuild(is_ros=False, main=3, has_encoders=True),
+    "ugv02": UgvBuild(is_ros=False, main=2, has_encoders=False),
+    "ugv_rover": UgvBuild(is_ros=True, main=2, has_encoders=True),
+    "ugv_beast": UgvBuild(is_ros=True, main=3, has_encoders=True),
+}
+
+
+class UgvCar:
+    """One car and its UART on virtual time. Times: s from any origin, that must not run backwards.
+
+    options: `mission` (its boot mission drives for 2 s), `no_encoder` (a loose wire: the left encoder counts nothing),
+    `quiet` (`T:605` is 0: no echo).
+    """
+
+    def __init__(
+        self, build: UgvBuild, body: CarBody, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0
+    ) -> None:
+        self._build = build
+        self._body = body
+        self._rng = rng
+        self._options = options
+        self._now = now
+        self._arrivals: deque[tuple[float, bytes]] = deque()
+        self._free_at = now
+        self._out: deque[tuple[float, bytes]] = deque()
+        self._tx_free = now
+        self._kept_main = 2 if build.is_ros else 1
+        """The chassis after a reset. The ROS firmware keeps what it was told."""
+        self._odometer = [0.0, 0.0]
+        self._wheels = [0.0, 0.0]
+        """The true speed of each wheel, m/s."""
+        self._page: tuple[int, int] | None = None
+        """The motion of the web page that is open, by the sign of each side."""
+        self.scheduler: EventScheduler | None = None
+        self.alive: Final = True
+        self.runaway_since: float | None = None
+        """Since when the motors are on while the dead-man is not armed; None if they are not."""
+        self.wrong_since: float | None = None
+        """Since when it drives by a line of its host while it was told another chassis; None if it does not."""
+        self._reset(now, text=False)
+        self._boot_until = now  # it has run for a while
+        self._mission: list[tuple[float, str]] = []
+
+    # ------------------------------------------------------------------ the calls of the simulation
+
+    @property
+    def truth(self) -> Truth:
+        """The true state. The motors' numbers are the duty, -255..255."""
+        left, right = (round(each) for each in self._duty)
+        light = "#ffffff" if self._outputs[0] else "off"
+        speed = round(255 * max(abs(self._target[0]), abs(self._target[1])))
+        return Truth(
+            Mode.MANUAL,
+            left,
+            right,
+            blocked=self._blocked_until > self._now,
+            fan=False,
+            led=light,
+            servo=90,
+            speed=speed,
+            alive=True,
+        )
+
+    @property
+    def moving(self) -> bool:
+        """True if a wheel turns."""
+        return any(abs(each) > 0.005 for each in self._wheels)
+
+    def pose(self, now: float) -> Pose:
+        """Return the true pose."""
+        return self._body.pose(now)
+
+    def feed(self, data: bytes, now: float) -> None:
+        """Put bytes on the link; they reach the car at the rate of its UART."""
+        self._run(now)
+        self._free_at = max(now, self._free_at) + len(data) / UGV_BYTES_PER_S
+        if self._free_at >= self._uart_from:
+            self._arrivals.append((self._free_at, data))
+
+    def advance(self, now: float) -> list[tuple[float, bytes]]:
+        """Run up to `now`; return the pieces sent since the last call."""
+        self._run(now)
+        sent = []
+        while self._out and self._out[0][0] <= now:
+            sent.append(self._out.popleft())
+        return sent
+
+    def next_event(self) -> float:
+        """Return the time of the next event."""
+        return min(self._next_turn, self._out[0][0] if self._out else inf)
+
+    def backlog(self, now: float) -> int:
+        """Return the number of bytes still on the wire."""
+        return sum(len(data) for at, data in self._arrivals if at > now)
+
+    def drop_link(self, now: float) -> None:
+        """Cut the link: what is on the way is lost. A partial line stays in the car for ever."""
+        self._run(now)
+        self._arrivals.clear()
+        self._out.clear()
+
+    def brown_out(self, now: float) -> None:
+        """Reset the car."""
+        self._run(now)
+        self._reset(now, text=True)
+
+    def press(self, button: Button, now: float) -> bool:
+        """Press a button of the car's own web page; it drives on until `stop`, or until the page is closed."""
+        self._run(now)
+        if button not in SIGNS:
+            return False
+        self._page = None
+        if button is not Button.STOP:
+            self._page = SIGNS[button]
+        self._page_at = now
+        if button is Button.STOP:
+            self._obey({"T": 1, "L": 0, "R": 0})
+        return True
+
+    def due(self) -> float:
+        """Return the time at which the program next runs."""
+        return self._next_turn
+
+    def run_alone(self, now: float) -> None:
+        """Run this program up to `now`."""
+        while self._next_turn <= now:
+            self._now = self._next_turn
+            self._next_turn += LOOP_S
+            self._turn()
+        self._now = max(self._now, now)
+
+    def _run(self, now: float) -> None:
+        if self.scheduler is None:
+            self.run_alone(now)
+        else:
+            self.scheduler.run(now)
+
+    # ------------------------------------------------------------------ a reset
+
+    def _reset(self, now: float, *, text: bool) -> None:
+        """Forget everything that is in RAM, as a reset does."""
+        ros = self._build.is_ros
+        self._main = self._kept_main
+        self._loop_on = True
+        self._target = [0.0, 0.0]
+        self._integral = [0.0, 0.0]
+        self._duty = [0.0, 0.0]
+        self._raw = False
+        """True after `T:11`: the duty is as commanded, without the speed loop."""
+        self._outputs = (0, 0)
+        self._dead_man_s = UGV_DEAD_MAN_S
+        self._fed_at = now
+        self._timed_out = False
+        self._uncovered = False
+        """True if something drives that the dead-man does not see."""
+        self._stream = ros
+        self._gap_s = 0.05 if ros else 0.0
+        self._echo = not ros
+        self._talks = "quiet" not in self._options
+        self._rate = [1.0, 1.0]
+        self._reported_at = -inf
+        self._line = bytearray()
+        self._blocked_until = -inf
+        self._page = None
+        self._page_at = inf
+        self._volts: tuple[float, float] = (self._body.battery_v(now) * 1.5, now)
+        self._speed_at = now
+        self._odometer = [0.0, 0.0]
+        self._next_turn = now + LOOP_S
+        self._boot_until = now + BOOT_S
+        self._arrivals.clear()
+        self._uart_from = now + UART_S
+        self._mission = [(now + BOOT_S, '{"T":1,"L":0.3,"R":0.3}'), (now + BOOT_S + 2.0, '{"T":1,"L":0,"R":0}')]
+        if "mission" not in self._options:
+            self._mission = []
+        if text:
+            self._print(_ROM)
+            for at, words in _SETUP:
+                self._out.append((now + at, words))
+            self._tx_free = now + _SETUP[-1][0]
+
+    # ------------------------------------------------------------------ one turn of the loop
+
+    def _turn(self) -> None:
+        now = self._now
+        if now >= self._boot_until:
+            self._run_mission(now)
+            if now >= self._blocked_until and not self._mission:
+                self._take_lines(now)
+                self._press_on(now)
+                self._control(now)
+                self._report(now)
+                self._check_dead_man(now)
+        self._move(now)
+
+    def _run_mission(self, now: float) -> None:
+        """Play the boot mission: a step at its time, unless a byte waits on the UART. Its duty counts at once."""
+        while self._mission and now >= self._mission[0][0]:
+            if self._arrivals and self._arrivals[0][0] <= now:
+                self._mission.clear()
+                return
+            self._obey(json.loads(self._mission.pop(0)[1]))
+            if not self._is_closed:
+                self._control(now)
+
+    def _press_on(self, now: float) -> None:
+        if self._page is not None and now >= self._page_at:
+            self._page_at = now + PAGE_S
+            self._obey({"T": 1, "L": 0.3 * self._page[0], "R": 0.3 * self._page[1]})
+
+    @property
+    def _is_closed(self) -> bool:
+        """True if this firmware controls the speed of the chassis that it was told."""
+        return self._build.is_ros or self._main == 3
+
+    def _control(self, now: float) -> None:
+        """Compute the duty of the motors: each 100 ms with a closed loop, at once with an open one."""
+        if self._raw:
+            return
+        if not self._is_closed:
+            self._duty = [max(-255.0, min(255.0, 512.0 * each)) for each in self._target]
+            return
+        if now < self._speed_at + SPEED_LOOP_S:
+            return
+        self._speed_at = now
+        for side in (0, 1):
+            target, measured = self._target[side], self._measured(side)
+            if target == 0.0 and measured == 0.0:
+                self._integral[side] = self._duty[side] = 0.0
+                continue
+            error = target - measured
+            self._integral[side] = max(-255.0, min(255.0, self._integral[side] + KI_PER_TURN * error))
+            duty = max(-255.0, min(255.0, KP * error + self._integral[side]))
+            self._duty[side] = duty if abs(duty) >= DEAD_DUTY else 0.0
+
+    def _measured(self, side: int) -> float:
+        """Return the speed by the encoder of a side. A loop that gets no signal winds up."""
+        if not self._build.has_encoders or ("no_encoder" in self._options and side == 0):
+            return 0.0
+        return self._sign * round(self._wheels[side], 3)
+
+    @property
+    def _sign(self) -> int:
+        """Return -1 if the program turns the motors the wrong way, because it was told another chassis."""
+        inverted = (3,) if self._build.is_ros else (2, 3)
+        return 1 if (self._main in inverted) is (self._build.main in inverted) else -1
+
+    def _check_dead_man(self, now: float) -> None:
+        """Stop once when nothing has fed the dead-man for its time. There is no message, and no latch."""
+        if not self._timed_out and 0.0 <= self._dead_man_s < now - self._fed_at:
+            self._timed_out, self._uncovered, self._raw = True, False, False
+            self._target = [0.0, 0.0]
+
+    def _feed_dead_man(self) -> None:
+        self._fed_at, self._timed_out, self._uncovered = self._now, False, False
+
+    def _move(self, now: float) -> None:
+        """Let the motors follow their duty, and the car its wheels."""
+        for side in (0, 1):
+            wanted = self._sign * TOP_SPEED_M_S * self._duty[side] / 255
+            self._wheels[side] += FOLLOW * (wanted - self._wheels[side])
+            if abs(self._wheels[side] - wanted) < 0.002:
+                self._wheels[side] = wanted
+            self._odometer[side] += abs(self._wheels[side]) * LOOP_S
+        pwm = [round(255 * each / TOP_SPEED_M_S) for each in self._wheels]
+        self._body.drive(now, pwm[0], pwm[1])
+        armed = self._dead_man_s >= 0.0 and not self._timed_out and not self._uncovered
+        drives = any(self._duty if self._raw else self._target)
+        self.runaway_since = (self.runaway_since or now) if drives and not armed else None
+
+    # ------------------------------------------------------------------ from the host
+
+    def _take_lines(self, now: float) -> None:
+        """Obey the whole lines that have arrived. A partial line waits for ever, and is glued to the next."""
+        while self._arrivals and self._arrivals[0][0] <= now:
+            self._line += self._arrivals.popleft()[1]
+        while (end := self._line.find(b"\n")) >= 0:
+            text = bytes(self._line[:end]).rstrip(b"\r")
+            del self._line[: end + 1]
+            self._on_line(text.decode("latin-1"))
+
+    def _on_line(self, text: str) -> None:
+        """Obey the first object of a line. Everything that is wrong with it is silent."""
+        if not text.strip() or len(text) > MAX_DOCUMENT:
+            return
+        try:
+            found, _ = json.JSONDecoder().raw_decode(text.strip())
+        except ValueError:
+            return
+        if self._echo and self._talks:
+            self._print(f"{text}\r\n".encode("latin-1"))
+        command = found if isinstance(found, dict) else {}
+        if command.get("T") in (1, 11, 13):
+            moves = any(_number(command, name) for name in "LRXZ") and self._main != self._build.main
+            self.wrong_since = (self.wrong_since or self._now) if moves else None
+        self._obey(command)
+
+    def _obey(self, command: Mapping[str, Any]) -> None:
+        try:
+            kind = int(float(command.get("T", 0)))
+        except (TypeError, ValueError):
+            return
+        left, right, number = (_number(command, name) for name in ("L", "R", "cmd"))
+        match kind:
+            case 0 if self._build.is_ros:
+                self._target, self._raw = [0.0, 0.0], False
+            case 1 if _is_number(command, "L") and _is_number(command, "R"):
+                self._feed_dead_man()
+                self._set_target(left, right)
+            case 11:
+                self._feed_dead_man()
+                self._raw = True
+                self._duty = [max(-255.0, min(255.0, each)) for each in (left, right)]
+            case 13:
+                forward, turn = _number(command, "X"), _number(command, "Z")
+                if self._build.is_ros:  # the dead-man does not see it
+                    self._uncovered = self._timed_out
+                else:
+                    self._feed_dead_man()
+                self._set_target(forward - turn * 0.0625, forward + turn * 0.0625)
+            case 111:
+                self._blocked_until = self._now + number / 1000
+            case 130:
+                self._report(self._now, asked=True)
+            case 131:
+                self._stream = bool(number)
+            case 132:
+                self._outputs = (round(min(255, max(0, _number(command, "IO4")))), round(_number(command, "IO5")))
+            case 136:
+                self._dead_man_s = number / 1000
+            case 138:
+                self._rate = [min(1.0, abs(left)), min(1.0, abs(right))]
+            case 142:
+                self._gap_s = abs(number) / 1000
+            case 143:
+                self._echo = bool(number)
+            case 405:
+                self._print(b'{"T":405,"ssid":"UGV"}')  # without a line end
+            case 600:
+                self._reset(self._now, text=True)
+            case 605:
+                self._talks = number != 0
+            case 900:
+                self._main = int(_number(command, "main"))
+                self._kept_main = self._main if self._build.is_ros else self._kept_main
+            case _:
+                pass
+
+    def _set_target(self, left: float, right: float) -> None:
+        """Set the speeds of a closed loop, or the shares of an open one. Too great ones leave the old speed."""
+        if self._is_closed and max(abs(left), abs(right)) > UGV_LIMIT_M_S:
+            return
+        self._raw = False
+        self._target = [left * self._rate[0], right * self._rate[1]]
+
+    # ------------------------------------------------------------------ to the host
+
+    def _report(self, now: float, *, asked: bool = False) -> None:
+        """Send a feedback, unless the last one was within the gap: that holds for a question, too."""
+        if not (asked or self._stream) or now < self._reported_at + max(self._gap_s, LOOP_S):
+            return
+        self._reported_at = now
+        if now >= self._volts[1] + BATTERY_S:
+            self._volts = self._body.battery_v(now) * 1.5, now
+        volts = self._volts[0]
+        wheels = {"L": round(self._measured(0), 3), "R": round(self._measured(1), 3)}
+        if self._build.is_ros:
+            gyro = round(16.4 * self._body.yaw_rate_deg_s(now))
+            imu = {"ax": 0, "ay": 0, "az": 8192, "gx": 0, "gy": 0, "gz": gyro, "mx": 1, "my": 2, "mz": 3}
+            way = {"odl": int(100 * self._odometer[0]), "odr": int(100 * self._odometer[1])}
+            fields: dict[str, float] = {"T": 1001, **wheels, **imu, **way, "v": int(100 * volts)}
+        else:
+            if asked and not self._is_closed and self._raw:
+                wheels = {"L": round(self._duty[0]), "R": round(self._duty[1])}  # the command itself
+            yaw = round(degrees(self._body.pose(now).heading_rad), 2)
+            fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
+        self._print(json.dumps(fields, separators=(",", ":")).encode() + b"\r\n")
+
+    def _print(self, data: bytes) -> None:
+        self._tx_free = max(self._now, self._tx_free) + len(data) / UGV_BYTES_PER_S
+        self._out.append((self._tx_free, data))
+
+
+def _is_number(command: Mapping[str, Any], name: str) -> bool:
+    value = command.get(name)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _number(command: Mapping[str, Any], name: str) -> float:
+    """Return a field. One that is missing, or no number, counts as 0."""
+    return float(command[name]) if _is_number(command, name) else 0.0
