@@ -11,7 +11,7 @@ import logging
 import random
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -36,7 +36,7 @@ from gateway.state_file import SafetyStateFile
 from schemas import bus
 from schemas.authority import People
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
-from schemas.links import car_link
+from schemas.links import BAUD, SerialUrl, UsbUrl, car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
@@ -71,6 +71,9 @@ LOOK_INTERVAL_S: Final = 10.0
 """Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
 FLOOD_LOG_PAUSE_S: Final = 10.0
 """Minimum pause after a flood before the next one is logged."""
+
+BITS_PER_BYTE: Final = 10
+"""Bits of a byte on a UART: 8N1."""
 
 log = logging.getLogger("gateway")
 
@@ -129,8 +132,9 @@ class CarGateway:
         self._mark = RunningMark(settings.state_dir, settings.fleet, settings.car)
         self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
-        self._health = LinkHealth(since=now, bytes_per_s=self._driver.bytes_per_s)
-        self._baud = BaudWatch(settings.url)
+        self._health = LinkHealth(since=now, bytes_per_s=self._driver.model.profile.baud / BITS_PER_BYTE)
+        self._url = _at_rate(settings.url, self._driver.model.profile.baud)
+        self._baud = BaudWatch(self._url)
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
@@ -139,7 +143,7 @@ class CarGateway:
         self._damaged = 0
         """Frames that were rejected since the last search for the trouble of the link."""
         self._look_at = now
-        self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(settings.url))
+        self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(self._url))
         self._wake = asyncio.Event()
         self._commands = CommandHandler(
             settings.fleet,
@@ -255,7 +259,7 @@ class CarGateway:
         looked_again = False
         while True:
             try:
-                link = await open_link(self._settings.url, first=self._may_move)
+                link = await open_link(self._url, first=self._may_move)
             except LinkError as error:
                 if not may_fail and not await self._is_port_in_use():
                     if looked_again or not isinstance(error, Busy):
@@ -268,7 +272,7 @@ class CarGateway:
             may_fail = True
             now = self._loop.time()
             self._link = link
-            self._baud = BaudWatch(self._settings.url)
+            self._baud = BaudWatch(self._url)
             self._health.on_open(now)
             self._control.link_up(now)
             if self._attempts.on_open(now):
@@ -306,7 +310,7 @@ class CarGateway:
         if self._learned_file.trouble:
             self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
             self._learned_file.trouble = ""
-        self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open. The gateway stops the car first.")
+        self._commands.log(Level.INFO, "link_open", f"{self._url} is open. The gateway stops the car first.")
 
     async def _read(self, link: Link) -> None:
         """Decode bytes until the link is lost."""
@@ -574,6 +578,11 @@ class CarGateway:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
             except bus.BusError as error:
                 self._commands.log(Level.ERROR, "no_hub", str(error))
+
+
+def _at_rate(url: LinkUrl, baud: int) -> LinkUrl:
+    """Return a link at the rate of its car, unless it names a rate of its own."""
+    return replace(url, baud=baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url
 
 
 async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> bool:

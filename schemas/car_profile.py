@@ -48,6 +48,10 @@ class CarProfile(Protocol):
         """The number of cells of its battery."""
 
     @property
+    def baud(self) -> int:
+        """The rate of its UART, baud."""
+
+    @property
     def dead_man_s(self) -> float | None:
         """The time after which the car stops by itself if nothing drives it; None if it drives on."""
 

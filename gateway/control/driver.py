@@ -263,11 +263,6 @@ class Driver(ABC):
         """What is claimed of the car."""
 
     @property
-    @abstractmethod
-    def bytes_per_s(self) -> float:
-        """Return the rate of the car's own wire, bytes/s."""
-
-    @property
     def lost_frames(self) -> int:
         """Return the number of stop frames that did not arrive, by the car's reports."""
         return 0

@@ -68,6 +68,7 @@ class PlainProfile:
     lights: frozenset[Light] = frozenset()
     servos: frozenset[ServoAction] = frozenset()
     cells: int = 2
+    baud: int = 115200
     dead_man_s: float | None = None
     not_observed: tuple[str, ...] = ()
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})
@@ -209,8 +210,6 @@ class PlainStop:
 class PlainDriver(Driver):
     """One car of a plain family. A family gives the class attributes and the abstract methods."""
 
-    BYTES_PER_S: ClassVar[float]
-    """The rate of the car's own wire."""
     STOP_FRAMES: ClassVar[int] = 1
     """Number of frames of a stop. Each try sends all of them."""
     STOP_GAP_S: ClassVar[float] = 0.1
@@ -286,11 +285,6 @@ class PlainDriver(Driver):
     def model(self) -> PlainModel:
         """What is claimed of the car."""
         return self._model
-
-    @property
-    def bytes_per_s(self) -> float:
-        """Return the rate of the car's own wire, bytes/s."""
-        return self.BYTES_PER_S
 
     def verdict(self, event: Event) -> str:
         """Return what kind of bytes these are."""

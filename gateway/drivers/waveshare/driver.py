@@ -130,7 +130,6 @@ def line(command: int, **fields: Any) -> bytes:
 class WaveshareDriver(PlainDriver):
     """One car of this family."""
 
-    BYTES_PER_S: ClassVar[float] = 11520.0
     STOP_FRAMES: ClassVar[int] = 3
     STOPS_WITHIN_S: ClassVar[float] = 0.7
     """Twice the longest turn of the firmware's loop (two searches for a servo, 0.2 s), and a brake from 0.5 m/s."""

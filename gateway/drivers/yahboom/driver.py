@@ -32,7 +32,6 @@ from gateway.drivers.yahboom.protocol.events import Event as WireEvent
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile
-from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
@@ -47,11 +46,6 @@ class YahboomDriver(Executor):
         super().__init__(desk, CarModel(desk.car, profile, auto, desk.log, desk.battery_policy, learned or Learned()))
         self._monitor = CarMonitor(self.model, self, desk.log)
         self._decoder = Decoder(head=profile.dialect.head)
-
-    @property
-    def bytes_per_s(self) -> float:
-        """Return the rate of the car's own wire, bytes/s."""
-        return BYTES_PER_S
 
     @property
     def lost_frames(self) -> int:

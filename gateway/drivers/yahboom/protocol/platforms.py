@@ -33,6 +33,7 @@ from gateway.drivers.yahboom.protocol.timing import (
     REPORT_INTERVAL_S,
     block_s,
 )
+from schemas.links import BAUD
 from schemas.platform_name import HEAD, NO_READINGS, OPTIONS, parse_name
 from schemas.words import Light, Mode, Motion, Platform, ServoAction, SpeedStep
 
@@ -177,6 +178,11 @@ class Profile:
     def cells(self) -> int:
         """The number of cells of its battery."""
         return 3 if "3s" in self.options else 2
+
+    @property
+    def baud(self) -> int:
+        """The rate of its UART, baud."""
+        return BAUD
 
     @property
     def dead_man_s(self) -> None:

@@ -1,0 +1,310 @@
+"""Checks a family of cars: `python -m gateway.drivers.check mypackage.family`. Pure, on virtual time.
+
+It tries what a gateway relies on with every driver, whatever its cars are: bytes of any kind, a stop at once, claims
+only from readings, an end. What is particular about a family it cannot know. Exit code 0: nothing found, 1: faults, 2:
+wrong use.
+"""
+
+import random
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from itertools import pairwise
+from typing import Any, Final
+
+from gateway.control.commands import (
+    Action,
+    AimServo,
+    ChangeSpeed,
+    Command,
+    Drive,
+    Fan,
+    Find,
+    Led,
+    MoveArm,
+    MoveServo,
+    SetLight,
+    SetMode,
+    Stop,
+    Whistle,
+)
+from gateway.control.controller import Controller
+from gateway.control.driver import Driver
+from gateway.control.events import CommandRecord
+from gateway.drivers import Family
+from schemas.authority import Sender
+from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
+from schemas.topics import TOPICS
+from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
+from schemas.words import Light as LightWord
+
+STEP_S: Final = 0.02
+TICK_S: Final = 0.2
+FIRST_STOP_S: Final = 1.0
+"""Maximum time from a person's stop to its first frame, unless a longer worst case is announced."""
+JOINED_S: Final = 7.0
+"""Maximum age of the last frame of a stop that goes on. A new one joins it, and waits for its next try."""
+MAX_FRAMES_AT_ONCE: Final = 50
+ACTIONS: Final[tuple[Action, ...]] = (
+    Led(1, 2, 3),
+    *(SetLight(light) for light in LightWord),
+    *(MoveServo(action) for action in ServoAction),
+    AimServo(90),
+    MoveArm((90,) * 6),
+    Whistle(),
+    ChangeSpeed(SpeedStep.UP),
+    ChangeSpeed(SpeedStep.DOWN),
+    Fan(),
+    Find(),
+    *(SetMode(mode) for mode in Mode),
+)
+_NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
+_PERSON: Final = Sender("ann@desk", Rank.PERSON)
+
+
+class Bench:
+    """A gateway's control with a driver, and a car that never says anything."""
+
+    def __init__(self, family: Family, platform: str) -> None:
+        self.control: Controller[Driver] = Controller("red", family.driver_of(platform, {}))
+        self.now = 100.0
+        self.sent: list[tuple[float, bytes, FrameOrigin]] = []
+        self.records: list[CommandRecord] = []
+        self.faults: list[str] = []
+        self._number = 0
+        self._tick_at = 0.0
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.now + seconds
+        while self.now < end:
+            self.now += STEP_S
+            if self.now >= self._tick_at:
+                self._tick_at = self.now + TICK_S
+                self.control.tick(self.now)
+            for event in self.control.driver.flush(self.now):
+                self.control.on_event(event, self.now)
+            self.write()
+
+    def write(self) -> None:
+        """Write what is due."""
+        for count in range(MAX_FRAMES_AT_ONCE + 1):
+            write = self.control.poll(self.now)
+            if write is None:
+                break
+            if count == MAX_FRAMES_AT_ONCE:
+                self.faults.append(f"more than {MAX_FRAMES_AT_ONCE} frames at one moment: {write.data!r}")
+                break
+            self.control.driver.sends(write.data, self.now)
+            self.control.on_written(write, self.now)
+            self.sent.append((self.now, write.data, write.why))
+        if self.control.next_at(self.now) < self.now:
+            self.faults.append("next_at lies before now")
+        self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
+
+    def ask(self, what: Action) -> str:
+        """Give a command as a person. Return its id."""
+        self._number += 1
+        command = Command(f"c{self._number}", "check", _PERSON, what)
+        self.control.command(command, self.now)
+        self.write()
+        return command.id
+
+    def last(self, command_id: str) -> CommandRecord | None:
+        """Return the last record of a command."""
+        return next((each for each in reversed(self.records) if each.command.id == command_id), None)
+
+
+def _connected(family: Family, platform: str) -> Bench:
+    bench = Bench(family, platform)
+    bench.control.link_up(bench.now)
+    bench.run(30.0)
+    return bench
+
+
+def check_profile(family: Family, platform: str) -> Iterator[str]:
+    """Check that a profile is a value, and names only what there is."""
+    profile = family.profile_of(platform)
+    if profile != family.profile_of(platform) or hash(profile) != hash(family.profile_of(platform)):
+        yield "profile_of returns another value each time"
+    if profile.name.partition("+")[0] != platform:
+        yield f"the profile is named {profile.name}"
+    if Mode.MANUAL not in profile.modes:
+        yield "it lacks mode manual"
+    topics = {each.removeprefix("sensor/") for each in TOPICS if each.startswith("sensor/")}
+    for mode in profile.modes:
+        if unknown := profile.measurable(mode) - topics:
+            yield f"it measures {', '.join(sorted(unknown))}, which are no topics"
+    for word in CAPABILITIES:
+        if word not in profile.capabilities and not profile.why_lacking(word):
+            yield f"why_lacking({word!r}) says nothing, and it is no capability"
+
+
+def check_bytes(family: Family, platform: str) -> Iterator[str]:
+    """Check that any bytes are taken, and that what they are does not depend on their pieces."""
+    moments = random.Random(1)  # noqa: S311 - no secret
+    bench = _connected(family, platform)
+    sent = b"".join(data for _, data, _ in bench.sent)
+    for _ in range(300):
+        data = moments.choice((moments.randbytes(moments.randrange(200)), sent[moments.randrange(len(sent)) :], b"\n"))
+        whole, pieces = (family.driver_of(platform, {}) for _ in range(2))
+        events = [Controller("red", each).driver for each in (whole, pieces)]
+        cut = moments.randrange(len(data) + 1)
+        one = [event.raw for event in events[0].feed(data, 1.0)]
+        two = [event.raw for piece in (data[:cut], data[cut:]) for event in events[1].feed(piece, 1.0)]
+        if one != two:
+            yield f"{data!r} makes other events if it comes in two pieces"
+            return
+        for event in bench.control.driver.feed(data, bench.now):
+            bench.control.driver.measured(event)
+            bench.control.driver.verdict(event)
+            bench.control.on_event(event, bench.now)
+        bench.run(0.1)
+
+
+def check_connect(family: Family, platform: str) -> Iterator[str]:
+    """Check that a car is stopped when its link opens, and that nothing is claimed that it has not shown."""
+    bench = _connected(family, platform)
+    if not bench.sent:
+        yield "nothing was written within 30 s after the link was opened: the car may drive"
+    if bench.control.driver.model.basis is Basis.SHOWN:
+        yield "a car that said nothing counts as one that has shown its stop"
+
+
+def check_stop(family: Family, platform: str) -> Iterator[str]:
+    """Check that a person's stop goes out in time at any moment, and never counts as shown without a reading."""
+    for wait_s in (0.0, 0.05, 0.6, 3.0, 30.0):
+        bench = Bench(family, platform)
+        bench.control.link_up(bench.now)
+        bench.run(wait_s)
+        asked_at = bench.now
+        stop = bench.ask(Stop())
+        bench.run(30.0)
+        announced_s = max((each.worst_case_s for each in bench.records if each.command.id == stop), default=0.0)
+        # It may join a stop that goes on: then the frames of that one count.
+        from_s, until_s = asked_at - JOINED_S, asked_at + max(FIRST_STOP_S, announced_s)
+        if not any(from_s <= at <= until_s for at, _, _ in bench.sent):
+            yield f"no frame of a stop within {until_s - asked_at:g} s, {wait_s:g} s after the link was opened"
+        last = bench.last(stop)
+        if last is None or last.phase not in (Phase.SENT, Phase.FAILED):
+            yield f"a stop that nothing shows ends as {last.phase if last else 'nothing'}, not as sent or failed"
+
+
+def check_drive(family: Family, platform: str) -> Iterator[str]:
+    """Check that a drive goes out or fails, ends with a stop, and is repeated for a dead-man."""
+    bench = _connected(family, platform)
+    began, before = bench.now, len(bench.sent)
+    drive = bench.ask(Drive(Motion.FORWARD, 4.0))
+    bench.run(MAX_QUEUE_TIME_S + 10.0)
+    last = bench.last(drive)
+    if last is None or last.phase in (Phase.ASKED, Phase.QUEUED):
+        yield "a drive waits for ever"
+    moved = any(each.command.id == drive and each.phase is Phase.SENT for each in bench.records)
+    if not moved:
+        return
+    frames = bench.sent[before:]
+    dead_man_s = family.profile_of(platform).dead_man_s
+    during = [at for at, _, _ in frames if at <= began + 4.0]
+    gaps = [b - a for a, b in pairwise(during)]
+    if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
+        yield f"a held motion is not repeated within half of its dead-man of {dead_man_s:g} s"
+    stops = (FrameOrigin.STOP, FrameOrigin.RECOVERY)
+    if not any(why in stops for _, _, why in frames[1:]):
+        yield "the end of a drive sends no stop"
+    if bench.control.driver.model.motors is Motors.ON:
+        yield "the motors count as on after the drive"
+
+
+def check_actions(family: Family, platform: str) -> Iterator[str]:
+    """Check that each action has frames, or a refusal in words."""
+    bench = _connected(family, platform)
+    driver = bench.control.driver
+    for what in ACTIONS:
+        refusal = driver.refusal(what)
+        if refusal is not None and not refusal:
+            yield f"{what} is refused without a word"
+        if refusal is None and not isinstance(what, SetMode | Find) and not driver.frames(what):
+            yield f"{what} is accepted, and has no frames"
+        if isinstance(what, SetMode) and (refusal is None) != (what.mode in driver.model.profile.modes):
+            yield f"{what} is {'accepted' if refusal is None else 'refused'}, unlike its profile says"
+
+
+def check_loss(family: Family, platform: str) -> Iterator[str]:
+    """Check that a lost link ends what waits, and that a stop goes first when it is back."""
+    bench = _connected(family, platform)
+    stop = bench.ask(Stop())
+    bench.run(0.1)
+    bench.control.link_down("unplugged", bench.now)
+    bench.write()
+    before = len(bench.sent)
+    bench.run(5.0)
+    if len(bench.sent) > before:
+        yield "frames are written without a link"
+    last = bench.last(stop)
+    if last is None or last.phase in (Phase.ASKED, Phase.QUEUED):
+        yield "a stop stays open when its link is lost"
+    if bench.control.driver.model.motors is Motors.OFF:
+        yield "the motors count as off without a link"
+    bench.control.link_up(bench.now)
+    bench.run(10.0)
+    if len(bench.sent) == before:
+        yield "nothing is written when the link is back"
+
+
+def check_end(family: Family, platform: str) -> Iterator[str]:
+    """Check that a gateway which ends stops its car, and ends in time."""
+    bench = _connected(family, platform)
+    before = len(bench.sent)
+    bench.control.shut_down(bench.now)
+    bench.run(SHUTDOWN_S + 1.0)
+    if not bench.control.driver.finished:
+        yield f"it has not ended {SHUTDOWN_S:g} s after it was told to"
+    if len(bench.sent) == before:
+        yield "it ends without a stop of a car that has shown nothing"
+
+
+CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
+    check_profile,
+    check_bytes,
+    check_connect,
+    check_stop,
+    check_drive,
+    check_actions,
+    check_loss,
+    check_end,
+)
+
+
+def check(family: Family) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield platform, check and faults, for each check of each platform."""
+    for platform in family.PLATFORMS:
+        for each in CHECKS:
+            yield platform, each.__name__, list(each(family, platform))
+
+
+def main(arguments: list[str]) -> int:
+    """Check the families of the modules that are named. Return the exit code."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        sys.stdout.write(f"{__doc__}\nexample:\n  python -m gateway.drivers.check gateway.drivers.waveshare.family\n")
+        return 0 if arguments else 2
+    found = 0
+    for name in arguments:
+        try:
+            family: Any = import_module(name)
+            missing = [each for each in _NAMES if not hasattr(family, each)]
+        except ImportError as error:
+            sys.stderr.write(f"gateway.drivers.check: {name} cannot be imported: {error}\n")
+            return 2
+        if missing:
+            sys.stderr.write(
+                f"gateway.drivers.check: {name} has no {', '.join(missing)} (see gateway/drivers/__init__.py)\n"
+            )
+            return 2
+        for platform, what, faults in check(family):
+            found += len(faults)
+            sys.stdout.write(f"{platform} {what.removeprefix('check_')}: {'; '.join(faults) or 'ok'}\n")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
