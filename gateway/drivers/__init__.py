@@ -18,8 +18,9 @@ from schemas.words import Platform
 if TYPE_CHECKING:
     from gateway.control.driver import Desk, Driver
 
+YAHBOOM: Final = "yahboom"
 BUILT_IN: Final = {
-    "yahboom": "gateway.drivers.yahboom.family",
+    YAHBOOM: "gateway.drivers.yahboom.family",
     "waveshare": "gateway.drivers.waveshare.family",
 }
 """Module of each family that comes with the gateway."""
@@ -96,7 +97,7 @@ def family_name(platform: str) -> str:
     """Return the name of the family of a platform, such as `yahboom`; raise ValueError."""
     kind = kind_of(normalize_name(platform))
     if kind == AUTO:
-        return next(iter(BUILT_IN))
+        return YAHBOOM
     return _find(kind)[0]
 
 

@@ -130,7 +130,7 @@ class PlainModel:
     """When the last reading came."""
     link_since: float = float("-inf")
     shows: Shows = Shows.NO
-    shows_words: str = "its readings do not show a stop"
+    shows_words: str = "the readings of such a car do not show a stop"
     findings: Findings = field(default_factory=Findings)
     doubted: bool = False
     why_quiet: str = ""
@@ -173,7 +173,7 @@ class PlainModel:
     @property
     def shows_stops(self) -> tuple[Shows, str]:
         """Whether its readings show that a stop arrived, with the reason."""
-        return self.shows, f"{self.name}: {self.shows_words}"
+        return self.shows, self.shows_words
 
     def unheard_s(self, now: float) -> float:
         """Return for how long the car has sent no reading on this link."""
@@ -408,7 +408,7 @@ class PlainDriver(Driver):
         answers = model.is_heard and (model.heard_at is not None or not model.profile.has_readings)
         if not self.can_show and answers:
             if now >= stop.last_at + self.STOPS_WITHIN_S:
-                self._finish(stop, Basis.SENT, f"{model.name}: {model.shows_words}", now)
+                self._finish(stop, Basis.SENT, model.shows_words, now)
                 return None
         elif now >= stop.last_at + self.EVIDENCE_S and not stop.is_late:
             self._fail_late(stop, now)

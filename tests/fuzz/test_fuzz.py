@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.fuzz import controller, decoder, driven
+from tests.fuzz import controller, decoder, driven, ugv_search
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -22,3 +22,10 @@ def test_a_driven_car_to_which_anything_happens(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_a_decoder_that_is_fed_anything(seed: int) -> None:
     assert decoder.run(seed, 50_000) > 40_000
+
+
+def test_a_car_of_the_second_family_to_which_anything_happens() -> None:
+    episodes = [ugv_search.play(seed) for seed in (*range(60), 1048, 1218, 4657)]
+    assert {each.seed: each.faults for each in episodes if each.faults} == {}
+    assert sum(each.drives for each in episodes) >= 60, "what may be done is done"
+    assert sum(each.shown for each in episodes) >= 15, "some can show their stops"

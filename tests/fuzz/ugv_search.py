@@ -38,6 +38,8 @@ class UgvEpisode:
     seed: int
     car_platform: str = ""
     told: str = ""
+    frozen_options: frozenset[str] | None = None
+    """The options of the car; None: random."""
     faults: list[str] = field(default_factory=list)
     sent: list[tuple[float, bytes]] = field(default_factory=list)
     records: list[CommandRecord] = field(default_factory=list)
@@ -50,7 +52,7 @@ class UgvEpisode:
         self.car_platform = self.car_platform or moments.choice(list(UGV_BUILDS))
         self.told = self.told or self.car_platform
         options = {each for each in ("mission", "no_encoder", "quiet") if moments.random() < 0.12}
-        self.options = frozenset(options)
+        self.options = frozenset(options) if self.frozen_options is None else self.frozen_options
         self.car = build_ugv(self.car_platform, World.room(), 0, moments, options=self.options)
         self.control: Controller[Driver] = Controller("red", drivers.driver_of(self.told, {}))
         self.now = 0.0
@@ -101,6 +103,9 @@ class UgvEpisode:
                 self.to_car.append((self.now + self.delay_s, write.data))
         while self.to_car and self.to_car[0][0] <= self.now:
             self.car.feed(self.to_car.pop(0)[1], self.now)
+        self._take_records()
+
+    def _take_records(self) -> None:
         self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
 
     def _is_lost(self) -> bool:
@@ -161,6 +166,7 @@ class UgvEpisode:
         """Give a command as a person."""
         self.ids += 1
         answer = self.control.command(Command(f"c{self.ids}", "any", ANN, what), self.now)
+        self._take_records()
         is_calm = not self.loss and self.linked and self.now > self.calm_since + SETTLED_S
         if isinstance(what, Stop | EmergencyStop) and is_calm:
             self.stop_due = self.now + answer.worst_case_s + 2 * self.delay_s + 0.1

@@ -12,6 +12,7 @@ from itertools import product
 from typing import Any, Final
 
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
+from gateway import drivers
 from gateway.drivers.yahboom.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
 from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
@@ -140,6 +141,9 @@ class Redecoding:
         found = []
         for name in names:
             try:
+                if drivers.family_name(name) != drivers.YAHBOOM:
+                    words = f"{self.car} is of platform {name}, whose frames are not decoded again. Leave it out: --car"
+                    raise NoPlatform(words)
                 found.append(parse_platform(name))
             except ValueError:
                 raise NoPlatform(

@@ -91,8 +91,8 @@ IN_FLIGHT_S: Final = 2.0
 """Maximum time that a line of ours is on its way to the car, over a slow link."""
 STUCK_S: Final = 1.0
 """Maximum time that a wheel stands in a drive: by then the speed loop has wound up to full power twice."""
-VOLTAGE_S: Final = 10.0
-"""Interval at which the car measures its voltage. Each feedback repeats the last value."""
+VOLTAGE_S: Final = 1.0
+"""Interval at which an unchanged voltage is published. Each feedback repeats the last one, up to 10 s old."""
 ECHO_S: Final = 2.0
 """Maximum time from a line of ours to its echo."""
 INNER: Final = 0.4
@@ -228,7 +228,7 @@ class WaveshareDriver(PlainDriver):
         return topics
 
     def _is_new_voltage(self, volts: float, at: float) -> bool:
-        """Return True if the car has measured its voltage again, as far as one can tell."""
+        """Return True if a voltage is published: it is new, or the last one was a while ago."""
         before, measured_at = self._voltage
         if volts == before and at < measured_at + VOLTAGE_S:
             return False
@@ -298,14 +298,15 @@ class WaveshareDriver(PlainDriver):
             self._on_wheels(event, now)
 
     def _say_what_it_shows(self) -> None:
+        car = self._model.name
         if self._here is None or not self._here.has_encoders:
-            words = "its wheel speeds are not measured; its dead-man stops it if nothing drives it"
+            words = f"the wheel speeds of {car} are not measured; its dead-man stops it if nothing drives it"
         elif not all(self._turned):
-            words = "it was not driven since its set-up, so nothing shows that its encoders count"
+            words = f"{car} was not driven since its set-up, so nothing shows that its encoders count"
         elif not self._echoes:
-            words = "it does not repeat our lines, so nothing shows when it got the stop"
+            words = f"{car} does not repeat our lines, so nothing shows when it got the stop"
         else:
-            words = "its wheel speeds show that it stands"
+            words = f"the wheel speeds of {car} show that it stands"
         self._model.shows_words = words
 
     def _is_reset(self, event: Feedback) -> bool:

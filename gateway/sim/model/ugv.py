@@ -103,7 +103,7 @@ class UgvCar:
         self.wrong_since: float | None = None
         """Since when it drives by a line of its host while it was told another chassis; None if it does not."""
         self._reset(now, text=False)
-        self._boot_until = now  # it has run for a while
+        self._boot_until = self._uart_from = now  # it has run for a while
         self._mission: list[tuple[float, str]] = []
 
     # ------------------------------------------------------------------ the calls of the simulation

@@ -1,0 +1,51 @@
+"""A platform finds its family: ours by a table, others by the entry point of their package."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from gateway import drivers
+from schemas.words import Mode
+
+
+def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
+    assert {"arduino", "stm32", "raspberry_pi", "unknown", "wave_rover", "ugv_beast"} <= set(
+        drivers.built_in_platforms()
+    )
+    for name in drivers.built_in_platforms():
+        profile = drivers.profile_of(name)
+        assert profile.name == name
+        assert Mode.MANUAL in profile.modes
+        assert callable(drivers.driver_of(name, {}))
+    assert drivers.family_name("ugv02") == "waveshare"
+    assert drivers.family_name("auto") == drivers.family_name("stm32+arm") == drivers.YAHBOOM
+
+
+@pytest.mark.parametrize("name", ["ugv_rovr", "", "ugv_rover+arm", "+arm", "arduino+arn"])
+def test_a_wrong_name_is_refused_in_words(name: str) -> None:
+    with pytest.raises(ValueError, match=r"Unknown (platform|option)"):
+        drivers.check_platform(name)
+
+
+def test_names_are_read_in_any_case() -> None:
+    assert drivers.check_platform("UGV_Rover") == "ugv_rover"
+    assert drivers.check_platform("Auto+Text") == "auto+text"
+    assert [each.name for each in drivers.profiles_of("auto+arm")] == ["arduino+arm", "stm32+arm", "raspberry_pi+arm"]
+
+
+def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = tmp_path / "tank_driver-1.0.dist-info"
+    found.mkdir()
+    (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
+    (found / "entry_points.txt").write_text("[zenoh_car_fleet.drivers]\ntank = tests.support.tank\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    drivers._installed.cache_clear()
+    drivers._find.cache_clear()
+    try:
+        assert "tank" in drivers.platforms()
+        assert drivers.check_platform("tank") == "tank"
+        assert drivers.profile_of("tank").measurable(Mode.MANUAL) == {"battery", "range"}
+    finally:
+        drivers._installed.cache_clear()
+        drivers._find.cache_clear()

@@ -1,0 +1,152 @@
+"""The hazards of facts about these cars, each tried on a simulated one (docs/reference/waveshare.md#hazards)."""
+
+import json
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from gateway.control.commands import AimServo, Drive, Led, SetLight, SetMode, Stop, Whistle
+from gateway.drivers.waveshare import driver as waveshare
+from gateway.drivers.waveshare.chassis import FULL_SPEED
+from gateway.sim.model.ir_remote import Button
+from schemas.words import Basis, CarTrust, Light, Mode, Motion, Motors, Phase, Reason, Shows
+from tests.fuzz.ugv_search import SETTLED_S, UgvEpisode
+
+
+def ready(platform: str, told: str = "", options: frozenset[str] = frozenset()) -> UgvEpisode:
+    """Return a car that is set up and stands."""
+    episode = UgvEpisode(1, platform, told, frozen_options=options)
+    episode.connect()
+    episode.run(SETTLED_S)
+    return episode
+
+
+def commands(episode: UgvEpisode, since: float = 0.0) -> list[dict[str, Any]]:
+    """Return the commands that were written since then."""
+    return [json.loads(line) for at, data in episode.sent if at >= since for line in data.split(b"\n") if line]
+
+
+@pytest.mark.parametrize("platform", ["wave_rover", "ugv01", "ugv02", "ugv_rover", "ugv_beast"])
+def test_nothing_moves_before_the_firmware_is_known_and_the_chassis_is_set(platform: str) -> None:
+    episode = UgvEpisode(1, platform, frozen_options=frozenset())
+    episode.connect()
+    episode.ask(Drive(Motion.FORWARD, 1.0))
+    episode.run(3.0)
+    order = [each["T"] for each in commands(episode)]
+    first = next(index for index, each in enumerate(commands(episode)) if each["T"] == 1 and each["L"])
+    assert order.index(waveshare.CHASSIS) < first
+    assert order.index(waveshare.DEAD_MAN) < first
+    assert episode.faults == []
+    assert episode.car.wrong_since is None
+
+
+def test_a_car_with_another_firmware_is_stopped_and_never_driven() -> None:
+    episode = ready("wave_rover", told="ugv_rover")
+    assert episode.ask(Drive(Motion.FORWARD)) is Phase.REJECTED
+    assert episode.records[-1].reason is Reason.UNSUPPORTED
+    assert episode.ask(Stop()) is Phase.QUEUED
+    assert all(not each.get("L") for each in commands(episode) if each["T"] == 1)
+    assert episode.control.driver.model.findings.platform_contradictions
+
+
+def test_a_held_motion_feeds_the_dead_man_and_is_clamped() -> None:
+    episode = ready("ugv01")
+    began = episode.now
+    episode.ask(Drive(Motion.SPIN_LEFT, 3.0))
+    episode.run(3.0)
+    times = [at for at, data in episode.sent if at >= began and b'"T":1,' in data]
+    assert max(b - a for a, b in pairwise(times)) <= waveshare.DEAD_MAN_MS / 1000 / 3
+    assert all(abs(each[side]) <= FULL_SPEED for each in commands(episode, began) if each["T"] == 1 for side in "LR")
+
+
+@pytest.mark.parametrize(
+    ("platform", "options", "basis", "shows"),
+    [
+        ("ugv_rover", frozenset(), Basis.SHOWN, Shows.YES),
+        ("ugv01", frozenset(), Basis.SHOWN, Shows.YES),
+        ("wave_rover", frozenset(), Basis.SENT, Shows.NO),
+        ("ugv02", frozenset(), Basis.SENT, Shows.NO),
+        ("ugv_rover", frozenset({"quiet"}), Basis.SENT, Shows.UNKNOWN),
+        ("ugv_rover", frozenset({"no_encoder"}), Basis.SENT, Shows.UNKNOWN),
+    ],
+)
+def test_only_measured_wheels_show_a_stop(platform: str, options: frozenset[str], basis: Basis, shows: Shows) -> None:
+    episode = ready(platform, options=options)
+    model = episode.control.driver.model
+    assert model.basis is Basis.SENT, "it was not driven yet"
+    episode.ask(Drive(Motion.FORWARD, 0.8))
+    episode.run(3.0)
+    episode.ask(Stop())
+    episode.run(3.0)
+    assert (model.motors, model.basis, model.shows) == (Motors.OFF, basis, shows)
+    assert not episode.car.moving
+
+
+def test_a_lost_link_ends_at_the_dead_man() -> None:
+    episode = ready("ugv_beast")
+    episode.ask(Drive(Motion.FORWARD, 9.0))
+    episode.run(1.0)
+    assert episode.car.moving
+    episode.cut()
+    episode.run(1.6)
+    assert not episode.car.moving
+    assert episode.control.driver.model.motors is Motors.UNKNOWN, "nothing shows it"
+
+
+def test_a_restart_takes_the_permission_back() -> None:
+    episode = ready("ugv01")
+    episode.ask(Drive(Motion.FORWARD, 9.0))
+    episode.run(1.0)
+    episode.car.brown_out(episode.now)
+    restarted = episode.now
+    episode.run(9.0)
+    again = [each["T"] for each in commands(episode, restarted)]
+    assert waveshare.CHASSIS in again
+    assert not any(each["T"] == 1 and each["L"] for each in commands(episode, restarted + 0.3))
+    assert not episode.car.moving
+    assert episode.ask(Drive(Motion.BACK, 0.5)) is not Phase.REJECTED
+
+
+def test_a_motion_that_nobody_commanded_is_stopped() -> None:
+    episode = ready("ugv_rover")
+    episode.car.press(Button.FORWARD, episode.now)
+    episode.run(1.3)
+    assert not episode.car.moving
+    assert episode.control.driver.model.trust.state in (CarTrust.RECOVERING, CarTrust.STOPPED)
+
+
+def test_a_wheel_without_a_signal_ends_the_drive() -> None:
+    episode = ready("ugv_rover", options=frozenset({"no_encoder"}))
+    episode.ask(Drive(Motion.FORWARD, 5.0))
+    episode.run(2.0)
+    assert not episode.car.truth.driving
+    assert [each.reason for each in episode.records if each.phase is Phase.FAILED] == [Reason.STUCK]
+
+
+def test_the_stop_of_a_person_waits_for_nothing() -> None:
+    episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
+    episode.car.brown_out(0.0)
+    episode.connect()
+    episode.run(0.2)
+    assert episode.sent == [], "a boot is not disturbed"
+    episode.ask(Stop())
+    episode.run(0.05)
+    assert commands(episode)[0] == {"T": 11, "L": 0, "R": 0, "n": 1}
+
+
+def test_what_such_a_car_lacks_is_refused_and_its_lights_work() -> None:
+    episode = ready("wave_rover")
+    for what in (Led(1, 2, 3), Whistle(), AimServo(1), SetLight(Light.RED), SetMode(Mode.TRACKING)):
+        assert episode.ask(what) is Phase.REJECTED
+    episode.ask(SetLight(Light.WHITE))
+    episode.run(0.5)
+    assert episode.car.truth.led == "#ffffff"
+
+
+def test_no_command_outside_the_list_can_be_written() -> None:
+    for kind in (0, 2, 13, 111, 138, 140, 242, 405, 600, 603):
+        with pytest.raises(AssertionError):
+            waveshare.line(kind, cmd=-1)
+    with pytest.raises(AssertionError):
+        waveshare.line(waveshare.PWM, L=1, R=0)

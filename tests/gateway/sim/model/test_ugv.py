@@ -1,0 +1,160 @@
+"""The simulated cars of the second family are as dangerous as facts say (docs/reference/waveshare.md)."""
+
+import json
+import random
+from typing import Any
+
+import pytest
+
+from gateway.sim.model.factory import build_ugv
+from gateway.sim.model.ugv import BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, UgvCar
+from gateway.sim.model.world import World
+
+
+class Host:
+    """What writes to a car, and reads what it sends."""
+
+    def __init__(self, platform: str, *options: str) -> None:
+        self.car: UgvCar = build_ugv(platform, World.room(), 0, random.Random(1), options=frozenset(options))
+        self.now = 0.0
+        self.heard = b""
+
+    def send(self, *lines: str) -> "Host":
+        """Send lines, and let them arrive."""
+        for line in lines:
+            self.car.feed(line.encode(), self.now)
+        return self.run(0.1)
+
+    def run(self, seconds: float) -> "Host":
+        """Let time pass."""
+        self.now += seconds
+        self.heard += b"".join(data for _, data in self.car.advance(self.now))
+        return self
+
+    def feedback(self) -> dict[str, Any]:
+        """Return the last whole feedback."""
+        found = [each for each in self.heard.split(b"\n") if each.startswith(b'{"T":1001')]
+        last: dict[str, Any] = json.loads(found[-1])
+        return last
+
+    @property
+    def duty(self) -> tuple[int, int]:
+        """Return the true duty of the motors."""
+        return self.car.truth.motor_left, self.car.truth.motor_right
+
+
+FORWARD = '{"T":1,"L":0.2,"R":0.2}\n'
+
+
+@pytest.mark.parametrize("platform", ["wave_rover", "ugv01", "ugv_rover"])
+def test_the_dead_man_stops_it_once(platform: str) -> None:
+    main = UGV_BUILDS[platform].main
+    host = Host(platform).send(f'{{"T":900,"main":{main},"module":0}}\n', FORWARD).run(1.0)
+    assert host.car.moving
+    host.run(UGV_DEAD_MAN_S)
+    assert not host.car.moving
+
+
+def test_motion_by_t13_is_never_stopped_on_one_firmware() -> None:
+    twist = '{"T":13,"X":0.2,"Z":0}\n'
+    host = Host("ugv_rover").run(4.0).send(twist).run(20.0)
+    assert host.car.moving
+    assert host.car.runaway_since is not None
+    host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n').run(4.0).send(twist).run(20.0)
+    assert not host.car.moving
+
+
+def test_a_negative_dead_man_is_none() -> None:
+    host = Host("ugv_rover").send('{"T":136,"cmd":-1}\n', FORWARD).run(20.0)
+    assert host.car.moving
+
+
+def test_too_great_numbers_leave_the_old_speed_and_feed_the_dead_man() -> None:
+    host = Host("ugv_rover").send(FORWARD)
+    for _ in range(10):
+        host.send('{"T":1,"L":9,"R":9}\n').run(1.0)
+    assert host.car.moving
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['{"T":1,"L":0.2}\n', '{"T":1,"L":"a","R":0.2}\n', "{T:1}\n", '{"T":999,"L":1,"R":1}\n', f"{'x' * 300}{FORWARD}"],
+)
+def test_what_is_wrong_is_ignored_without_a_word(line: str) -> None:
+    host = Host("wave_rover").send('{"T":143,"cmd":0}\n')
+    host.heard = b""
+    host.send(line).run(0.5)
+    assert (host.car.moving, host.heard) == (False, b"")
+
+
+def test_a_partial_line_spoils_the_next_and_a_line_end_clears_it() -> None:
+    assert not Host("wave_rover").send('{"T":1,"L":0.', FORWARD).run(0.3).car.moving
+    assert Host("wave_rover").send('{"T":1,"L":0.', "\n", FORWARD).run(0.3).car.moving
+
+
+def test_the_second_object_of_a_line_is_dropped() -> None:
+    assert not Host("wave_rover").send('{"T":130}{"T":1,"L":0.2,"R":0.2}\n').run(0.3).car.moving
+
+
+def test_one_half_is_full_power_on_an_open_loop() -> None:
+    assert Host("wave_rover").send('{"T":1,"L":0.5,"R":0.5}\n').duty == (255, 255)
+
+
+def test_without_encoders_the_speeds_are_nothing_or_the_command() -> None:
+    host = Host("wave_rover").send('{"T":11,"L":200,"R":200}\n', '{"T":130}\n')
+    assert host.feedback()["L"] == 200
+    host.send(FORWARD).run(0.5).send('{"T":130}\n')
+    assert (host.feedback()["L"], host.car.moving) == (0, True)
+
+
+def test_a_question_within_the_gap_has_no_answer() -> None:
+    host = Host("wave_rover").send('{"T":142,"cmd":1000}\n', '{"T":130}\n')
+    host.heard = b""
+    assert host.send('{"T":130}\n').run(0.3).heard.count(b"1001") == 0
+    assert host.run(1.0).send('{"T":130}\n').heard.count(b"1001") == 1
+
+
+def test_volts_come_in_two_units() -> None:
+    one = Host("wave_rover").send('{"T":130}\n').feedback()["v"]
+    two = Host("ugv_rover").run(0.5).feedback()["v"]
+    assert isinstance(one, float)
+    assert isinstance(two, int)
+    assert 9 < one < 13
+    assert 900 < two < 1300
+
+
+def test_a_reset_forgets_the_chassis_on_one_firmware_and_drives_the_wrong_way() -> None:
+    host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n')
+    host.car.brown_out(host.now)
+    host.run(BOOT_S + 0.5).send(FORWARD).run(0.5)
+    assert host.duty[0] > 0
+    assert host.car.wrong_since is not None
+    assert host.car._wheels[0] < 0
+
+
+def test_a_boot_mission_drives_and_an_early_byte_aborts_it() -> None:
+    host = Host("ugv_rover", "mission")
+    host.car.brown_out(host.now)
+    assert host.run(BOOT_S + 3.0).heard.startswith(b"ets")
+    host.car.brown_out(host.now)
+    host.run(1.0).send("\n").run(BOOT_S + 2.0)
+    assert not host.car.moving
+
+
+def test_a_delay_keeps_the_dead_man_from_its_check() -> None:
+    host = Host("ugv_rover").send(FORWARD).run(0.5).send('{"T":111,"cmd":8000}\n').run(6.0)
+    assert host.car.moving
+
+
+def test_nothing_stops_and_drops_an_arm_on_one_firmware_only() -> None:
+    for empty in ('{"T":0}\n', "{}\n", "[]\n"):
+        assert not Host("ugv_rover").send(FORWARD).run(0.5).send(empty).run(0.5).car.moving
+    host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n', FORWARD).run(0.5).send('{"T":0}\n').run(0.5)
+    assert host.car.moving
+
+
+def test_an_answer_without_a_line_end_glues_the_next_feedback() -> None:
+    host = Host("ugv_rover").run(0.2)
+    host.heard = b""
+    host.send('{"T":405}\n').run(0.3)
+    assert b'"ssid":"UGV"}{"T":1001' in host.heard
