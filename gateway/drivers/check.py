@@ -38,7 +38,7 @@ from schemas.topics import TOPICS
 from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
 from schemas.words import Light as LightWord
 
-STEP_S: Final = 0.02
+CHECK_STEP_S: Final = 0.02
 TICK_S: Final = 0.2
 FIRST_STOP_S: Final = 1.0
 """Maximum time from a person's stop to its first frame, unless a longer worst case is announced."""
@@ -78,7 +78,7 @@ class Bench:
         """Let time pass."""
         end = self.now + seconds
         while self.now < end:
-            self.now += STEP_S
+            self.now += CHECK_STEP_S
             if self.now >= self._tick_at:
                 self._tick_at = self.now + TICK_S
                 self.control.tick(self.now)

@@ -6,7 +6,7 @@ MAX_LINE: Final = 1024
 """Maximum bytes of a line, without its end. Longer ones come in pieces of this length."""
 
 
-class Lines:
+class LineSplitter:
     """The lines of one connection, so that a new link never completes an old line."""
 
     def __init__(self, max_line: int = MAX_LINE) -> None:

@@ -47,6 +47,8 @@ options of the simulator only:
   +silent=MODE                          prints nothing in this mode; may be repeated (arduino, stm32)
   +gray=MAX +constants                  the grayscale goes up to MAX; constants for line, obstacle, light and grayscale
                                         (arduino, stm32)
+  +mission +no_encoder +quiet           its boot mission drives; the left encoder counts nothing; it repeats no line
+                                        (wave_rover, ugv01, ugv02, ugv_rover, ugv_beast; no other option)
 an stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows the frames of
 the motions, dies at any other and sends nothing.
 faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
@@ -66,7 +68,7 @@ faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may b
 faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends a fault (rename and
 cut_write end as link_drop does); without "for_s" a fault lasts until then:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
-infrared remote, which only an Arduino or STM32 car in mode remote_control obeys; buttons: forward, back, left, right,
+infrared remote, which only an Arduino or STM32 car in mode remote_control obeys, or the web page of a ugv; buttons: forward, back, left, right,
 spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
   --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
 worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
@@ -94,8 +96,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:PLATFORM:LINK",
-        help="PLATFORM: arduino, stm32, raspberry_pi or course, with options such as +arm, see below; LINK: pty, "
-        "pty:PATH or tcp://HOST:PORT",
+        help="PLATFORM: arduino, stm32, raspberry_pi, course, wave_rover, ugv01, ugv02, ugv_rover or ugv_beast, with "
+        "options such as +arm, see below; LINK: pty, pty:PATH or tcp://HOST:PORT",
     )
     parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behavior (default: 0)")
     parser.add_argument(

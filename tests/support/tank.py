@@ -1,4 +1,4 @@
-"""A family of cars from another package: a tank that takes JSON lines over TCP. docs/how-to/write-a-driver.md shows it.
+"""A family of cars from another package: a tank that takes JSON lines over TCP.
 
 A line `{"move":[0.5,0.5]}` sets the share of full power of each side, until the next one. The tank sends
 `{"v":7.9,"dist_cm":42}` five times a second. It has no dead-man, and acknowledges nothing.
@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from gateway.control.commands import Action
 from gateway.control.driver import Desk, Event, Fields, Rejected, TextLine
-from gateway.drivers.lines import Lines
+from gateway.drivers.lines import LineSplitter
 from gateway.drivers.plain import PlainDriver, PlainProfile
 from schemas.words import Cause, Motion
 
@@ -28,7 +28,7 @@ SIDES = {
 }
 
 
-class Report:
+class TankReport:
     """One report of the tank."""
 
     def __init__(self, raw: bytes, at: float, volts: float, dist_cm: float) -> None:
@@ -44,11 +44,11 @@ class TankDriver(PlainDriver):
 
     def __init__(self, desk: Desk) -> None:
         super().__init__(desk, PROFILE)
-        self._lines = Lines()
+        self._lines = LineSplitter()
 
     def link_up(self, now: float) -> None:
         """Forget the unfinished line of the last link."""
-        self._lines = Lines()
+        self._lines = LineSplitter()
         super().link_up(now)
 
     def feed(self, data: bytes, now: float) -> list[Event]:
@@ -60,7 +60,7 @@ class TankDriver(PlainDriver):
             return TextLine(line, now)
         try:
             found = json.loads(line)
-            return Report(line, now, float(found["v"]), float(found["dist_cm"]))
+            return TankReport(line, now, float(found["v"]), float(found["dist_cm"]))
         except (ValueError, TypeError, KeyError, RecursionError):
             return Rejected(line, now, Cause.TRUNCATED)
 
@@ -83,7 +83,7 @@ class TankDriver(PlainDriver):
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
         """Return the measured values by topic."""
-        if not isinstance(event, Report):
+        if not isinstance(event, TankReport):
             return {}
         topics: dict[str, Fields] = {}
         if 0 < event.volts < 9:
@@ -94,9 +94,9 @@ class TankDriver(PlainDriver):
 
     def on_reading(self, event: Event, now: float) -> None:
         """Take a report."""
-        if isinstance(event, Report) and 0 < event.volts < 9:
+        if isinstance(event, TankReport) and 0 < event.volts < 9:
             self.on_voltage(event.volts, now)
-        if isinstance(event, Report) and 0 < event.dist_cm < 400:
+        if isinstance(event, TankReport) and 0 < event.dist_cm < 400:
             self.model.range_cm, self.model.range_at = event.dist_cm, event.at
 
     def motion_frame(self, motion: Motion) -> bytes:

@@ -8,7 +8,7 @@ from gateway.drivers.plain import PlainProfile
 from schemas.words import Light
 
 
-class Firmware(StrEnum):
+class UgvFirmware(StrEnum):
     """The two programs of these cars. They share the commands, and differ in what makes a command safe."""
 
     GENERAL = "ugv_base_general"
@@ -26,15 +26,15 @@ class Chassis:
     is a share of full power, 0.5 being all of it, and `L` and `R` are nothing or the command itself."""
 
 
-PLATFORMS: Final[dict[str, dict[Firmware, Chassis]]] = {
-    "wave_rover": {Firmware.GENERAL: Chassis(1, has_encoders=False)},
-    "ugv01": {Firmware.GENERAL: Chassis(3, has_encoders=True)},
+PLATFORMS: Final[dict[str, dict[UgvFirmware, Chassis]]] = {
+    "wave_rover": {UgvFirmware.GENERAL: Chassis(1, has_encoders=False)},
+    "ugv01": {UgvFirmware.GENERAL: Chassis(3, has_encoders=True)},
     "ugv02": {
-        Firmware.GENERAL: Chassis(2, has_encoders=False),
-        Firmware.ROS: Chassis(2, has_encoders=True),
+        UgvFirmware.GENERAL: Chassis(2, has_encoders=False),
+        UgvFirmware.ROS: Chassis(2, has_encoders=True),
     },
-    "ugv_rover": {Firmware.ROS: Chassis(2, has_encoders=True)},
-    "ugv_beast": {Firmware.ROS: Chassis(3, has_encoders=True)},
+    "ugv_rover": {UgvFirmware.ROS: Chassis(2, has_encoders=True)},
+    "ugv_beast": {UgvFirmware.ROS: Chassis(3, has_encoders=True)},
 }
 """Products of old and new stock have different firmwares, so a platform may have two."""
 FULL_SPEED: Final = 0.5
@@ -54,7 +54,7 @@ def profile_of(name: str) -> PlainProfile:
         raise ValueError(f'Unknown option "+{options[:40]}" of {kind}. It has none.')
     measures = {"battery"}
     for firmware, chassis in PLATFORMS[kind].items():
-        measures |= {"attitude"} if firmware is Firmware.GENERAL else {"odometer", "imu"}
+        measures |= {"attitude"} if firmware is UgvFirmware.GENERAL else {"odometer", "imu"}
         measures |= {"wheels"} if chassis.has_encoders else set()
     return PlainProfile(
         kind,

@@ -42,9 +42,9 @@ from typing import Any, ClassVar, Final
 from gateway.control.commands import Action, Drive, Find, SetLight
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
 from gateway.control.events import OutgoingFrame
-from gateway.drivers.lines import Lines
+from gateway.drivers.lines import LineSplitter
 from gateway.drivers.plain import PlainDriver, PlainProfile
-from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, Firmware
+from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, UgvFirmware
 from gateway.drivers.waveshare.feedback import Feedback, read_line
 from schemas.words import FrameOrigin, Level, Light, Motion, Motors, Phase, Reason, Shows
 
@@ -87,7 +87,7 @@ UNASKED_REPORTS: Final = 3
 """Number of feedbacks in a row with turning wheels that show a motion which nobody commanded here."""
 UNASKED_LOG_S: Final = 30.0
 """Minimum time between two log records about that. The stops go on meanwhile."""
-IN_FLIGHT_S: Final = 2.0
+ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours is on its way to the car, over a slow link."""
 STUCK_S: Final = 1.0
 """Maximum time that a wheel stands in a drive: by then the speed loop has wound up to full power twice."""
@@ -141,11 +141,11 @@ class WaveshareDriver(PlainDriver):
     def __init__(self, desk: Desk, profile: PlainProfile) -> None:
         super().__init__(desk, profile)
         self._chassis = PLATFORMS[profile.name]
-        self._lines = Lines()
+        self._lines = LineSplitter()
         self._sent: deque[tuple[bytes, float]] = deque(maxlen=64)
         self._number = 0
         """Number of the last stop frame, which tells its echo from others."""
-        self._firmware: Firmware | None = None
+        self._firmware: UgvFirmware | None = None
         self._moved_at = float("-inf")
         """When the last motion was written."""
         self._named_at = float("-inf")
@@ -276,7 +276,7 @@ class WaveshareDriver(PlainDriver):
         self._log.log(Level.WARNING, "car_restarted", words, now)
         self._forget_car(now + BOOT_QUIET_S)
         self.recover(words, now)
-        if now > self._moved_at + IN_FLIGHT_S:
+        if now > self._moved_at + ON_ITS_WAY_S:
             self._wait_for_setup()  # else the car may read a motion of ours when it has started: the stop comes behind
 
     def on_reading(self, event: Event, now: float) -> None:
@@ -313,7 +313,7 @@ class WaveshareDriver(PlainDriver):
         before, self._odometer_m = self._odometer_m, event.odometer_m or self._odometer_m
         return before is not None and max(map(abs, before)) > 0.5 and event.odometer_m == (0.0, 0.0)
 
-    def _on_firmware(self, firmware: Firmware, now: float) -> None:
+    def _on_firmware(self, firmware: UgvFirmware, now: float) -> None:
         model = self._model
         self._firmware = firmware
         name, here = model.profile.name, self._here
@@ -375,7 +375,7 @@ class WaveshareDriver(PlainDriver):
 
     def link_up(self, now: float) -> None:
         """Listen first: the link is open."""
-        self._lines = Lines()
+        self._lines = LineSplitter()
         self._sent.clear()
         self._firmware = None
         self._forget_car(now + LISTEN_S)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from gateway.control.driver import Event, Rejected, TextLine
-from gateway.drivers.waveshare.chassis import Firmware
+from gateway.drivers.waveshare.chassis import UgvFirmware
 from schemas.words import Cause
 
 FEEDBACK: Final = 1001
@@ -28,7 +28,7 @@ class Feedback:
 
     raw: bytes
     at: float
-    firmware: Firmware | None
+    firmware: UgvFirmware | None
     """None if its fields are those of neither, or of both."""
     left_m_s: float
     right_m_s: float
@@ -81,26 +81,26 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
         left,
         right,
         _voltage(found, firmware),
-        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is Firmware.GENERAL else None,
-        _tuple(found, ("odl", "odr"), 0.01) if firmware is Firmware.ROS else None,
-        _tuple(found, _IMU, 1.0) if firmware is Firmware.ROS else None,
+        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is UgvFirmware.GENERAL else None,
+        _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None,
+        _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS else None,
     )
 
 
-def _firmware(found: dict[str, Any]) -> Firmware | None:
+def _firmware(found: dict[str, Any]) -> UgvFirmware | None:
     """Return which firmware reports like this: one has a temperature, the other the way of its wheels."""
     is_general, is_ros = "temp" in found, "odl" in found and "odr" in found
     if is_general is is_ros:
         return None
-    return Firmware.GENERAL if is_general else Firmware.ROS
+    return UgvFirmware.GENERAL if is_general else UgvFirmware.ROS
 
 
-def _voltage(found: dict[str, Any], firmware: Firmware | None) -> float | None:
+def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | None:
     """Return the voltage. One firmware sends volts, the other hundredths of a volt."""
     value = _number(found, "v")
     if value is None or firmware is None:
         return None
-    volts = value if firmware is Firmware.GENERAL else value / 100
+    volts = value if firmware is UgvFirmware.GENERAL else value / 100
     return volts if 0.0 < volts <= MAX_V else None
 
 

@@ -46,7 +46,7 @@ _SETUP: Final = (
     (1.9, b"\r\nServer Starts.\r\n"),
 )
 """What a boot prints, by the time since the ROM's text."""
-BOOT_S: Final = 2.0
+UGV_BOOT_S: Final = 2.0
 """Time from a reset until the loop runs."""
 UART_S: Final = 0.3
 """Time from a reset until the program has its UART. Bytes that arrive before are lost."""
@@ -232,10 +232,10 @@ class UgvCar:
         self._speed_at = now
         self._odometer = [0.0, 0.0]
         self._next_turn = now + LOOP_S
-        self._boot_until = now + BOOT_S
+        self._boot_until = now + UGV_BOOT_S
         self._arrivals.clear()
         self._uart_from = now + UART_S
-        self._mission = [(now + BOOT_S, '{"T":1,"L":0.3,"R":0.3}'), (now + BOOT_S + 2.0, '{"T":1,"L":0,"R":0}')]
+        self._mission = [(now + UGV_BOOT_S, '{"T":1,"L":0.3,"R":0.3}'), (now + UGV_BOOT_S + 2.0, '{"T":1,"L":0,"R":0}')]
         if "mission" not in self._options:
             self._mission = []
         if text:

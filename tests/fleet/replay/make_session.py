@@ -100,6 +100,9 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
             made.put(f"{base}/sensor/obstacle", pb.Obstacle(left=second % 4 == 0, right=second % 5 == 0), at)
             made.put(f"{base}/sensor/light", pb.Light(left=second % 2 == 0), at)
             made.put(f"{base}/sensor/imu", pb.Imu(gyro_x_raw=second * 3, accel_z_raw=16384), at)
+            made.put(f"{base}/sensor/wheels", pb.Wheels(left_m_s=0.25, right_m_s=-0.25), at)
+            made.put(f"{base}/sensor/odometer", pb.Odometer(left_m=second, right_m=-second), at)
+            made.put(f"{base}/sensor/attitude", pb.Attitude(yaw_rad=0.1), at)
             made.put(f"{base}/sensor/arm", pb.Arm(joint_deg=[90, 45, 30, 20, 10, second]), at)
         inferred = "tracking" if now == "tracking" else "manual" if now == "manual" else "unknown"
         verdict = "confirmed" if inferred == now else "assumed"

@@ -3,12 +3,12 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.drivers.lines import Lines
+from gateway.drivers.lines import LineSplitter
 
 
 @given(st.lists(st.binary(max_size=40), max_size=12), st.integers(1, 20))
 def test_the_pieces_do_not_matter_and_no_line_is_too_long(pieces: list[bytes], top: int) -> None:
-    lines, whole = Lines(top), Lines(top)
+    lines, whole = LineSplitter(top), LineSplitter(top)
     found = [line for piece in pieces for line in lines.feed(piece)]
     assert found == whole.feed(b"".join(pieces))
     assert lines.take_rest() == whole.take_rest()
@@ -16,7 +16,7 @@ def test_the_pieces_do_not_matter_and_no_line_is_too_long(pieces: list[bytes], t
 
 
 def test_an_unfinished_line_waits_and_is_taken_once() -> None:
-    lines = Lines()
+    lines = LineSplitter()
     assert lines.feed(b'{"a":1}\r\n\r\n{"b"') == [b'{"a":1}']
     assert lines.take_rest() == b'{"b"'
     assert lines.feed(b":2}\n") == [b":2}"]

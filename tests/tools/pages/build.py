@@ -27,6 +27,11 @@ def drive_one() -> str:
     return _program("fleet/examples/programs/drive_one.py")
 
 
+def tank() -> str:
+    """Return the driver of another package; tests/gateway/drivers/test_check.py checks it."""
+    return _program("tests/support/tank.py")
+
+
 PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
     "topics": ("docs/reference/keys.md", tables.key_table),
     "messages": ("docs/reference/messages.md", proto.message_tables),
@@ -43,6 +48,7 @@ PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
     "plan": ("docs/reference/plan-file.md", lambda: files.schema_tables(files.plan_schema())),
     "world": ("docs/reference/world-file.md", lambda: files.schema_tables(files.world_schema())),
     "any_client": ("docs/how-to/use-any-zenoh-client.md", any_client),
+    "tank": ("docs/how-to/write-a-driver.md", tank),
     "drive_one": ("docs/how-to/drive-from-python.md", drive_one),
 }
 """Generated parts of pages: the page, and the function that makes the part."""

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.driver import Rejected, TextLine
-from gateway.drivers.waveshare.chassis import Firmware
+from gateway.drivers.waveshare.chassis import UgvFirmware
 from gateway.drivers.waveshare.feedback import Feedback, read_line
 from schemas.words import Cause
 
@@ -41,9 +41,9 @@ def read(fields: dict[str, Any]) -> Any:
 
 def test_the_two_firmwares_are_told_apart_and_read_in_one_unit() -> None:
     one, two = read(GENERAL), read(ROS)
-    assert (one.firmware, one.left_m_s, one.right_m_s, one.voltage_v) == (Firmware.GENERAL, 0.0, 0.25, 11.64)
+    assert (one.firmware, one.left_m_s, one.right_m_s, one.voltage_v) == (UgvFirmware.GENERAL, 0.0, 0.25, 11.64)
     assert one.attitude_rad == pytest.approx((math.radians(1), math.radians(-2), math.pi / 2))
-    assert (two.firmware, two.voltage_v, two.odometer_m) == (Firmware.ROS, 11.64, pytest.approx((1.2, -0.03)))
+    assert (two.firmware, two.voltage_v, two.odometer_m) == (UgvFirmware.ROS, 11.64, pytest.approx((1.2, -0.03)))
     assert two.imu_raw == (4, 5, 6, 1, 2, 3)
     assert one.odometer_m is one.imu_raw is two.attitude_rad is None
 

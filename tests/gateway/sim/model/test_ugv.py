@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.sim.model.factory import build_ugv
-from gateway.sim.model.ugv import BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, UgvCar
+from gateway.sim.model.ugv import UGV_BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, UgvCar
 from gateway.sim.model.world import World
 
 
@@ -126,7 +126,7 @@ def test_volts_come_in_two_units() -> None:
 def test_a_reset_forgets_the_chassis_on_one_firmware_and_drives_the_wrong_way() -> None:
     host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n')
     host.car.brown_out(host.now)
-    host.run(BOOT_S + 0.5).send(FORWARD).run(0.5)
+    host.run(UGV_BOOT_S + 0.5).send(FORWARD).run(0.5)
     assert host.duty[0] > 0
     assert host.car.wrong_since is not None
     assert host.car._wheels[0] < 0
@@ -135,9 +135,9 @@ def test_a_reset_forgets_the_chassis_on_one_firmware_and_drives_the_wrong_way() 
 def test_a_boot_mission_drives_and_an_early_byte_aborts_it() -> None:
     host = Host("ugv_rover", "mission")
     host.car.brown_out(host.now)
-    assert host.run(BOOT_S + 3.0).heard.startswith(b"ets")
+    assert host.run(UGV_BOOT_S + 3.0).heard.startswith(b"ets")
     host.car.brown_out(host.now)
-    host.run(1.0).send("\n").run(BOOT_S + 2.0)
+    host.run(1.0).send("\n").run(UGV_BOOT_S + 2.0)
     assert not host.car.moving
 
 
