@@ -136,7 +136,7 @@ def test_docs_holds_only_what_is_published() -> None:
 
 
 GLOSSARY: Final = ROOT / "docs/reference/glossary.md"
-PRODUCTS: Final = re.compile(r"(?i)WAVE ROVER|UGV Rover")
+PRODUCTS: Final = re.compile(r"(?i)WAVE ROVER|UGV Rover|boot\.mission|`\+mission`|rover:ugv_rover")
 """Names that their maker gave."""
 BRITISH: Final = re.compile(r"(?i)\b(?:colour\w*|metres?|behaviour|neighbour\w*|grey|licence)\b")
 
