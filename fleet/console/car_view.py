@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final
 
-from fleet.client.claims import CarClaims, GatewayStarts, claims_of
+from fleet.client.car_state import GatewayStarts
+from fleet.client.claims import CarClaims, claims_of
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
