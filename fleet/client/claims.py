@@ -13,7 +13,7 @@ from math import isinf
 from typing import Any, Final
 
 from schemas import topics
-from schemas.words import UNKNOWN, Basis, LinkState, Motors
+from schemas.words import UNKNOWN, Basis, Motors
 
 STOPPED: Final = "stopped"
 """First words of a stop that the car's own readings show."""
@@ -162,28 +162,6 @@ def claims_of(
         mode_claim(*mode, present=present),
         link_claim(*link, present=present),
     )
-
-
-def why_not_ready(link: str, reason: str, waits_for: str) -> str:
-    """Return why a car is not ready; empty if it answers, and a command to it waits for nothing.
-
-    What a car has not shown delays no command. link, reason: of `state/link`. waits_for: of `state/safety`.
-    """
-    if link == LinkState.LOST:
-        return f"link lost: {reason}" if reason else "link lost"
-    if link == LinkState.STALE:  # it gets commands all the same
-        return "silent: is it switched on?"
-    return f"waits for {waits_for}" if waits_for else ""
-
-
-def readiness_of(states: Mapping[str, Any], claims: CarClaims) -> tuple[bool, str]:
-    """Return whether a car is ready by its claims, and why it is not, in words; empty if nothing tells."""
-    safety, link = states.get("state/safety"), states.get("state/link")
-    is_old = claims.link.is_stale or claims.motors.is_stale  # such as those of a replay, or of a gateway that hangs
-    if safety is None or link is None or claims.link.what != link.state or is_old:
-        return False, ""
-    why = why_not_ready(link.state, link.reason, safety.waits_for)
-    return not why, why
 
 
 def describe_end_of_doubt(car: str) -> str:

@@ -73,15 +73,9 @@ def test_all_views_of_a_car_agree(name: str) -> None:
     case = CASES[name]
     said_at = NOW - case.age_s
     state = CarState("red")
-    answers = CarState.of_answers(
-        "red",
-        [
-            (topic, Reading(f"fleet/red/{topic}", datetime.fromtimestamp(said_at, UTC), message))
-            for topic, message in case.states.items()
-        ],
-        NOW,
-        present=case.present,
-    )
+    time = datetime.fromtimestamp(said_at, UTC)
+    readings = {topic: Reading(f"fleet/red/{topic}", time, message) for topic, message in case.states.items()}
+    answers = CarState.of_answers("red", readings.items(), NOW, present=case.present)
     row = CarStatus("red")
     for topic, message in case.states.items():
         state.take(topic, message, said_at)
