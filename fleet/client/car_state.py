@@ -108,10 +108,10 @@ class CarState:
                 if message.boot_id == self._boot_id:
                     self._newest[topic] = (message, at)  # the last words of a gateway that has just ended
                 return False
-            if message.boot_id:
-                if message.boot_id != self._boot_id:
-                    self._forget_states()
-                self._boot_id = message.boot_id
+            boot_id = message.boot_id or self._boot_id
+            if self._boot_id not in ("", boot_id):
+                self._forget_states()
+            self._boot_id = boot_id
         self._newest[topic] = (message, at)
         return True
 
@@ -148,6 +148,11 @@ class CarState:
         """Return the newest message. None if there is none, or if its gateway has gone since."""
         return self.newest(topic) if self.present else None
 
+    @property
+    def has_states(self) -> bool:
+        """True if any state of its gateway is known."""
+        return any(topic.startswith("state/") for topic in self._newest)
+
     def fresh(self, topic: str, now: float) -> Any:
         """Return the newest message. None if there is none, or if it is stale."""
         return None if self.is_stale(topic, now) else self.newest(topic)
@@ -162,7 +167,7 @@ class CarState:
         after_s = topics.TOPICS[topic].stale_after_s
         return after_s is not None and self.age_s(topic, now) > after_s
 
-    def stale(self, now: float) -> list[str]:
+    def stale_topics(self, now: float) -> list[str]:
         """Return the topics whose newest message is stale, sorted."""
         return sorted(topic for topic in self._newest if topic in topics.TOPICS and self.is_stale(topic, now))
 

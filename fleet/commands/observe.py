@@ -156,7 +156,7 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
         "battery_v": None if battery is None else battery.voltage_v,
         "battery_level": None if battery is None else battery.level,
         "battery_age_s": None if battery is None else round(readings["sensor/battery"].age_s(), 3),
-        "stale": state.stale(now),
+        "stale": state.stale_topics(now),
     }
 
 

@@ -1,5 +1,6 @@
 """A car as the bus shows it: how old a message is, whose word it is, and that all views of a car agree."""
 
+import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from math import inf
@@ -9,7 +10,10 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.client.car_state import NEVER_HEARD, NO_ANSWER, CarState
+from fleet.client.diagnosis import CarEvidence, diagnose
 from fleet.client.reading import MAX_STAMP_AHEAD_S, Reading
+from fleet.commands.observe import row_of
+from fleet.console.car_view import CarView
 from fleet.supervisor.car_status import CarStatus
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -70,24 +74,34 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_all_views_of_a_car_agree(name: str) -> None:
-    case = CASES[name]
-    said_at = NOW - case.age_s
-    state = CarState("red")
-    time = datetime.fromtimestamp(said_at, UTC)
-    readings = {topic: Reading(f"fleet/red/{topic}", time, message) for topic, message in case.states.items()}
-    answers = CarState.of_answers("red", readings.items(), NOW, present=case.present)
-    row = CarStatus("red")
+    """A list, a start, the doctor, a page and the plan say the same of one car at one time."""
+    case, now = CASES[name], time.time()
+    said_at = now - case.age_s
+    stamped = datetime.fromtimestamp(said_at, UTC)
+    readings = {topic: Reading(f"fleet/red/{topic}", stamped, message) for topic, message in case.states.items()}
+    row, card = CarStatus("red"), CarView("red", "")
+    card.on_presence(said_at, present=True)
     for topic, message in case.states.items():
-        state.take(topic, message, said_at)
         row.take(topic, message, said_at)
-    state.on_presence(present=case.present)
+        card.on_message(topic, message, said_at)
     if not case.present:
         row.reset()
-    for seen in (state, answers, row.state):
-        assert seen.why_missing(NOW) == case.missing
-        assert (seen.why_not_ready(NOW) is None) is (case.missing == "")
-        assert (seen.is_silent, seen.is_unheard) == (case.silent, case.unheard)
-        assert seen.claims(NOW).motors.what == case.motors
+    card.on_presence(now, present=case.present)
+    asked = CarState.of_answers("red", readings.items(), now, present=case.present)
+    for state in (asked, row.state, card.state):
+        assert state.why_missing(now) == case.missing
+        assert (state.why_not_ready(now) is None) is (case.missing == "")
+        assert (state.is_silent, state.is_unheard) == (case.silent, case.unheard)
+        assert state.claims(now).motors.what == case.motors
+
+    listed, page = row_of("red", readings, present=case.present), card.as_dict(now)
+    assert (listed["ready"], listed["unheard"], listed["motors"]) == (not case.missing, case.unheard, case.motors)
+    is_old = case.age_s > 3.0
+    assert ("state/safety" in listed["stale"]) is is_old
+    assert page["motors"]["state"] == ("unknown" if is_old else case.motors)
+    found = {each.code for each in diagnose(CarEvidence(asked, now))}
+    assert ("silent" in found, "link_down" in found) == (case.silent, case.link.state == "lost")
+    assert ("no_gateway" in found) is not case.present
 
 
 def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came() -> None:
