@@ -2,11 +2,13 @@
 
 import time
 from contextlib import suppress
+from math import inf
 from typing import Any
 
+from fleet.client.car_state import CarState
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
-from fleet.client.reading import MAX_STAMP_AHEAD_S
+from fleet.client.reading import Reading, age_of_answer_s
 from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
@@ -25,11 +27,12 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
         for each in status.processes
         if each.kind == ProcessKind.GATEWAY and each.state != RunState.ENDED
     }
-    states: dict[str, dict[str, Any]] = {}
+    answers: dict[str, list[tuple[str, Reading]]] = {}
     for expression in ("*/state/*", "*/sensor/battery"):
         for reading in client.get(expression):
             if (key := keys.parse(reading.key)) is not None:
-                states.setdefault(key.car, {})[key.topic] = reading.value
+                answers.setdefault(key.car, []).append((key.topic, reading))
+    now = time.time()
     commands = _commands(client)
     recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
     if recording is None and (lost := [each.unrecorded for each in supervisions if each.unrecorded]):
@@ -38,9 +41,8 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {
         car: CarEvidence(
-            car,
-            present=car in present,
-            states=states.get(car, {}),
+            CarState.of_answers(car, answers.get(car, []), now, present=car in present),
+            now,
             commands=commands.get(car, []),
             process=processes.get(car),
             recording=recording,
@@ -58,11 +60,9 @@ def _commands(client: Fleet) -> dict[str, list[tuple[float, Any]]]:
     for sample in client.bus.recall(keys.topic_key(client.name, "*", _EVENT.name), RECENT_COMMAND_S):
         with suppress(messages.BadPayload):
             event: Any = messages.parse(_EVENT.message, bytes(sample.payload), str(sample.encoding))
-            age_s = now - event.stamp.seconds - event.stamp.nanos / 1e9
-            if age_s < -MAX_STAMP_AHEAD_S:
-                continue  # from before the clock was set back: nothing tells its age
-            age_s = max(0.0, age_s)
-            found.setdefault(event.car, []).append((age_s, event))
+            age_s = age_of_answer_s(messages.stamp_ns(event.stamp) / 1e9, now)
+            if age_s < inf:  # else nothing tells its age
+                found.setdefault(event.car, []).append((age_s, event))
     for events in found.values():
         events.sort(key=lambda each: -each[0])
     return found

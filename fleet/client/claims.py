@@ -9,10 +9,11 @@ Lists, status, shutdown, doctor, console and Python take their words from here, 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isinf
 from typing import Any, Final
 
 from schemas import topics
-from schemas.words import UNKNOWN, Basis, LinkState, Motors
+from schemas.words import UNKNOWN, Basis, Motors
 
 STOPPED: Final = "stopped"
 """First words of a stop that the car's own readings show."""
@@ -23,10 +24,6 @@ NOT_CONFIRMED: Final = "NOT CONFIRMED"
 NOT_STOPPED: Final = "NOT STOPPED"
 """First words of a stop that did not reach a car that may be moving."""
 NO_GATEWAY: Final = "no gateway"
-_MAX_KNOWN_ENDED: Final = 8
-"""Number of ended gateways of a car whose late messages are recognized."""
-LATE_MESSAGE_NS: Final = 2_000_000_000
-"""Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
 _STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
@@ -84,15 +81,8 @@ def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> Ca
     """Return what is claimed of the motors. safety: the newest fleet.v1.Safety; None: there is none."""
     if safety is None or not safety.motors:
         return CarClaim(UNKNOWN)
-    since_s = safety.trust_since_s + age_s if safety.HasField("trust_since_s") else None
-    claim = CarClaim(
-        safety.motors,
-        safety.motors_basis,
-        since_s,
-        age_s,
-        safety.trust_evidence,
-        is_stale=_is_stale("state/safety", age_s),
-    )
+    since_s = safety.trust_since_s if safety.HasField("trust_since_s") else None
+    claim = _claim("state/safety", age_s, safety.motors, safety.motors_basis, since_s, safety.trust_evidence)
     return claim if present else CarClaim(UNKNOWN, past=claim)
 
 
@@ -100,9 +90,8 @@ def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
     """Return what is claimed of the mode. mode: the newest fleet.v1.Mode; None: there is none."""
     if mode is None or not mode.asked:
         return CarClaim(UNKNOWN)
-    since_s = mode.since_s + age_s if mode.HasField("since_s") else None
-    is_stale = _is_stale("state/mode", age_s)
-    claim = CarClaim(mode.asked, mode.verdict, since_s, age_s, mode.evidence, is_stale=is_stale)
+    since_s = mode.since_s if mode.HasField("since_s") else None
+    claim = _claim("state/mode", age_s, mode.asked, mode.verdict, since_s, mode.evidence)
     return claim if present else CarClaim(UNKNOWN, past=claim)
 
 
@@ -110,7 +99,7 @@ def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
     """Return what is claimed of the link. link: the newest fleet.v1.Link; None: there is none."""
     if link is None or not link.state:
         return CarClaim(UNKNOWN if present else NO_GATEWAY)
-    claim = CarClaim(link.state, "", link.since_s + age_s, age_s, link.reason, is_stale=_is_stale("state/link", age_s))
+    claim = _claim("state/link", age_s, link.state, "", link.since_s, link.reason)
     return claim if present else CarClaim(NO_GATEWAY, past=claim)
 
 
@@ -135,47 +124,17 @@ def describe_age(age_s: float) -> str:
     return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
 
 
-def _is_stale(topic: str, age_s: float) -> bool:
+def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | None, why: str) -> CarClaim:
+    """Return a claim of a message of this age. since_s: as the message says."""
     after_s = topics.TOPICS[topic].stale_after_s
-    return after_s is not None and age_s > after_s
+    is_stale = after_s is not None and age_s > after_s
+    if isinf(age_s):  # its stamp tells no age
+        return CarClaim(what, basis, why=why, is_stale=is_stale)
+    return CarClaim(what, basis, None if since_s is None else since_s + age_s, age_s, why, is_stale=is_stale)
 
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 3)
-
-
-class GatewayStarts:
-    """Recognizes which messages are from the running gateway of a car.
-
-    Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
-    reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
-    them ends. So a message that is stamped clearly later than all others counts, whatever its start.
-    """
-
-    def __init__(self) -> None:
-        self.current = ""
-        """The boot_id of the running gateway. Empty if it is not known."""
-        self._newest_ns = 0
-        self._ended: dict[str, None] = {}
-
-    def take(self, boot_id: str, stamp_ns: int = 0) -> bool:
-        """Return True if a message of this start counts. A new start ends the one before."""
-        if boot_id in self._ended and stamp_ns <= self._newest_ns + LATE_MESSAGE_NS:
-            return False
-        if boot_id and boot_id != self.current:
-            self.end()
-            self._ended.pop(boot_id, None)
-            self.current = boot_id
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        return True
-
-    def end(self) -> None:
-        """Note that the running gateway has ended: its messages count no more."""
-        if self.current:
-            self._ended[self.current] = None
-            while len(self._ended) > _MAX_KNOWN_ENDED:
-                del self._ended[next(iter(self._ended))]
-        self.current = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,28 +162,6 @@ def claims_of(
         mode_claim(*mode, present=present),
         link_claim(*link, present=present),
     )
-
-
-def why_not_ready(link: str, reason: str, waits_for: str) -> str:
-    """Return why a car is not ready; empty if it answers, and a command to it waits for nothing.
-
-    What a car has not shown delays no command. link, reason: of `state/link`. waits_for: of `state/safety`.
-    """
-    if link == LinkState.LOST:
-        return f"link lost: {reason}" if reason else "link lost"
-    if link == LinkState.STALE:  # it gets commands all the same
-        return "silent: is it switched on?"
-    return f"waits for {waits_for}" if waits_for else ""
-
-
-def readiness_of(states: Mapping[str, Any], claims: CarClaims) -> tuple[bool, str]:
-    """Return whether a car is ready by its claims, and why it is not, in words; empty if nothing tells."""
-    safety, link = states.get("state/safety"), states.get("state/link")
-    is_old = claims.link.is_stale or claims.motors.is_stale  # such as those of a replay, or of a gateway that hangs
-    if safety is None or link is None or claims.link.what != link.state or is_old:
-        return False, ""
-    why = why_not_ready(link.state, link.reason, safety.waits_for)
-    return not why, why
 
 
 def describe_end_of_doubt(car: str) -> str:

@@ -3,11 +3,12 @@
 `CHECKS` is the table of findings: condition, cause, and what to type. The likeliest cause comes first.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from fleet.client.claims import CarClaims, claims_of, describe_end_of_doubt
+from fleet.client.car_state import CarState
+from fleet.client.claims import describe_end_of_doubt
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
 from schemas.authority import binding_pause
@@ -44,13 +45,11 @@ _NO_TROUBLE: Final = (Reason.SUPERSEDED, Reason.DUPLICATE)
 
 @dataclass(frozen=True, slots=True)
 class CarEvidence:
-    """Everything that the bus knows of one car. A message that nobody sent is missing."""
+    """Everything that is known of one car now."""
 
-    car: str
-    present: bool
-    """True if its gateway is on the bus."""
-    states: Mapping[str, Any] = field(default_factory=dict)
-    """The newest message by topic, such as `state/link`."""
+    state: CarState
+    now: float
+    """The time by the clock of the state."""
     commands: Sequence[tuple[float, Any]] = ()
     """Age (s) and CommandEvent, the newest last."""
     process: Any = None
@@ -61,17 +60,6 @@ class CarEvidence:
     """The roles of the plan (fleet.v1.Assignment)."""
     coordinated: bool = False
     """True if a coordinator is on the bus."""
-    ages_s: Mapping[str, float] = field(default_factory=dict)
-    """The age of each message of `states`. Empty: they have just come."""
-
-    def of(self, name: str) -> Any:
-        """Return the newest message of a topic. None if there is none, or if its gateway has gone since."""
-        return self.states.get(name) if self.present else None
-
-    @property
-    def claims(self) -> CarClaims:
-        """What is claimed of motors, mode and link."""
-        return claims_of(self.states, self.ages_s, present=self.present)
 
     @property
     def failed(self) -> list[tuple[float, Any]]:
@@ -85,8 +73,7 @@ class CarEvidence:
     @property
     def rejected(self) -> dict[str, int]:
         """The rejected frames by cause."""
-        link = self.of("state/link")
-        return {} if link is None else {each: count for each, count in link.rejects.items() if each not in _NO_FRAMES}
+        return {each: count for each, count in self.state.link.rejects.items() if each not in _NO_FRAMES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,78 +103,62 @@ class DoctorCheck:
 
 
 def _ended(e: CarEvidence) -> str:
-    if e.present or e.process is None:
+    if e.state.present or e.process is None:
         return ""
     why = f" ({e.process.words})" if e.process.words else ""
     return f"Its gateway is {e.process.state}{why}. Nothing stops the car, and whether it moves is not known."
 
 
 def _absent(e: CarEvidence) -> str:
-    if e.present or e.process is not None:
+    if e.state.present or e.process is not None:
         return ""
     return "No gateway serves the car. Nothing stops it, and whether it moves is not known."
 
 
 def _hung(e: CarEvidence) -> str:
-    answers = any(topic.startswith("state/") for topic in e.states)
-    return "" if answers or not e.present else "Its gateway is on the bus and does not answer. It may hang."
+    if e.state.has_states or not e.state.present:
+        return ""
+    return "Its gateway is on the bus and does not answer. It may hang."
 
 
 def _adapter_full(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or link.state != LinkState.LOST or ADAPTER_FULL not in link.reason:
-        return ""
-    return f"Adapter full: {link.reason}."
+    link = e.state.link
+    return f"Adapter full: {link.reason}." if link.state == LinkState.LOST and ADAPTER_FULL in link.reason else ""
 
 
 def _lost(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or link.state != LinkState.LOST or _adapter_full(e):
+    link = e.state.link
+    if link.state != LinkState.LOST or _adapter_full(e):
         return ""
     return f"The link has been lost for {link.since_s:.0f} s: {link.reason or 'no reason is known'}."
 
 
 def _contradicted(e: CarEvidence) -> str:
-    health = e.of("state/health")
-    if health is None or not health.platform_contradictions:
-        return ""
-    return f"Its platform may be named wrongly: {'; '.join(health.platform_contradictions)}."
+    contradictions = "; ".join(e.state.health.platform_contradictions)
+    return f"Its platform may be named wrongly: {contradictions}." if contradictions else ""
 
 
 def _doubted(e: CarEvidence) -> str:
-    safety, health = e.of("state/safety"), e.of("state/health")
-    doubted = health is not None and health.doubted
-    if not doubted and (safety is None or safety.trust != CarTrust.UNPROVEN):
-        return ""
-    if not doubted:
+    if e.state.health.doubted:
+        words = "It has shown its stops before, and did not show the last one. Plans leave it alone."
+        return f"{words} {describe_end_of_doubt(e.state.car)}"
+    if e.state.safety.trust == CarTrust.UNPROVEN:
         return "Its reports do not show its last stop yet. Look at the car: it may be moving."
-    words = "It has shown its stops before, and did not show the last one. Plans leave it alone."
-    return f"{words} {describe_end_of_doubt(e.car)}"
+    return ""
 
 
 def _out_of_range(e: CarEvidence) -> str:
-    health = e.of("state/health")
-    if health is None or not health.out_of_range:
+    health = e.state.health
+    if not health.out_of_range:
         return ""
     fields = ", ".join(health.out_of_range)
     hints = [words for field, words in _OUT_OF_RANGE.items() if field in health.out_of_range]
     return " ".join((f"Always out of range for a {health.platform} car, and so never published: {fields}.", *hints))
 
 
-def _silent(e: CarEvidence) -> bool:
-    link, safety = e.of("state/link"), e.of("state/safety")
-    stale = link is not None and link.state in (LinkState.STALE, LinkState.QUIET)
-    return stale and (link.state == LinkState.STALE or (safety is not None and safety.trust == CarTrust.UNHEARD))
-
-
-def _fan_runs(e: CarEvidence) -> bool:
-    motion = e.of("state/motion")
-    return motion is not None and motion.fan
-
-
 def _baud(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or link.rx_frames > sum(e.rejected.values()):  # a reading came
+    link = e.state.link
+    if link.rx_frames > sum(e.rejected.values()):  # a reading came
         return ""
     if link.rejects.get("wrong_baud", 0):
         return "Bytes arrive, and never a frame. They look like a wrong baud rate: the log has both rates."
@@ -195,29 +166,29 @@ def _baud(e: CarEvidence) -> str:
 
 
 def _silent_fan(e: CarEvidence) -> str:
-    return "It is silent, and its fan runs: some cars send nothing then." if _silent(e) and _fan_runs(e) else ""
+    silent_by_fan = e.state.is_silent and e.state.motion.fan
+    return "It is silent, and its fan runs: some cars send nothing then." if silent_by_fan else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
-    if not _silent(e) or _fan_runs(e) or _baud(e):
+    if not e.state.is_silent or e.state.motion.fan or _baud(e):
         return ""
-    link = e.of("state/link")
-    since = f"for {link.last_rx_s:.0f} s" if link.HasField("last_rx_s") else "since its link opened"
+    last_rx_s = e.state.last_rx_s
+    since = "since its link opened" if last_rx_s is None else f"for {last_rx_s:.0f} s"
     words = f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
-    if link.rx_frames:
+    if e.state.link.rx_frames:
         return words
     return f"{words} If it drives and never sends readings: `platform: raspberry_pi+no_readings` in the fleet file."
 
 
 def _shared(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or not link.rejects.get(_PORT_SHARED, 0):
+    if not e.state.link.rejects.get(_PORT_SHARED, 0):
         return ""
     return "Another program has its port open, too, or had it: bytes may be missing. The log names it."
 
 
 def _damaged(e: CarEvidence) -> str:
-    link, count = e.of("state/link"), sum(e.rejected.values())
+    link, count = e.state.link, sum(e.rejected.values())
     # The rejected frames are among those that came.
     if _baud(e) or count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
@@ -226,90 +197,80 @@ def _damaged(e: CarEvidence) -> str:
 
 
 def _estopped(e: CarEvidence) -> str:
-    safety = e.of("state/safety")
-    if safety is None or not safety.estops:
+    if not e.state.safety.estops:
         return ""
-    estop = safety.estops[0]
+    estop = e.state.safety.estops[0]
     return f"E-stopped by {name_of(estop.by)}{f': {estop.why}' if estop.why else ''}. It accepts only stops."
 
 
 def _paused(e: CarEvidence) -> str:
-    safety = e.of("state/safety")
-    if safety is None or not safety.pauses:
-        return ""
-    pause = binding_pause(safety.pauses)
-    return f"The fleet is paused by {_who(pause, pause.stamp)}."
+    pause = binding_pause(e.state.safety.pauses)
+    return "" if pause is None else f"The fleet is paused by {_who(pause, pause.stamp)}."
 
 
 def _lent(e: CarEvidence) -> str:
-    safety = e.of("state/safety")
-    if safety is None or not safety.HasField("loan") or not any(event.reason == Reason.LENT for _, event in e.failed):
+    safety = e.state.safety
+    if not safety.HasField("loan") or not any(event.reason == Reason.LENT for _, event in e.failed):
         return ""
     return f"It is lent to {safety.loan.to} by {_who(safety.loan, safety.loan.since)}, so others are refused."
 
 
 def _other_mode(e: CarEvidence) -> str:
-    mode = e.of("state/mode")
-    if mode is None or mode.verdict != Verdict.CONTRADICTED:
+    mode = e.state.mode
+    if mode.verdict != Verdict.CONTRADICTED:
         return ""
     return f"It should be in mode {mode.asked} and is probably in {mode.inferred}: {mode.evidence}."
 
 
 def _weak(e: CarEvidence) -> str:
-    battery = e.of("sensor/battery")
+    battery = e.state.of("sensor/battery")
     if battery is None or battery.level not in (BatteryLevel.LOW, BatteryLevel.CRITICAL):
         return ""
     return f"The battery is {battery.level} ({battery.voltage_v:.2f} V). Motors may not start, and the car may reset."
 
 
 def _held(e: CarEvidence) -> str:
-    safety = e.of("state/safety")
-    if safety is None or not safety.HasField("hold"):
+    safety = e.state.safety
+    if not safety.HasField("hold"):
         return ""
     return f"On hold: {name_of(safety.hold.by)} sent it a stop. No plan moves it until someone resumes it."
 
 
 def _leased(e: CarEvidence) -> str:
-    safety = e.of("state/safety")
-    refused = any(event.reason == Reason.LEASED for _, event in e.failed)
-    if safety is None or not safety.HasField("lease") or not refused:
+    lease = e.state.safety.lease
+    if not e.state.safety.HasField("lease") or not any(event.reason == Reason.LEASED for _, event in e.failed):
         return ""
-    return f"{name_of(safety.lease.holder)} ({safety.lease.kind}) drives it, so others are refused."
+    return f"{name_of(lease.holder)} ({lease.kind}) drives it, so others are refused."
 
 
 def _breaks(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or link.reconnects < MIN_ODD_RECONNECTS:
-        return ""
-    return f"The link broke {link.reconnects} times: cable, range or battery."
+    count = e.state.link.reconnects
+    return f"The link broke {count} times: cable, range or battery." if count >= MIN_ODD_RECONNECTS else ""
 
 
 def _restarted(e: CarEvidence) -> str:
-    if e.process is None or not e.process.restarts or not e.present:
+    if e.process is None or not e.process.restarts or not e.state.present:
         return ""
     return f"Its gateway was started again {_times(e.process.restarts)}: {e.process.words or 'see its log'}."
 
 
 def _lags(e: CarEvidence) -> str:
-    health = e.of("state/health")
-    if health is None or health.loop_lag_s <= MAX_ODD_LOOP_LAG_S:
+    lag_s = e.state.health.loop_lag_s
+    if lag_s <= MAX_ODD_LOOP_LAG_S:
         return ""
-    return f"Its gateway stood still for {health.loop_lag_s:.2f} s: the computer is overloaded."
+    return f"Its gateway stood still for {lag_s:.2f} s: the computer is overloaded."
 
 
 def _flooded(e: CarEvidence) -> str:
-    link = e.of("state/link")
-    if link is None or link.tx_airtime <= MAX_AIRTIME:
-        return ""
-    return f"Our frames fill {link.tx_airtime:.0%} of the link: a program sends too many commands."
+    share = e.state.link.tx_airtime
+    return f"Our frames fill {share:.0%} of the link: a program sends too many commands." if share > MAX_AIRTIME else ""
 
 
 def _refused(e: CarEvidence) -> str:
     if not e.failed:
         return ""
     age, event = e.failed[-1]
-    mode = e.of("state/mode")
-    is_over = event.reason == Reason.WRONG_MODE and mode is not None and mode.asked == Mode.MANUAL
+    is_over = event.reason == Reason.WRONG_MODE and e.state.mode.asked == Mode.MANUAL
     # Or the car has done since then what was refused.
     if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
         return ""
@@ -371,7 +332,7 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
         DoctorFinding(
             check.code,
             complete_hints(cause, options),
-            complete_command(check.todo.format(car=evidence.car), options),
+            complete_command(check.todo.format(car=evidence.state.car), options),
             check.of_fleet,
         )
         for check in CHECKS
@@ -385,9 +346,10 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
 
 def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
     """Yield what is known of the car, as names and texts."""
-    link, health = evidence.of("state/link"), evidence.of("state/health")
-    claims, battery = evidence.claims, evidence.of("sensor/battery")
-    if not evidence.present:
+    state, claims = evidence.state, evidence.state.claims(evidence.now)
+    link, mode, safety, health = (state.of(f"state/{name}") for name in ("link", "mode", "safety", "health"))
+    battery = state.of("sensor/battery")
+    if not state.present:
         for name, claim in claims.by_name.items():
             if claim.past is not None:
                 yield name, claim.words
@@ -398,12 +360,12 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
             "link",
             f"{claims.link.short} for {link.since_s:.0f} s, {counts}{f'; rejected: {rejected}' if rejected else ''}",
         )
-    if (mode := evidence.of("state/mode")) is not None:
+    if mode is not None:
         inferred = "" if mode.inferred == mode.asked else f", probably {mode.inferred}"
         yield "mode", f"{claims.mode.short}{inferred}{f': {mode.evidence}' if mode.evidence else ''}"
-    if (safety := evidence.of("state/safety")) is not None:
+    if safety is not None:
         yield "motors", f"{claims.motors.words}; trust {safety.trust}"
-        yield "control", _control(evidence.car, safety)
+        yield "control", _control(state.car, safety)
     if health is not None:
         seen = "; ".join(health.platform_evidence) or "nothing was seen yet"
         volts = f", battery {battery.voltage_v:.2f} V ({battery.level})" if battery is not None else ""
@@ -430,7 +392,7 @@ def describe_reports(health: Any) -> str:
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:
     """Return the findings and what is known, for JSON. options: as for `diagnose`."""
     found = [asdict(finding) for finding in diagnose(evidence, options)]
-    return {"car": evidence.car, "findings": found, "facts": dict(describe(evidence))}
+    return {"car": evidence.state.car, "findings": found, "facts": dict(describe(evidence))}
 
 
 def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
@@ -483,7 +445,7 @@ def _services(evidence: CarEvidence, health: Any) -> Iterator[str]:
         yield "no plan"
     elif evidence.assignment is None or not evidence.assignment.stopped_by:
         roles = () if evidence.assignment is None else evidence.assignment.roles
-        role = next((role.name for role in roles if evidence.car in role.cars), "none")
+        role = next((role.name for role in roles if evidence.state.car in role.cars), "none")
         yield f"plan runs, role {role}"
     else:
         yield "plan stopped"

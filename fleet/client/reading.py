@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from html import escape
+from math import inf
 from typing import Any, Final, Self, TypeAlias
 
 from fleet.conditions import fields_of, value_in
@@ -23,6 +24,15 @@ MAX_STAMP_AHEAD_S: Final = 10.0
 _CLOSE_POLL_S: Final = 0.2
 """Interval at which a waiting reader notices that the stream was closed."""
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def age_of_answer_s(stamp_s: float, now: float) -> float:
+    """Return the age of what a query returned, by its stamp. Both times: s since the epoch.
+
+    At least 0, as clocks differ. Infinite if the stamp is far ahead: it is from before a wall clock was set back and
+    tells no age. The value may be old.
+    """
+    return inf if stamp_s - now > MAX_STAMP_AHEAD_S else max(0.0, now - stamp_s)
 
 
 _HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
@@ -72,9 +82,7 @@ class Reading:
         topic = topics.of_key(self.key)
         if topic is None or topic.stale_after_s is None:
             return False
-        # A stamp from before a wall clock was set back tells no age. The value may be old.
-        is_ahead = (self.time - (now or datetime.now(UTC))).total_seconds() > MAX_STAMP_AHEAD_S
-        return is_ahead or self.age_s(now) > topic.stale_after_s
+        return age_of_answer_s(self.time.timestamp(), (now or datetime.now(UTC)).timestamp()) > topic.stale_after_s
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{name}={'not measured' if text is None else text}" for name, text in self._fields())

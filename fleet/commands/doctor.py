@@ -68,7 +68,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
         if as_json:
             click.echo(json.dumps(as_dict(evidence, hint_options())))
         elif name is None:
-            echo_safely(_first_line(evidence.car, [each for each in findings if not each.of_fleet]))
+            echo_safely(_first_line(evidence.state.car, [each for each in findings if not each.of_fleet]))
         else:
             _show_car(evidence, findings)
     raise SystemExit(1 if any(odd) else 0)
@@ -81,7 +81,7 @@ def _session_of(name: str) -> Path | None:
 
 
 def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
-    echo_safely(_first_line(evidence.car, findings))
+    echo_safely(_first_line(evidence.state.car, findings))
     _show(findings, describe(evidence))
 
 

@@ -9,7 +9,8 @@ from typing import Any, Final
 import click
 
 from fleet.client import history
-from fleet.client.claims import claims_of, describe_end_of_doubt, readiness_of
+from fleet.client.car_state import CarState
+from fleet.client.claims import describe_end_of_doubt
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
@@ -40,7 +41,7 @@ from schemas.authority import binding_pause
 from schemas.bus import Sample, intersects
 from schemas.colors import car_color, hex_color
 from schemas.suggestion import did_you_mean
-from schemas.words import LinkState, Motors, Shows
+from schemas.words import Shows
 
 CAR_COLUMNS: Final = (
     "car",
@@ -61,8 +62,6 @@ OPTIONAL_CAR_COLUMNS: Final = ("platform", "shows stops", "verdict", "driver", "
 _SHOWS: Final = {Shows.YES: "yes", Shows.NO: "no", Shows.UNKNOWN: "not known"}
 _KEY_COLUMNS: Final = ("key", "type", "unit", "rate", "age")
 _DAY_S: Final = 86_400.0
-_UNHEARD_S: Final = 3.0
-"""Silence after which a car counts as unheard if the state of its motors is unknown."""
 _MAX_SHORTFALL_LINES: Final = 5
 
 
@@ -122,54 +121,43 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
 
     readings: its latest ones, by topic. present: True if its gateway is on the bus.
     """
-    values = {topic: reading.value for topic, reading in readings.items()}
-    ages_s = {topic: reading.age_s() for topic, reading in readings.items()}
-    claimed = claims_of(values, ages_s, present=present)
-    ready, why_not_ready = readiness_of(values, claimed)
-    measured = readings.get("sensor/battery")
-    link, motion = values.get("state/link"), values.get("state/motion") if present else None
-    safety, battery = values.get("state/safety"), values.get("sensor/battery")
-    health = values.get("state/health")
-    last_rx_s = link.last_rx_s if link and link.HasField("last_rx_s") else None
+    now = datetime.now(UTC).timestamp()
+    state = CarState.of_answers(car, readings.items(), now, present=present)
+    claimed, why_not_ready = state.claims(now), state.why_not_ready(now)
+    link, safety, health = (state.last_word(f"state/{name}") for name in ("link", "safety", "health"))
+    battery = state.newest("sensor/battery")
     return {
         "car": car,
-        "link": claimed.link.what if link or not present else "no answer",
-        "reason": link.reason if link else "",
-        "ready": ready,
-        "why_not_ready": why_not_ready,
-        "waits_for": safety.waits_for if safety and present else None,
-        "unheard": present and link is not None and _unheard(link.state, last_rx_s, safety.motors if safety else ""),
-        "last_rx_s": None if last_rx_s is None else round(last_rx_s, 3),
-        "platform": health.platform if health else None,
-        "platform_contradictions": list(health.platform_contradictions) if health else [],
-        "mode": claimed.mode.what if "state/mode" in values else None,
+        "link": claimed.link.what if link.state or not present else "no answer",
+        "reason": link.reason,
+        "ready": why_not_ready is None,
+        "why_not_ready": why_not_ready or "",
+        "waits_for": None if state.of("state/safety") is None else safety.waits_for,
+        "unheard": state.is_unheard,
+        "last_rx_s": round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None,
+        "platform": health.platform or None,
+        "platform_contradictions": list(health.platform_contradictions),
+        "mode": None if state.newest("state/mode") is None else claimed.mode.what,
         "verdict": claimed.mode.basis or None,
-        "motion": motion.motion if motion else None,
-        "driver": safety.lease.holder if safety and safety.HasField("lease") else None,
-        "driver_kind": safety.lease.kind if safety and safety.HasField("lease") else None,
-        "hold": safety.hold.by if safety and safety.HasField("hold") else None,
-        "paused": binding_pause(safety.pauses).by if safety and safety.pauses else None,
-        "lent": safety.loan.to if safety and safety.HasField("loan") else None,
-        "estops": [estop.id for estop in safety.estops] if safety else [],
-        "motors": claimed.motors.what if safety else None,
+        "motion": state.motion.motion or None,
+        "driver": safety.lease.holder or None,
+        "driver_kind": safety.lease.kind or None,
+        "hold": safety.hold.by or None,
+        "paused": binding_pause(safety.pauses).by if safety.pauses else None,
+        "lent": safety.loan.to or None,
+        "estops": [estop.id for estop in safety.estops],
+        "motors": None if state.newest("state/safety") is None else claimed.motors.what,
         "motors_basis": claimed.motors.basis or None,
         "claims": {name: claim.as_dict() for name, claim in claimed.by_name.items()},
-        "shows_stops": health.shows_stops or None if health else None,
-        "shows_stops_words": health.shows_stops_words if health else "",
-        "doubted": health.doubted if health else False,
-        "out_of_range": list(health.out_of_range) if health else [],
-        "battery_v": battery.voltage_v if battery else None,
-        "battery_level": battery.level if battery else None,
-        "battery_age_s": round(measured.age_s(), 3) if measured else None,
-        "stale": sorted(topic for topic, reading in readings.items() if reading.stale()),
+        "shows_stops": health.shows_stops or None,
+        "shows_stops_words": health.shows_stops_words,
+        "doubted": health.doubted,
+        "out_of_range": list(health.out_of_range),
+        "battery_v": None if battery is None else battery.voltage_v,
+        "battery_level": None if battery is None else battery.level,
+        "battery_age_s": None if battery is None else round(readings["sensor/battery"].age_s(), 3),
+        "stale": state.stale_topics(now),
     }
-
-
-def _unheard(link: str, last_rx_s: float | None, motors: str) -> bool:
-    """Return True if the link is open and the car is silent: stale, without any byte, or unknown for too long."""
-    if link == LinkState.LOST:
-        return False
-    return link == LinkState.STALE or last_rx_s is None or (motors == Motors.UNKNOWN and last_rx_s > _UNHEARD_S)
 
 
 def shown(name: str, row: Mapping[str, Any]) -> str:

@@ -7,11 +7,14 @@ from typing import Final
 
 import click
 
+from fleet.client.car_state import CarState
+from fleet.client.reading import age_of_answer_s
 from fleet.client.supervision import ask_status
 from fleet.commands.options import not_running
-from fleet.supervisor.car_status import CarStatus, describe_missing, describe_start
+from fleet.supervisor.car_status import describe_start
 from schemas import keys
 from schemas.bus import Bus, BusError, messages_of
+from schemas.messages import stamp_ns
 from schemas.suggestion import nearest
 from schemas.topics import Qos
 from schemas.words import RunState
@@ -67,12 +70,13 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
         if status.state != RunState.RUNNING:
             return cars, dict.fromkeys(cars, f"the fleet is {status.state}")
         return cars, missing
-    rows = {key.rpartition("/")[2]: CarStatus(key.rpartition("/")[2]) for key in bus.tokens(keys.car_token(fleet, "*"))}
+    states = {car: CarState(car) for car in (key.rpartition("/")[2] for key in bus.tokens(keys.car_token(fleet, "*")))}
+    now = time.time()
     for topic in _STATES:
         for message in messages_of(bus.query(f"{fleet}/*/{topic}", qos=Qos.STATE)):
-            if message.car in rows:
-                rows[message.car].take(topic, message, time.monotonic())
-    return sorted(rows), {car: why for car, row in sorted(rows.items()) if (why := describe_missing(row))}
+            if message.car in states:
+                states[message.car].take(topic, message, now - age_of_answer_s(stamp_ns(message.stamp) / 1e9, now))
+    return sorted(states), {car: why for car, state in sorted(states.items()) if (why := state.why_missing(now))}
 
 
 def _unknown(car: str, known: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final
 
-from fleet.client.claims import CarClaims, GatewayStarts, claims_of
+from fleet.client.car_state import CarState
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
@@ -76,20 +76,18 @@ class CarView:
         self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Commands and log records, the newest last."""
         self.authority = Authority()
-        """The rights of each person."""
+        """The rights of each person. Cached: a page asks ten times a second."""
         self.names_people = False
         """True if a gateway of this car has said who may drive it."""
         self.commands = CommandLedger()
         self._events: deque[tuple[float, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Time and event of the newest commands."""
-        self._newest: dict[str, tuple[Any, float]] = {}
+        self.state = CarState(name)
         self._trend = BatteryTrend()
-        self._present = False
         self._heard_at: float | None = None
         """When the newest message came."""
-        self._starts = GatewayStarts()
         self._changed_at: float | None = None
-        """When the gateway joined or left the bus."""
+        """When the gateway joined or left the bus. None: nobody has said yet if it is there."""
 
     @property
     def last_sign_at(self) -> float:
@@ -109,9 +107,8 @@ class CarView:
                 level = messages.level_of(value)
                 self._note(value.timestamp, words, Level.INFO if level is Level.DEBUG else level)
             case _:
-                if not self._counts(topic, value):
+                if not self.state.take(topic, value, now):
                     return
-                self._newest[topic] = (value, now)
                 if topic == "sensor/battery":
                     self._trend.add(value.voltage_v, now)
                 elif topic == "state/safety":
@@ -119,61 +116,36 @@ class CarView:
 
     def on_presence(self, now: float, *, present: bool) -> None:
         """Handle that the car's gateway is on the bus, or not."""
-        if present is not self._present or self._changed_at is None:
-            if present and self._changed_at is not None:
-                self._forget_states()  # what the last gateway claimed is over: the returning one says what is so
-            self._present, self._changed_at = present, now
-
-    def _counts(self, topic: str, value: Any) -> bool:
-        """Return False for a late state of an earlier gateway. Forget the states of that one if a new one speaks."""
-        if not topic.startswith("state/"):
-            return True
-        before = self._starts.current
-        if not self._starts.take(value.boot_id, messages.stamp_ns(value.stamp)):
-            return False
-        if before and self._starts.current != before:
-            self._forget_states()
-        return True
-
-    def _forget_states(self) -> None:
-        for topic in [each for each in self._newest if each.startswith("state/")]:
-            del self._newest[topic]
-
-    def claims(self, now: float) -> CarClaims:
-        """Return what is claimed of motors, mode and link. Without a gateway nobody knows it any more."""
-        states = {topic: message for topic, (message, _) in self._newest.items()}
-        return claims_of(states, self._ages_s(now), present=self._gone_at is None)
-
-    def _ages_s(self, now: float) -> dict[str, float]:
-        return {topic: max(0.0, now - at) for topic, (_, at) in self._newest.items()}
+        if self._changed_at is None:
+            self.state.present = present
+        elif present is self.state.present:
+            return
+        self.state.on_presence(present=present)
+        self._changed_at = now
 
     @property
     def _gone_at(self) -> float | None:
         """When the gateway left the bus. None if it is there, or was never seen."""
-        return None if self._present else self._changed_at
+        return None if self.state.present else self._changed_at
 
     def describe_gateway(self) -> list[tuple[str, str]]:
         """Return what the car's gateway knows, as names and texts. A gateway that is gone knows nothing any more."""
         if self._gone_at is not None:
             return []
-        return describe_gateway(*(self._get(f"state/{name}") for name in ("link", "health", "safety", "mode")))
+        return describe_gateway(*(self.state.of(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def diagnose(self, now: float) -> dict[str, Any]:
         """Return what `fleet doctor` says of the car, as far as its messages tell."""
-        evidence = CarEvidence(
-            self.name,
-            present=self._present,
-            states={topic: message for topic, (message, _) in self._newest.items()},
-            commands=[(now - at, event) for at, event in self._events],
-            ages_s=self._ages_s(now),
-        )
+        state = self.state if self._changed_at is not None else CarState(self.name, present=False)
+        evidence = CarEvidence(state, now, [(now - at, event) for at, event in self._events])
         # Recorder and plan have pages of their own.
         facts = [(name, words) for name, words in describe(evidence) if name != "services"]
         return {"findings": [str(finding) for finding in diagnose(evidence)], "facts": facts}
 
     def as_dict(self, now: float) -> dict[str, Any]:
         """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""
-        shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
+        shown: dict[str, Any] = {"name": self.name, "color": self.color}
+        shown["gateway"] = self.state.present and self._changed_at is not None
         if self._gone_at is not None:
             shown["gone_s"] = int(now - self._gone_at)
         if self._heard_at is not None and now - self._heard_at > SILENT_AFTER_S:
@@ -184,49 +156,31 @@ class CarView:
             shown["event"] = self.ledger[-1]
         return shown
 
-    def _get(self, topic: str) -> Any:
-        found = self._newest.get(topic)
-        return None if found is None else found[0]
-
-    def _fresh(self, topic: str, now: float) -> Any:
-        """Return the newest message. None if there is none, or if it is stale."""
-        found = self._newest.get(topic)
-        stale_after_s = topics.TOPICS[topic].stale_after_s
-        if found is None or (stale_after_s is not None and now - found[1] > stale_after_s):
-            return None
-        return found[0]
-
     def _link(self, now: float) -> dict[str, Any]:
-        found = self._newest.get("state/link")
-        if found is None:
+        claim = self.state.claims(now).link
+        if claim.is_stale or (claim.age_s is None and claim.past is None):
             return {"link": {"state": UNKNOWN, "reason": "", "since_s": 0}}
-        link, at = found
-        claim = self.claims(now).link
-        if claim.is_stale:
-            return {"link": {"state": UNKNOWN, "reason": "", "since_s": 0}}
-        if claim.past is not None:
-            return {"link": {"state": claim.what, "reason": "", "since_s": 0}}
-        shown = {"state": claim.what, "reason": claim.why, "since_s": int(link.since_s + now - at)}
-        if claim.what == LinkState.ONLINE:
-            shown["since_s"] = 0  # a growing number that nobody needs would draw the card each second
-        return {"link": shown}
+        # A growing number that nobody needs would draw the card each second.
+        is_calm = claim.past is not None or claim.what == LinkState.ONLINE
+        since_s = 0 if is_calm else int(claim.since_s or 0)
+        return {"link": {"state": claim.what, "reason": claim.why, "since_s": since_s}}
 
     def _mode(self, now: float) -> dict[str, Any]:
-        mode, claim = self._get("state/mode"), self.claims(now).mode
-        if mode is None or claim.past is not None or claim.is_stale:
+        claim = self.state.claims(now).mode
+        if claim.age_s is None or claim.is_stale:
             return {"mode": {"asked": UNKNOWN, "inferred": UNKNOWN, "verdict": Verdict.ASSUMED, "evidence": ""}}
         return {
             "mode": {
                 "asked": claim.what,
-                "inferred": mode.inferred,
+                "inferred": self.state.mode.inferred,
                 "verdict": claim.basis,
                 "evidence": claim.why,
             }
         }
 
     def _motion(self, now: float) -> dict[str, Any]:
-        motion = self._fresh("state/motion", now)
-        if motion is None or self._gone_at is not None:
+        motion = self.state.motion
+        if self.state.is_stale("state/motion", now) or not self.state.present:
             return {"motion": {"motion": UNKNOWN, "owner": "", "speed": None, "fan": False, "servo_deg": None}}
         shown = {
             "motion": motion.motion,
@@ -239,7 +193,7 @@ class CarView:
         return {"motion": shown}
 
     def _safety(self, now: float) -> dict[str, Any]:
-        safety, claim = self._get("state/safety"), self.claims(now).motors
+        safety, claim = self.state.newest("state/safety"), self.state.claims(now).motors
         motors: dict[str, Any] = {"state": claim.what, "basis": claim.basis}
         past = claim if claim.is_stale else claim.past
         if past is not None:  # what is old is told as past, with its age
@@ -270,7 +224,7 @@ class CarView:
         return shown
 
     def _health(self, _: float) -> dict[str, Any]:
-        health = self._get("state/health")
+        health = self.state.newest("state/health")
         if health is None:
             return {"platform": "", **UNKNOWN_ABILITIES.as_dict()}
         return {
@@ -282,19 +236,19 @@ class CarView:
 
     def _sensors(self, now: float) -> dict[str, Any]:
         shown: dict[str, Any] = {}
-        if (battery := self._fresh("sensor/battery", now)) is not None:
+        if (battery := self.state.fresh("sensor/battery", now)) is not None:
             shown["battery"] = {
                 "v": round(battery.voltage_v, 1),
                 "charge": round(battery.charge, 1) if battery.HasField("charge") else None,
                 "level": battery.level,
                 "trend": self._trend.words,
             }
-        if (range_ := self._fresh("sensor/range", now)) is not None:
+        if (range_ := self.state.fresh("sensor/range", now)) is not None:
             shown["range_m"] = round(range_.range_m, 2) if range_.HasField("range_m") else None
-        if (line := self._fresh("sensor/line", now)) is not None:
+        if (line := self.state.fresh("sensor/line", now)) is not None:
             shown["line"] = [getattr(line, name) for name in _LINES]
         for name in ("obstacle", "light"):
-            if (pair := self._fresh(f"sensor/{name}", now)) is not None:
+            if (pair := self.state.fresh(f"sensor/{name}", now)) is not None:
                 shown[name] = [getattr(pair, side) for side in _SIDES]
         return shown
 

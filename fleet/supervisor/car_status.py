@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-from fleet.client.claims import CarClaim, GatewayStarts, motors_claim, why_not_ready
-from schemas import messages
+from fleet.client.car_state import CarState
+from fleet.client.claims import CarClaim, motors_claim
 from schemas.keys import name_of
 from schemas.local_time import date_and_clock
-from schemas.words import UNKNOWN, BatteryLevel, LinkState, Motors
+from schemas.words import LinkState
 
 MIN_COLUMN_WIDTH: Final = 4
 """Minimum width of a column that is shortened."""
@@ -28,19 +28,10 @@ RATE_WINDOW_S: Final = 2.0
 
 @dataclass(slots=True)
 class CarStatus:
-    """The latest state of one car, as its gateway published it."""
+    """The state of one car for the supervisor, and which of its changes deserve a line."""
 
     car: str
-    link: str = ""
-    reason: str = ""
-    mode: str = ""
-    verdict: str = ""
-    motion: str = ""
-    motors: str = ""
-    hold: str = ""
-    estop: str = ""
-    lease: str = ""
-    battery: str = ""
+    state: CarState = field(init=False)
     rate_hz: float | None = None
     """Frames per second from the car."""
     event: str = ""
@@ -48,71 +39,51 @@ class CarStatus:
     """True if any gateway has published the car's state/safety."""
     reached: bool = False
     """True if any gateway has had an open link to the car: bytes came, or it stayed open."""
-    waits_for: str = ""
-    """What a command would wait for."""
-    heard: bool = False
-    """True if bytes came from the car over the link that is open."""
-    rest: CarClaim = field(default_factory=lambda: CarClaim(UNKNOWN))
-    """The last claim about the motors, also of a gateway that has ended since."""
-    _rest_boot: str = ""
-    _starts: GatewayStarts = field(default_factory=GatewayStarts)
     _counted: tuple[float, int] | None = None
     _reported: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.state = CarState(self.car, present=False)
+
+    @property
+    def rest(self) -> CarClaim:
+        """The last claim about the motors, also of a gateway that has ended since."""
+        return motors_claim(self.state.newest("state/safety"))
+
     def take(self, topic: str, value: Any, now: float) -> str:
         """Update from a message. Return a line for a notable change, else an empty string."""
-        if topic.startswith("state/") and not self._starts.take(value.boot_id, messages.stamp_ns(value.stamp)):
-            if topic == "state/safety" and value.boot_id == self._rest_boot:
-                self.rest = motors_claim(value)  # the last words of a gateway that has just ended
+        if topic == "event/log":
+            self.event = value.message.removeprefix(f"{self.car} ")
+        if topic.startswith("event/") or not self.state.take(topic, value, now):
             return ""
+        # The supervisor knows when a process has ended (`reset`). Until then whoever publishes a state is there.
+        self.state.present |= topic.startswith("state/")
         match topic:
             case "state/link":
-                self.link, self.reason = value.state, value.reason
                 # A bridge that is in use accepts a connection, and closes it before it sends a byte.
                 self.reached |= value.state in _OPEN and (value.rx_bytes > 0 or value.since_s >= REACHED_S)
-                self.heard = value.HasField("last_rx_s")
                 self._count(value.rx_frames, now)
                 return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")
             case "state/mode":
-                self.mode, self.verdict = value.asked, value.verdict
                 return self._change("mode", f"mode {value.asked}, {value.verdict}")
             case "state/motion":
                 by = f" by {name_of(value.owner)}" if value.owner else ""
-                self.motion = value.motion
                 return self._change("motion", f"motion {value.motion}{by}")
+            case "state/safety" if value.estops:
+                return self._change("safety", f"e-stop {' '.join(each.id for each in value.estops)}")
             case "state/safety":
-                return self._safety(value)
+                held = f"on hold by {name_of(value.hold.by)}" if value.HasField("hold") else "not on hold"
+                return self._change("safety", held)
             case "sensor/battery":
-                level = "" if value.level == BatteryLevel.OK else f" {value.level}"
-                self.battery = f"{value.voltage_v:.2f} V{level}"
                 return self._change("battery", f"battery {value.level}")
-            case "event/log":
-                self.event = value.message.removeprefix(f"{self.car} ")
             case _:
-                pass
-        return ""
+                return ""
 
     def reset(self, running: str = "") -> None:
-        """Forget the state: the car's gateway has ended. running: the boot_id of the next one, if it is known."""
-        if running:
-            self._starts.take(running)
-        else:
-            self._starts.end()
-        self.waits_for, self.heard = "", False
-        self.link, self.reason, self.rate_hz, self._counted = "", "", None, None
-        self.mode = self.verdict = self.motion = self.motors = self.lease = ""
+        """Note that the car's gateway has ended. running: the boot_id of the next one, if it is known."""
+        self.state.on_gateway_end(running)
+        self.rate_hz = self._counted = None
         self._reported.clear()
-
-    def _safety(self, value: Any) -> str:
-        self.hold = name_of(value.hold.by) if value.HasField("hold") else ""
-        self.estop = " ".join(each.id for each in value.estops)
-        self.lease = name_of(value.lease.holder) if value.HasField("lease") else ""
-        self.motors = value.motors
-        self.waits_for = value.waits_for
-        self.rest, self._rest_boot = motors_claim(value), value.boot_id
-        if self.estop:
-            return self._change("safety", f"e-stop {self.estop}")
-        return self._change("safety", f"on hold by {self.hold}" if self.hold else "not on hold")
 
     def _count(self, frames: int, now: float) -> None:
         if self._counted is None or frames < self._counted[1]:
@@ -126,11 +97,6 @@ class CarStatus:
         essence = _SECONDS.sub("", words)
         before, self._reported[what] = self._reported.get(what), essence
         return "" if essence == before or (before is None and words in _AT_FIRST) else words
-
-    def as_dict(self) -> Mapping[str, object]:
-        """Return the status as JSON values."""
-        names = ("car", "link", "reason", "mode", "verdict", "motion", "hold", "estop", "lease", "battery")
-        return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
 
 
 @dataclass(slots=True)
@@ -167,16 +133,6 @@ def fit(widths: Mapping[str, int], width: int, optional: Sequence[str], gap: int
         widest = max(result, key=lambda name: result[name])
         result[widest] -= 1
     return result
-
-
-def describe_missing(row: CarStatus) -> str:
-    """Return why a car is not ready (`why_not_ready`), or has not answered since its gateway began; empty if it is."""
-    if not row.link:
-        return "its gateway is starting"
-    if why := why_not_ready(row.link, row.reason, row.waits_for):
-        return why
-    heard = row.motors in (Motors.OFF, Motors.ON) or (row.heard and row.motors)
-    return "" if heard else "nothing was heard from it yet"
 
 
 def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str, console: str = "") -> str:

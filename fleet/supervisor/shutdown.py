@@ -147,11 +147,12 @@ class GatewayShutdown:
         """Return the result for a car that its gateway did not stop."""
         row = self._rows.get(process.name)
         if row is None or not row.reached:
-            reason = row.reason if row is not None and row.reason not in ("", NOT_TRIED) else why
+            reason = row.state.link.reason if row is not None else ""
+            reason = why if reason in ("", NOT_TRIED) else reason
             return f"{NEVER_REACHED}, so it got no command ({reason.rstrip('.')})"
         if row.rest.what == Motors.OFF and row.rest.basis == Basis.SHOWN:
             return f"{STOPPED}, as it showed before its gateway ended ({why.rstrip('.')})"
-        could_not_reach = process.code is None or process.code < 0 or row.link in ("", LinkState.LOST)
+        could_not_reach = process.code is None or process.code < 0 or row.state.link.state in ("", LinkState.LOST)
         return f"{NOT_STOPPED if could_not_reach else NOT_CONFIRMED}: {why}"
 
     def turn(self, now: float) -> None:
@@ -180,13 +181,14 @@ class GatewayShutdown:
     def _reached(self, process: ManagedProcess) -> bool:
         row = self._rows.get(process.name)
         if process.name in self._tries:
-            return row is not None and row.link not in ("", LinkState.LOST)
+            return row is not None and row.state.link.state not in ("", LinkState.LOST)
         return not self._undecided(process)
 
     def _undecided(self, process: ManagedProcess) -> bool:
         """Return True if the gateway has not yet tried to open the link."""
         row = self._rows.get(process.name)
-        return process.status.state is RunState.STARTING or row is None or not row.link or row.reason == NOT_TRIED
+        link = None if row is None else row.state.link
+        return process.status.state is RunState.STARTING or not link or not link.state or link.reason == NOT_TRIED
 
     def _replace(self, process: ManagedProcess, why: str) -> None:
         tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1

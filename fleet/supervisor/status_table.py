@@ -11,6 +11,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from fleet.supervisor.car_status import CarStatus, fit
+from schemas.keys import name_of
 from schemas.local_time import clock
 from schemas.words import BatteryLevel, LinkState, RunState, Verdict
 
@@ -105,17 +106,24 @@ class Table:
 
 
 def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
-    link = process if process or not row.link else row.link
-    held = f"e-stop {row.estop}" if row.estop else f"hold {row.hold}" if row.hold else ""
+    state, safety, battery = row.state, row.state.newest("state/safety"), row.state.newest("sensor/battery")
+    link = process if process or not state.link.state else state.link.state
+    held = ""
+    if safety is not None and safety.estops:
+        held = f"e-stop {' '.join(each.id for each in safety.estops)}"
+    elif safety is not None and safety.HasField("hold"):
+        held = f"hold {name_of(safety.hold.by)}"
+    volts = "" if battery is None else f"{battery.voltage_v:.2f} V"
+    is_low = battery is not None and battery.level != BatteryLevel.OK
     rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"
     return [
         Text.assemble(("● " if color else "", color), (row.car, "bold")),
         Text(link, _LINK.get(link, "yellow")),
-        Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
-        Text(row.motion),
-        Text(row.rest.basic if row.motors else ""),
-        Text(held or row.lease, "red" if held else ""),
-        Text(row.battery, "red" if row.battery.endswith((BatteryLevel.LOW, BatteryLevel.CRITICAL)) else ""),
+        Text.assemble(state.mode.asked, " ", (state.mode.verdict, _VERDICT.get(state.mode.verdict, ""))),
+        Text(state.motion.motion),
+        Text(row.rest.basic if state.safety.motors else ""),
+        Text(held or name_of(state.safety.lease.holder), "red" if held else ""),
+        Text(f"{volts} {battery.level}" if is_low else volts, "red" if is_low else ""),
         Text(rate, justify="right"),
         Text(row.event, overflow="ellipsis", no_wrap=True),
     ]

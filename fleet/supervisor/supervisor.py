@@ -19,7 +19,7 @@ from typing import Any, Final
 from fleet.client.hints import complete_hints, fleet_options
 from fleet.client.services import why_unrecorded
 from fleet.supervisor import spec
-from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missing, describe_old_stops, describe_start
+from fleet.supervisor.car_status import CarStatus, StartProgress, describe_old_stops, describe_start
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
@@ -186,14 +186,14 @@ class Supervisor:
 
     def missing(self) -> dict[str, str]:
         """Return the cars and services that are not ready, each with the reason."""
-        result = {}
+        result, now = {}, time.monotonic()
         for name in self._spec.cars:
             process, row = self.processes.get(name), self.rows.get(name)
             if process is None or row is None:
                 result[name] = "its simulator is starting"
             elif process.status.state is not RunState.RUNNING:
                 result[name] = process.status.words or "its gateway is starting"
-            elif why := describe_missing(row):
+            elif why := row.state.why_missing(now):
                 result[name] = why
         for process in self.processes:
             up = process.status.state in (RunState.RUNNING, RunState.ELSEWHERE)
@@ -208,8 +208,8 @@ class Supervisor:
         if not self.starting:
             return
         missing = self.missing()
-        rows = [self.rows.get(name) for name in missing]
-        unreachable = all(row is not None and row.link == LinkState.LOST and row.reason != NOT_TRIED for row in rows)
+        links = [row.state.link if (row := self.rows.get(name)) else None for name in missing]
+        unreachable = all(link and link.state == LinkState.LOST and link.reason != NOT_TRIED for link in links)
         if not self._progress.has_ended(len(missing), now, unreachable=unreachable):
             return
         words = describe_start(list(self._spec.cars), missing, self._session, self._console)
@@ -383,7 +383,7 @@ class Supervisor:
     def _may_move(self, process: ManagedProcess) -> bool:
         """Return True if a gateway's car may be moving. Only a message of its gateway can exclude that."""
         row = self.rows.get(process.name)
-        return process.kind is ProcessKind.GATEWAY and (row is None or row.motors != Motors.OFF)
+        return process.kind is ProcessKind.GATEWAY and (row is None or row.state.safety.motors != Motors.OFF)
 
     def _exists(self, car: str) -> bool:
         """Return True unless the car is simulated and its simulator has ended."""

@@ -9,13 +9,12 @@ draws the table from the same messages.
 import io
 import math
 import os
-import socket
 import subprocess
 import sys
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,7 +50,6 @@ AFTER_S: Final = 4.5
 """Time shown after the last command."""
 DRIVE_S: Final = 26.0
 HOLD_S: Final = 9.0
-HOST: Final = socket.gethostname()
 BACKGROUND: Final = (250, 250, 248)
 GROUND: Final = (255, 255, 255)
 WALL: Final = (60, 64, 72)
@@ -99,9 +97,7 @@ class State:
             [SimpleNamespace(name=name, status=SimpleNamespace(state=state)) for name, state in self.services.items()],
             "~/.local/state",
         )
-        rows = {car: replace(row) for car, row in sorted(self.rows.items())}
-        for row in rows.values():
-            row.hold, row.lease = (name.replace(HOST, "laptop") for name in (row.hold, row.lease))
+        rows = dict(sorted(self.rows.items()))
         colors = {car: hex_color(car_color(car, 0)) for car in rows}
         supervisor: Any = SimpleNamespace(rows=rows, processes=processes, colors=colors)
         return Table(supervisor, Console(file=io.StringIO(), width=COLUMNS)).rendered()

@@ -2,10 +2,9 @@
 
 import pytest
 
+from fleet.client.car_state import LATE_MESSAGE_NS, GatewayStarts
 from fleet.client.claims import (
-    LATE_MESSAGE_NS,
     CarClaim,
-    GatewayStarts,
     is_bad_rest,
     link_claim,
     mode_claim,

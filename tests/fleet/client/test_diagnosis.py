@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from fleet.client.car_state import CarState
 from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, diagnose
 from schemas.bluetooth import describe_full
 from schemas.gen import fleet_v1_pb2 as pb
@@ -19,8 +20,11 @@ WELL: dict[str, Any] = {
 }
 
 
-def evidence(*, present: bool = True, **more: Any) -> CarEvidence:
-    return CarEvidence("red", present, **{"states": WELL, "recording": pb.Recording(state="recording"), **more})
+def evidence(*, present: bool = True, states: dict[str, Any] = WELL, age_s: float = 0.0, **more: Any) -> CarEvidence:
+    state = CarState("red", present)
+    for topic, message in states.items():
+        state.take(topic, message, 100.0 - age_s)
+    return CarEvidence(state, 100.0, **{"recording": pb.Recording(state="recording"), **more})
 
 
 def with_states(**messages: Any) -> CarEvidence:
@@ -111,7 +115,7 @@ def test_a_refusal_whose_cause_is_gone_is_no_finding(mode: str, later: list[Any]
 
 
 def test_the_likely_cause_comes_first_and_a_known_refusal_is_not_said_twice() -> None:
-    lost = with_states(link=pb.Link(state="lost", reason="unplugged"), safety=ODD["held"].of("state/safety"))
+    lost = with_states(link=pb.Link(state="lost", reason="unplugged"), safety=ODD["held"].state.safety)
     found = diagnose(replace(lost, commands=[refused("link_down")]))
     assert [each.code for each in found] == ["link_down", "held"]
     other = diagnose(replace(lost, commands=[refused("battery_low")]))
@@ -163,7 +167,7 @@ def test_what_was_learned_of_the_reports_is_a_fact() -> None:
 
 
 def test_the_last_claims_of_a_gateway_that_is_gone_are_told_as_past() -> None:
-    gone = evidence(present=False, ages_s={"state/safety": 40.0, "state/link": 40.0, "state/mode": 40.0})
+    gone = evidence(present=False, age_s=40.0)
     facts = dict(describe(gone))
     assert facts["motors"].startswith("unknown: its gateway is gone, and said off (shown")
     assert facts["motors"].endswith("40 s ago")

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from fleet.client.claims import why_not_ready
 from fleet.client.reading import Reading
 from fleet.commands.observe import CAR_COLUMNS, OPTIONAL_CAR_COLUMNS, row_of, shown
 from fleet.commands.output import show_table
@@ -81,8 +80,7 @@ def test_the_row_of_a_car_has_its_color_on_a_terminal(
     assert capsys.readouterr().out.splitlines()[1] == f"{dot}red"
 
 
-WHY_SILENT = why_not_ready("stale", "", "")
-"""As `fleet up` says it."""
+WHY_SILENT = "silent: is it switched on?"
 
 
 def states(**fields: Any) -> dict[str, Reading]:

@@ -13,7 +13,6 @@ from fleet.supervisor.car_status import (
     READY_TIMEOUT_S,
     CarStatus,
     StartProgress,
-    describe_missing,
     describe_old_stops,
     describe_start,
     fit,
@@ -64,7 +63,7 @@ def test_a_car_is_ready_when_its_link_is_open_and_a_command_waits_for_nothing(
     row = CarStatus("red")
     row.take("state/link", link, 0.0)
     row.take("state/safety", pb.Safety(motors=motors, waits_for=waits_for), 0.0)
-    assert describe_missing(row) == why
+    assert row.state.why_missing(1.0) == why
 
 
 def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
@@ -74,13 +73,13 @@ def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
     row.reset()
     row.take("state/link", pb.Link(state="online", boot_id="a"), 1.0)
     row.take("state/safety", pb.Safety(motors="off", motors_basis="sent", boot_id="a"), 1.0)
-    assert (row.link, row.motors) == ("", "")
+    assert (row.state.link.state, row.state.safety.motors) == ("", "")
     assert (row.rest.what, row.rest.basis) == ("off", "sent"), "its last words tell how it stopped the car"
     row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
     row.reset("b")
     row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
     row.take("state/link", pb.Link(state="online", boot_id="a"), 2.0)
-    assert row.link == "quiet"
+    assert row.state.link.state == "quiet"
 
 
 @pytest.mark.parametrize(
@@ -117,7 +116,7 @@ def test_a_row_shows_hold_and_e_stop() -> None:
     assert row.take("state/safety", held, 1.0) == "on hold by ann"
     held.estops.add(id="e1", by="bob")
     assert row.take("state/safety", held, 2.0) == "e-stop e1"
-    assert (row.hold, row.estop) == ("ann", "e1")
+    assert (row.state.safety.hold.by, row.state.safety.estops[0].id) == ("ann@laptop-4711", "e1")
     assert row.take("state/safety", pb.Safety(), 3.0) == "not on hold"
 
 
@@ -170,7 +169,7 @@ def test_the_rate_is_what_came_over_some_seconds() -> None:
     row.take("state/link", pb.Link(state="online", rx_frames=3), 9.0)
     assert row.rate_hz == 25.0, "another gateway counts anew"
     row.reset()
-    assert (row.rate_hz, row.link, row.mode) == (None, "", "")
+    assert (row.rate_hz, row.state.link.state, row.state.mode.asked) == (None, "", "")
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
@@ -182,8 +181,12 @@ def test_the_table_fits_and_names_every_car(width: int) -> None:
     for process in supervisor.processes:
         process.status.state = RunState.RUNNING
     for name in ("red", "green"):
-        supervisor.rows[name] = CarStatus(name, link="online", mode="obstacle_avoidance", event="x" * 300)
-    supervisor.rows["red"].lease, supervisor.rows["red"].battery = "ann@laboratory-desk-4711", "7.42 V critical"
+        row = supervisor.rows[name] = CarStatus(name, event="x" * 300)
+        row.take("state/link", pb.Link(state="online"), 0.0)
+        row.take("state/mode", pb.Mode(asked="obstacle_avoidance"), 0.0)
+    leased = pb.Safety(lease=pb.Lease(holder="ann_of_the_laboratory_desk@laptop-4711"))
+    supervisor.rows["red"].take("state/safety", leased, 0.0)
+    supervisor.rows["red"].take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), 0.0)
     console = Console(file=io.StringIO(), width=width)
     console.print(Table(supervisor, console).rendered())
     assert isinstance(console.file, io.StringIO)
