@@ -11,6 +11,7 @@ from schemas.authority import NO_PEOPLE, People
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.limits import CRITICAL_V, LOW_V
+from schemas.links import LINK_HELP, LINK_HELP_OPTIONS
 from schemas.process import startup, stdio
 from schemas.process.parent import watched_pid
 from schemas.suggestion import did_you_mean
@@ -117,8 +118,7 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--link",
         required=True,
-        help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04, both "
-        "also with ?adapter=hci1 or auto (`fleet scan` shows them)",
+        help=f"{LINK_HELP}{LINK_HELP_OPTIONS} (`fleet scan` shows them)",
     )
     run.add_argument(
         "--platform",

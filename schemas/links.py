@@ -1,18 +1,25 @@
-"""Link URLs: the kinds of links and the only parser of their text. Pure; nothing is opened."""
+"""Link URLs: each kind of link is a class, with its text, its port, its check and its help. Nothing is opened.
 
+A kind is a class here and a row in `KINDS`; `gateway.link` has its bytes, under the same scheme.
+"""
+
+import os.path
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
-from urllib.parse import parse_qs, quote, unquote, urlsplit
+from importlib.util import find_spec
+from itertools import combinations
+from typing import ClassVar, Final, Protocol
+from urllib.parse import SplitResult, parse_qs, quote, unquote, urlsplit
 
-from schemas.suggestion import nearest
+from schemas.suggestion import how_to_install, nearest
 
 CAR_TCP_PORT: Final = 8888
 """The port on which the program of a Raspberry Pi car listens (docs/reference/protocol.md#platforms)."""
 BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
 _BAUDS: Final = range(300, 4_000_001)
-_SCHEMES: Final = ("ble", "serial", "tcp")
-WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
+_WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
 _USB_FIELDS: Final = ("vid", "pid", "serial")
 _BLE_ADDRESS: Final = re.compile(r"[0-9A-F]{2}(:[0-9A-F]{2}){5}|[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}")
@@ -23,24 +30,138 @@ AUTO_ADAPTER: Final = "auto"
 _BLE_NAME_BYTES: Final = 248
 """Maximum length of the name of a Bluetooth device."""
 
+PortKey = tuple[str, str, frozenset[tuple[str, str]]]
+"""Equal for two links to one port: the kind of link, the device or host behind all its names, and the ids."""
+
 
 class BadLink(ValueError):
     """Text that is no link. The message is the reason."""
 
 
+class Look(Protocol):
+    """What can be looked at without opening a link. Each returns whether all is well, and the words."""
+
+    def device(self, path: str) -> tuple[bool, str]:
+        """Look at a serial port."""
+
+    def usb(self, url: "UsbUrl") -> tuple[bool, str]:
+        """Look for a USB device."""
+
+    def host(self, host: str, port: int) -> tuple[bool, str]:
+        """Look for a host, and not at a port whose car would take harm."""
+
+
+class LinkUrl(ABC):
+    """A link: how it is written, and what is known of it before it is opened. Its text is its URL."""
+
+    __slots__ = ()
+    scheme: ClassVar[str]
+    forms: ClassVar[tuple[str, ...]]
+    """How it is written, for the help."""
+    options: ClassVar[str] = ""
+    """What may follow the forms, for the help."""
+    module: ClassVar[str] = ""
+    """The module that it needs beside the installation, if any; `extra` has it, `needs` is its name for people."""
+    extra: ClassVar[str] = ""
+    needs: ClassVar[str] = ""
+    harm: ClassVar[str] = ""
+    """What opening and closing it may do to a car, in words. Empty if nothing."""
+
+    @classmethod
+    @abstractmethod
+    def parse(cls, text: str) -> "LinkUrl | None":
+        """Return the link with this URL, None if it is none after all; raise BadLink."""
+
+    @classmethod
+    def guess(cls, text: str) -> str:  # noqa: ARG003 - a kind may have no such texts
+        """Return the URL that a text without a scheme probably means. Empty if none."""
+        return ""
+
+    @classmethod
+    def missing(cls) -> str:
+        """Say what must be installed for this kind of link. Empty if nothing."""
+        if not cls.module or find_spec(cls.module) is not None:
+            return ""
+        return f"needs {cls.needs}, which is not installed: {how_to_install(cls.extra)}"
+
+    @property
+    @abstractmethod
+    def port_key(self) -> PortKey:
+        """The port that it names. Symlinks are followed."""
+
+    def possible_ports(self) -> Iterator[PortKey]:
+        """Yield the keys of all links that may name the port of this one."""
+        yield self.port_key
+
+    def without_options(self) -> "LinkUrl":
+        """Return the link without the options that do not tell cars apart."""
+        return self
+
+    def check(self, look: Look) -> tuple[bool, str]:  # noqa: ARG002 - Bluetooth cannot be looked at
+        """Return whether a car may be there, with the words. Nothing is opened that could move, reset or end a car."""
+        if missing := self.missing():
+            return False, missing
+        return True, f"{self.needs} is installed; whether the car is near, `fleet scan` shows"
+
+    def doubt_baud(self) -> str:
+        """Return the sentence that asks for the baud rate if the bytes of this link have no frame."""
+        return f"Is the module at the baud rate of the car, {BAUD}?"
+
+
+class _SerialLine(LinkUrl):
+    """A serial port, named in one of two ways."""
+
+    __slots__ = ()
+    scheme = "serial"
+    baud: int
+
+    @classmethod
+    def parse(cls, text: str) -> "LinkUrl | None":
+        parts = _split(text)
+        if parts.fragment:
+            raise BadLink("a # is written %23, and that only in a serial number")
+        return _serial(parts.netloc, parts.path, parts.query)
+
+    def doubt_baud(self) -> str:
+        if self.baud != BAUD:
+            return f"The port is at {self.baud} baud: cars use {BAUD}."
+        return f"The port is at {self.baud} baud: does this car use another one (?baud=115200)?"
+
+
 @dataclass(frozen=True, slots=True)
-class SerialUrl:
+class SerialUrl(_SerialLine):
     """A serial port by its device path."""
 
     path: str
     baud: int = BAUD
+    forms = ("/dev/ttyUSB0",)
+
+    @classmethod
+    def guess(cls, text: str) -> str:
+        """Return the URL that such a text means."""
+        return f"/dev/{text}" if re.fullmatch(r"(tty|cu\.|rfcomm)[\w.-]*", text) else ""
+
+    @property
+    def port_key(self) -> PortKey:
+        """The port that it names."""
+        # Resolve symlinks such as those in /dev/serial/by-id. On Windows, COM3 and com3 are one port.
+        device = self.path.upper() if _WINDOWS_PORT.fullmatch(self.path) else os.path.realpath(self.path)
+        return ("device", device, frozenset())
+
+    def without_options(self) -> LinkUrl:
+        """Return the link without the option that does not tell cars apart."""
+        return replace(self, baud=BAUD)
+
+    def check(self, look: Look) -> tuple[bool, str]:
+        """Look at it as far as nothing is opened."""
+        return look.device(self.path)
 
     def __str__(self) -> str:
         return f"serial://{self.path}" + ("" if self.baud == BAUD else f"?baud={self.baud}")
 
 
 @dataclass(frozen=True, slots=True)
-class UsbUrl:
+class UsbUrl(_SerialLine):
     """A serial port by the ids of its USB device, wherever it is plugged in. At least one id is set.
 
     vid, pid: 0 to 0xFFFF. serial: the whole serial number of the device.
@@ -50,10 +171,32 @@ class UsbUrl:
     pid: int | None = None
     serial: str | None = None
     baud: int = BAUD
+    forms = ("serial://?vid=1a86&serial=ABC",)
 
     def fits(self, vid: int | None, pid: int | None, serial: str | None) -> bool:
         """Return True if a device with these ids may be the one."""
         return self.vid in (None, vid) and self.pid in (None, pid) and self.serial in (None, serial)
+
+    @property
+    def port_key(self) -> PortKey:
+        """The port that it names."""
+        ids = (("vid", self.vid), ("pid", self.pid), ("serial", self.serial))
+        return ("usb", "", frozenset((name, str(value)) for name, value in ids if value is not None))
+
+    def possible_ports(self) -> Iterator[PortKey]:
+        """Yield also the keys of links with fewer ids: all of them may name this device."""
+        kind, where, ids = self.port_key
+        for count in range(1, len(ids) + 1):
+            for fewer in combinations(sorted(ids), count):
+                yield (kind, where, frozenset(fewer))
+
+    def without_options(self) -> LinkUrl:
+        """Return the link without the option that does not tell cars apart."""
+        return replace(self, baud=BAUD)
+
+    def check(self, look: Look) -> tuple[bool, str]:
+        """Look at it as far as nothing is opened."""
+        return look.usb(self)
 
     def __str__(self) -> str:
         ids = [f"{name}={value:04x}" for name, value in (("vid", self.vid), ("pid", self.pid)) if value is not None]
@@ -63,11 +206,52 @@ class UsbUrl:
 
 
 @dataclass(frozen=True, slots=True)
-class TcpUrl:
+class TcpUrl(LinkUrl):
     """A car or a bridge that listens on TCP."""
 
     host: str
     port: int
+    scheme = "tcp"
+    forms = ("tcp://host:8888",)
+    harm = (
+        "a Raspberry Pi car's program dies when a TCP client disconnects, this one too. Its motors then stay as they "
+        "are."
+    )
+
+    @classmethod
+    def parse(cls, text: str) -> LinkUrl | None:
+        """Return the link with this URL; raise BadLink."""
+        parts = _split(text)
+        try:
+            port = parts.port
+        except ValueError as error:
+            raise BadLink(str(error)) from None
+        if not parts.hostname or not port:
+            if parts.hostname and not parts.netloc.rpartition("]")[2].count(":"):
+                raise BadLink(f"the port is missing. Write tcp://{parts.hostname}:{CAR_TCP_PORT}")
+            raise BadLink(f"it needs a host and a port from 1 to 65535. Write tcp://192.168.1.7:{CAR_TCP_PORT}")
+        if parts.path or parts.query or parts.fragment or parts.username is not None:
+            raise BadLink("nothing may follow the port")
+        return TcpUrl(parts.hostname, port)
+
+    @classmethod
+    def guess(cls, text: str) -> str:
+        """Return the URL that such a text means."""
+        host = re.fullmatch(r"((?:\d{1,3}\.){3}\d{1,3}|\w[\w.-]*(?=:))(:\d{1,5})?", text)
+        return f"tcp://{host[1]}{host[2] or f':{CAR_TCP_PORT}'}" if host else ""
+
+    @property
+    def port_key(self) -> PortKey:
+        """The port that it names."""
+        return ("tcp", _host(self.host), frozenset({("port", str(self.port))}))
+
+    def check(self, look: Look) -> tuple[bool, str]:
+        """Look at it as far as nothing is opened."""
+        return look.host(self.host, self.port)
+
+    def doubt_baud(self) -> str:
+        """Return the sentence that asks for the baud rate."""
+        return f"Is the bridge at the baud rate of the car, {BAUD}?"
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -75,7 +259,7 @@ class TcpUrl:
 
 
 @dataclass(frozen=True, slots=True)
-class BleUrl:
+class BleUrl(LinkUrl):
     """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name.
 
     adapter: the computer's adapter, such as hci1; `auto` for any with room; None for the first one.
@@ -84,6 +268,30 @@ class BleUrl:
     address: str | None = None
     name: str | None = None
     adapter: str | None = None
+    scheme = "ble"
+    forms = ("ble://ADDRESS or ble://name=BT04",)
+    options = ", both also with ?adapter=hci1 or auto"
+    module, extra, needs = "bleak", "ble", "Bluetooth"
+
+    @classmethod
+    def parse(cls, text: str) -> LinkUrl | None:
+        """Return the link with this URL; raise BadLink."""
+        # Not by urlsplit, which would take the colons of an address for a port.
+        return _ble(text[6:]) if text[3:6] == "://" else None
+
+    @classmethod
+    def guess(cls, text: str) -> str:
+        """Return the URL that such a text means."""
+        return f"ble://{text.upper()}" if _BLE_ADDRESS.fullmatch(text.upper()) else ""
+
+    @property
+    def port_key(self) -> PortKey:
+        """The port that it names."""
+        return ("ble", self.address or "", frozenset() if self.name is None else frozenset({("name", self.name)}))
+
+    def without_options(self) -> LinkUrl:
+        """Return the link without the option that does not tell cars apart."""
+        return replace(self, adapter=None)
 
     def __str__(self) -> str:
         adapter = "" if self.adapter is None else f"?adapter={self.adapter}"
@@ -91,60 +299,58 @@ class BleUrl:
         return f"ble://{module}{adapter}"
 
 
-LinkUrl = SerialUrl | UsbUrl | TcpUrl | BleUrl
+KINDS: Final[tuple[type[LinkUrl], ...]] = (SerialUrl, UsbUrl, TcpUrl, BleUrl)
+_BY_SCHEME: Final = {kind.scheme: kind for kind in KINDS}
+LINK_HELP: Final = ", ".join(form for kind in KINDS for form in kind.forms)
+"""How links are written, for the help of a command."""
+LINK_HELP_OPTIONS: Final = "".join(kind.options for kind in KINDS)
+"""What may follow some of them."""
 
 
 def car_link(url: LinkUrl) -> str:
     """Return the text of a link without the options that do not tell cars apart: baud rate and adapter."""
-    match url:
-        case SerialUrl() | UsbUrl():
-            return str(replace(url, baud=BAUD))
-        case BleUrl():
-            return str(replace(url, adapter=None))
-        case TcpUrl():
-            return str(url)
+    return str(url.without_options())
 
 
 def parse_link(text: str) -> LinkUrl:
     """Return the link with this URL or bare device path; raise BadLink."""
     if not text.isprintable():  # urlsplit drops a line feed without an error
         raise BadLink("it has characters that cannot be printed")
-    if text.startswith("/") or WINDOWS_PORT.fullmatch(text):
+    if text.startswith("/") or _WINDOWS_PORT.fullmatch(text):
         return SerialUrl(text)
-    if text[:6].lower() == "ble://":  # urlsplit would take the colons of an address for a port
-        return _ble(text[6:])
-    try:
-        parts = urlsplit(text)
-        port = parts.port if parts.scheme == "tcp" else None
-    except ValueError as error:
-        raise BadLink(str(error)) from None
-    if parts.scheme == "serial":
-        if parts.fragment:
-            raise BadLink("a # is written %23, and that only in a serial number")
-        return _serial(parts.netloc, parts.path, parts.query)
-    if parts.scheme == "tcp":
-        if not parts.hostname or not port:
-            if parts.hostname and not parts.netloc.rpartition("]")[2].count(":"):
-                raise BadLink(f"the port is missing. Write tcp://{parts.hostname}:{CAR_TCP_PORT}")
-            raise BadLink(f"it needs a host and a port from 1 to 65535. Write tcp://192.168.1.7:{CAR_TCP_PORT}")
-        if parts.path or parts.query or parts.fragment or parts.username is not None:
-            raise BadLink("nothing may follow the port")
-        return TcpUrl(parts.hostname, port)
+    scheme, colon, _ = text.lstrip().partition(":")
+    kind = _BY_SCHEME.get(scheme.lower())
+    if colon and kind is not None and (link := kind.parse(text)) is not None:
+        return link
+    _split(text)  # it names what is wrong with any URL
     raise BadLink(f"this is not a link. {_likely_link(text)}`fleet scan` lists the links that are there.")
 
 
 def _likely_link(text: str) -> str:
     """Return the link that a text without a scheme probably means, as a question; empty if unknown."""
     scheme, colon, rest = text.partition("://")
-    if colon and rest and (near := nearest(scheme, _SCHEMES)):
+    if colon and rest and (near := nearest(scheme, _BY_SCHEME)):
         return f"Did you mean {near}://{rest}? "
-    if re.fullmatch(r"(tty|cu\.|rfcomm)[\w.-]*", text):
-        return f"Did you mean /dev/{text}? "
-    if _BLE_ADDRESS.fullmatch(text.upper()):
-        return f"Did you mean ble://{text.upper()}? "
-    if host := re.fullmatch(r"((?:\d{1,3}\.){3}\d{1,3}|\w[\w.-]*(?=:))(:\d{1,5})?", text):
-        return f"Did you mean tcp://{host[1]}{host[2] or f':{CAR_TCP_PORT}'}? "
-    return ""
+    likely = next((url for kind in KINDS if (url := kind.guess(text))), "")
+    return f"Did you mean {likely}? " if likely else ""
+
+
+def _split(text: str) -> SplitResult:
+    try:
+        return urlsplit(text)
+    except ValueError as error:
+        raise BadLink(str(error)) from None
+
+
+def _host(host: str) -> str:
+    import ipaddress  # a gateway starts faster without it
+
+    if host == "localhost":
+        return "127.0.0.1"
+    try:
+        return str(ipaddress.ip_address(host))
+    except ValueError:
+        return host.lower().rstrip(".")
 
 
 def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
@@ -158,7 +364,7 @@ def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
     if path.strip("/") or netloc:
         if netloc and path.strip("/"):
             raise BadLink("three slashes come before a device path")
-        if netloc and not WINDOWS_PORT.fullmatch(netloc):
+        if netloc and not _WINDOWS_PORT.fullmatch(netloc):
             raise BadLink("it names no device")
         if options:
             ids = ", ".join(name for name in _USB_FIELDS if name in options)

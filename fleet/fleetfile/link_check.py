@@ -11,16 +11,14 @@ import socket
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fleet.fleetfile.fleet_file import FleetCar
-from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
-from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
+from fleet.links import SimLink, may_be_same, parse_fleet_link
+from schemas.links import UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import CH340, explain_missing_port
-from schemas.suggestion import how_to_install
 from schemas.words import LinkState, Platform
 
 if TYPE_CHECKING:
@@ -54,7 +52,8 @@ def check_link(car: FleetCar, served: Mapping[str, tuple[str, str, str]]) -> Lin
         ok = state in (LinkState.ONLINE, LinkState.QUIET)
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
         return LinkCheck(car.name, car.link, ok, words)
-    ok, words = _check(parse_fleet_link(car.link), car.platform)
+    link = parse_fleet_link(car.link)
+    ok, words = (True, "`fleet up` simulates it") if isinstance(link, SimLink) else link.check(_Look(car.platform))
     return LinkCheck(car.name, car.link, ok, words)
 
 
@@ -64,18 +63,20 @@ def _is_same(url: str, link: str) -> bool:
     return isinstance(expected, SimLink) or may_be_same(parse_fleet_link(url), expected)
 
 
-def _check(link: FleetLink, platform: str) -> tuple[bool, str]:
-    match link:
-        case SimLink():
-            return True, "`fleet up` simulates it"
-        case SerialUrl(path=path):
-            return check_device(path)
-        case UsbUrl():
-            return _check_usb(link)
-        case TcpUrl():
-            return _check_tcp(link, platform)
-        case BleUrl():
-            return _check_ble()
+class _Look:
+    """Looks at what the link of a car of this platform names."""
+
+    def __init__(self, platform: str) -> None:
+        self._has_bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
+
+    def device(self, path: str) -> tuple[bool, str]:
+        return check_device(path)
+
+    def usb(self, url: UsbUrl) -> tuple[bool, str]:
+        return _check_usb(url)
+
+    def host(self, host: str, port: int) -> tuple[bool, str]:
+        return _check_host(host, port, bridge=self._has_bridge)
 
 
 def check_device(path: str) -> tuple[bool, str]:
@@ -134,26 +135,18 @@ def _check_usb(link: UsbUrl) -> tuple[bool, str]:
     return ok, f"{matching[0]}: {words}"
 
 
-def _check_tcp(link: TcpUrl, platform: str) -> tuple[bool, str]:
-    bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
-    port = link.port
+def _check_host(host: str, port: int, *, bridge: bool) -> tuple[bool, str]:
     try:
-        with socket.create_connection((link.host, port if bridge else CLOSED_PORT), timeout=HOST_TIMEOUT_S):
+        with socket.create_connection((host, port if bridge else CLOSED_PORT), timeout=HOST_TIMEOUT_S):
             pass
     except ConnectionRefusedError:
         if bridge:
-            return False, f"{link.host} is there, and nothing listens on port {port}: start the car's bridge"
+            return False, f"{host} is there, and nothing listens on port {port}: start the car's bridge"
     except TimeoutError:
-        return False, f"no answer from {link.host} within {HOST_TIMEOUT_S:g} s: switch the car on, join its network"
+        return False, f"no answer from {host} within {HOST_TIMEOUT_S:g} s: switch the car on, join its network"
     except (OSError, UnicodeError) as error:  # UnicodeError: a name that DNS cannot express
         words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return False, f"{link.host}: {words}: switch the car on, join its network"
+        return False, f"{host}: {words}: switch the car on, join its network"
     if bridge:
         return True, "its bridge accepts connections"
-    return True, f"{link.host} is there; not connected to port {port}, which would end the car's program"
-
-
-def _check_ble() -> tuple[bool, str]:
-    if find_spec("bleak") is None:
-        return False, f"needs Bluetooth, which is not installed: {how_to_install('ble')}"
-    return True, "Bluetooth is installed; whether the car is near, `fleet scan` shows"
+    return True, f"{host} is there; not connected to port {port}, which would end the car's program"

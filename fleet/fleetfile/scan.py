@@ -57,7 +57,7 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
 
 
 def _found(fields: Mapping[str, Any]) -> FoundLink:
-    if fields["kind"] == "ble":
+    if "verdict" not in fields:  # a device that advertises itself, and is not listened to
         words = f"Bluetooth device {printable(fields['name']) or 'without a name'}, {fields['rssi']} dBm"
         return FoundLink(fields["url"], "ble" if fields["uart"] else LinkVerdict.OTHER, words)
     settled = fields["platform"] if fields["platform"] in set(Platform) - {Platform.UNKNOWN} else AUTO

@@ -1,31 +1,45 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
-`base` has the interface and its errors. `serial`, `tcp` and `ble` implement it, two of them with the buffer of
+`base` has the interfaces and their errors. `serial`, `tcp` and `ble` implement them, two of them with the buffer of
 `buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a USB device,
-`url` accepts a link from the command line. `baud` doubts the baud rate of bytes without a frame.
+`serial_ports` and `ble_devices` list what is there, `url` accepts a link from the command line. `baud` doubts the baud
+rate of bytes without a frame.
+
+A kind of link is a URL in `schemas.links`, and a module with its `KIND` here. The two meet by the scheme.
 """
 
-from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
+from importlib import import_module
+from typing import Any, Final
+
+from gateway.link.base import BadUrl, Busy, CannotList, CannotOpen, Device, Link, LinkError, LinkKind, LinkLost
 from gateway.link.baud import BaudWatch
 from gateway.link.url import parse_url
-from schemas.links import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
+from schemas.links import LinkUrl
 
 __all__ = [
     "BadUrl",
     "BaudWatch",
     "Busy",
+    "CannotList",
     "CannotOpen",
+    "Device",
     "Link",
     "LinkError",
     "LinkLost",
     "LinkUrl",
+    "kind_of",
     "open_link",
     "parse_url",
 ]
 
-OPEN_TIMEOUT_S = 5.0
-# A module advertises about once a second, and a scan often misses the first one. The fourth car needs 4 s to connect.
-BLE_TIMEOUT_S = 20.0
+_MODULES: Final = {"serial": "gateway.link.serial", "tcp": "gateway.link.tcp", "ble": "gateway.link.ble"}
+"""Scheme of a URL: the module with its `KIND`, imported when it is needed: a gateway starts faster."""
+
+
+def kind_of(scheme: str) -> LinkKind[Any]:
+    """Return what opens and lists the links of this scheme; raise ImportError if a module that it needs is missing."""
+    kind: LinkKind[Any] = import_module(_MODULES[scheme]).KIND
+    return kind
 
 
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
@@ -33,16 +47,5 @@ async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool
 
     The connects through one Bluetooth adapter take turns. `first`: the car may be moving, so it goes first.
     """
-    match url:
-        case SerialUrl() | UsbUrl():
-            from gateway.link.serial import open_serial
-
-            return await open_serial(url, OPEN_TIMEOUT_S if timeout_s is None else timeout_s)
-        case TcpUrl():
-            from gateway.link.tcp import open_tcp
-
-            return await open_tcp(url, OPEN_TIMEOUT_S if timeout_s is None else timeout_s)
-        case BleUrl():
-            from gateway.link.ble import open_ble
-
-            return await open_ble(url, BLE_TIMEOUT_S if timeout_s is None else timeout_s, first=first)
+    kind = kind_of(url.scheme)
+    return await kind.open(url, kind.open_timeout_s if timeout_s is None else timeout_s, first=first)

@@ -1,7 +1,15 @@
-"""The interface of every link (read, write, close) and its errors."""
+"""The interfaces of every link (read, write, close) and of every kind of link (open, list), and their errors."""
 
 from abc import ABC, abstractmethod
-from typing import Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
+
+from schemas.links import LinkUrl
+
+if TYPE_CHECKING:
+    from gateway.link.serial_ports import SerialPort
+
+Url = TypeVar("Url", bound=LinkUrl)
 
 CLOSE_S: Final = 1.0
 """Timeout for closing a port or a connection (Bluetooth: 4 s). After it, `close` abandons or cuts the link."""
@@ -25,6 +33,10 @@ class Busy(CannotOpen):
 
 class LinkLost(LinkError):
     """The link is lost. A write that raises this may have sent all, some or none of its bytes."""
+
+
+class CannotList(Exception):
+    """The devices of a kind cannot be listed. The message is one line: why, what to do."""
 
 
 class Link(ABC):
@@ -53,3 +65,41 @@ class Link(ABC):
     @abstractmethod
     async def close(self) -> None:
         """Release the port within CLOSE_S; pending reads and writes raise LinkLost. Never raise; idempotent."""
+
+
+class Device(ABC):
+    """A device that advertises itself, and may be a car's."""
+
+    url: str
+
+    @abstractmethod
+    def fields(self) -> dict[str, Any]:
+        """Return what is known of it, for `--json`: at least url, name, rssi, and uart, which only a car has."""
+
+    @property
+    @abstractmethod
+    def heading(self) -> tuple[str, str]:
+        """Its address, and what else is known of it, for a person."""
+
+    @property
+    @abstractmethod
+    def likely(self) -> str:
+        """What makes it a car's; empty for any other device."""
+
+
+class LinkKind(ABC, Generic[Url]):
+    """What opens and lists the links of one scheme. `schemas.links` has their URLs."""
+
+    open_timeout_s: ClassVar[float] = 5.0
+
+    @abstractmethod
+    async def open(self, url: Url, timeout_s: float, *, first: bool) -> Link:
+        """Open the link within this time; raise CannotOpen. `first`: before the cars that wait for the same adapter."""
+
+    def ports(self) -> "Sequence[SerialPort]":
+        """Return the ports that can be listened to without harm; raise CannotOpen if the system does not list them."""
+        return ()
+
+    async def devices(self, seconds: float) -> Sequence[Device]:  # noqa: ARG002 - few kinds advertise
+        """Return the devices that advertise within this time, likely cars first; raise CannotList."""
+        return ()

@@ -8,7 +8,7 @@ samples slower sees several bits as one, and its bytes are arbitrary.
 from dataclasses import dataclass
 from typing import Final
 
-from schemas.links import BAUD, BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
+from schemas.links import LinkUrl
 
 MIN_BYTES: Final = 200
 """Minimum bytes without a frame before a baud rate is doubted; a report of a car has 46."""
@@ -63,14 +63,7 @@ class BaudWatch:
         fact = f"{total} bytes came, and never a frame"
         if looks_so:
             fact += ": they look like a wrong baud rate"
-        match self._url:
-            case SerialUrl(baud=baud) | UsbUrl(baud=baud):
-                right = f"cars use {BAUD}" if baud != BAUD else "does this car use another one (?baud=115200)"
-                return f"{fact}. The port is at {baud} baud: {right}{'.' if baud != BAUD else '?'}"
-            case TcpUrl():
-                return f"{fact}. Is the bridge at the baud rate of the car, {BAUD}?"
-            case BleUrl():
-                return f"{fact}. Is the module at the baud rate of the car, {BAUD}?"
+        return f"{fact}. {self._url.doubt_baud()}"
 
 
 def _share(counts: dict[int, int], wanted: frozenset[int]) -> float:

@@ -15,15 +15,15 @@ from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 from bleak import BleakAdapter, BleakClient, BleakScanner
-from bleak.args.bluez import BlueZScannerArgs
 from bleak.backends.characteristic import BleakGATTCharacteristic
 from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 from bleak.backends.service import BleakGATTService
 
 from gateway.link import ble_adapters
-from gateway.link.base import Busy, CannotOpen, Link, LinkLost
+from gateway.link.base import Busy, CannotOpen, Device, Link, LinkKind, LinkLost
 from gateway.link.ble_adapters import ConnectionNote, Turn
+from gateway.link.ble_devices import list_devices
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
 from schemas.bluetooth import ADAPTER_CONNECTIONS, SMALL_ADAPTER_CONNECTIONS, describe_full
 from schemas.links import AUTO_ADAPTER, BleUrl
@@ -73,7 +73,7 @@ UART_SERVICES: Final = tuple(service for services, _, _ in _UARTS for service in
 
 
 class BleLink(BufferedLink):
-    """One connection, created by `open_ble`."""
+    """One connection, created by `BleKind.open`."""
 
     def __init__(self, url: BleUrl, *, first: bool = False) -> None:
         super().__init__()
@@ -348,11 +348,25 @@ class BleLink(BufferedLink):
             self._lose(f"{self._url} is gone: the Bluetooth connection ended")
 
 
-async def open_ble(url: BleUrl, timeout_s: float, *, first: bool = False) -> Link:
-    """Find a module and connect to it; raise CannotOpen. `first`: do so before other gateways."""
-    link = BleLink(url, first=first)
-    await link.open(timeout_s)
-    return link
+class BleKind(LinkKind[BleUrl]):
+    """Bluetooth LE."""
+
+    # A module advertises about once a second, and a scan often misses the first one. The fourth car needs 4 s to
+    # connect.
+    open_timeout_s = 20.0
+
+    async def open(self, url: BleUrl, timeout_s: float, *, first: bool) -> Link:
+        """Find a module and connect to it; raise CannotOpen. `first`: do so before other gateways."""
+        link = BleLink(url, first=first)
+        await link.open(timeout_s)
+        return link
+
+    async def devices(self, seconds: float) -> Sequence[Device]:
+        """Return the modules and other devices that advertise; raise CannotList."""
+        return await list_devices(seconds, UART_SERVICES)
+
+
+KIND: Final = BleKind()
 
 
 def choose(
@@ -384,14 +398,6 @@ async def _connected(adapter: str | None) -> list[BLEDevice]:
         return await found.get_connected_devices(list(UART_SERVICES))
     except NotImplementedError:
         return []
-
-
-async def discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
-    """Return the devices that advertise within this time to any adapter, by address; raise whatever bleak raises."""
-    # With several adapters bleak chooses any of them, and a car may be in the range of one only.
-    options: list[BlueZScannerArgs] = [{"adapter": name} for name in await ble_adapters.list_connections()]
-    scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
-    return {address: each for scan in await asyncio.gather(*scans) for address, each in scan.items()}
 
 
 def _scanner(

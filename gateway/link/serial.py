@@ -13,11 +13,13 @@ import errno
 import os
 import re
 import threading
+from collections.abc import Sequence
 from typing import Final
 
 import serial
 
-from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkKind, LinkLost
+from gateway.link.serial_ports import SerialPort, serial_ports
 from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process import port_lock
@@ -65,7 +67,7 @@ _PSEUDO: Final = re.compile(r"/dev/(pts/|ttys)\d+")
 
 
 class SerialLink(Link):
-    """One open port, created by `open_serial`."""
+    """One open port, created by `SerialKind.open`."""
 
     def __init__(self, url: SerialUrl | UsbUrl, loop: asyncio.AbstractEventLoop) -> None:
         self._url = url
@@ -327,14 +329,26 @@ class SerialLink(Link):
             self._ended.set_result(None)
 
 
-async def open_serial(url: SerialUrl | UsbUrl, timeout_s: float) -> Link:
-    """Open a serial port; raise CannotOpen. Each call searches for a USB device anew."""
-    if str(url) in _opening:  # each further attempt would be one more hanging thread
-        raise CannotOpen(f"{url}: the port still hangs in an earlier try to open it: unplug it, and plug it in again")
-    _opening.add(str(url))
-    link = SerialLink(url, asyncio.get_running_loop())
-    await link.open(timeout_s)
-    return link
+class SerialKind(LinkKind[SerialUrl | UsbUrl]):
+    """Serial ports, by path or by USB device."""
+
+    async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
+        """Open a serial port; raise CannotOpen. Each call searches for a USB device anew."""
+        if str(url) in _opening:  # each further attempt would be one more hanging thread
+            raise CannotOpen(
+                f"{url}: the port still hangs in an earlier try to open it: unplug it, and plug it in again"
+            )
+        _opening.add(str(url))
+        link = SerialLink(url, asyncio.get_running_loop())
+        await link.open(timeout_s)
+        return link
+
+    def ports(self) -> Sequence[SerialPort]:
+        """Return the serial ports; raise CannotOpen."""
+        return serial_ports()
+
+
+KIND: Final = SerialKind()
 
 
 def _write_now(port: serial.Serial, data: bytes) -> int:

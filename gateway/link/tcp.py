@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkKind, LinkLost
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
 from schemas.links import TcpUrl
 
@@ -26,7 +26,7 @@ _lookups: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
 
 
 class TcpLink(asyncio.Protocol, BufferedLink):
-    """One connection, created by `open_tcp`."""
+    """One connection, created by `TcpKind.open`."""
 
     def __init__(self, url: TcpUrl) -> None:
         super().__init__()
@@ -126,23 +126,29 @@ def _sentence(data: bytes) -> str:
     return shown[:MAX_SAID_BYTES] + ("..." if len(shown) > MAX_SAID_BYTES else "")
 
 
-async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
-    """Connect; raise CannotOpen."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            return await connect_first(url, await _look_up(url))
-    except TimeoutError:
-        raise CannotOpen(f"{url}: no answer within {timeout_s:g} s. Is the car on, and in this network?") from None
-    except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
-        raise CannotOpen(f"{url}: there is no host {url.host!r}. Check the name, or use its address.") from None
-    except ConnectionRefusedError:
-        reason = (
-            "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it, "
-            "switch it off, and restart its program."
-        )
-        raise CannotOpen(f"{url}: {reason}") from None
-    except OSError as error:
-        raise CannotOpen(f"{url}: no connection, {_cause(error)}") from None
+class TcpKind(LinkKind[TcpUrl]):
+    """TCP."""
+
+    async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
+        """Connect; raise CannotOpen."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await connect_first(url, await _look_up(url))
+        except TimeoutError:
+            raise CannotOpen(f"{url}: no answer within {timeout_s:g} s. Is the car on, and in this network?") from None
+        except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
+            raise CannotOpen(f"{url}: there is no host {url.host!r}. Check the name, or use its address.") from None
+        except ConnectionRefusedError:
+            reason = (
+                "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it, "
+                "switch it off, and restart its program."
+            )
+            raise CannotOpen(f"{url}: {reason}") from None
+        except OSError as error:
+            raise CannotOpen(f"{url}: no connection, {_cause(error)}") from None
+
+
+KIND: Final = TcpKind()
 
 
 async def _look_up(url: TcpUrl) -> _Addresses:

@@ -11,10 +11,8 @@ from gateway.capture import BadCapture
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.link import BadUrl, LinkError, LinkUrl
 from schemas.duration import parse_duration
-from schemas.links import TcpUrl
 from schemas.process import startup, stdio
 
-LINK_HELP: Final = "/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04"
 PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; with options as in arduino+arm (default unknown)"
 _UNPRINTABLE: Final = re.compile(r"[^ -\[\]-~]")
 _COLORS: Final = {"red": "31", "yellow": "33", "cyan": "36", "dim": "2"}
@@ -79,11 +77,8 @@ def printable(data: bytes) -> str:
 
 def warn_before_opening(url: LinkUrl) -> None:
     """Print a warning if opening and closing this link may harm a car."""
-    if isinstance(url, TcpUrl):
-        print_note(
-            f"{url}: a Raspberry Pi car's program dies when a TCP client disconnects, this one too. Its motors then "
-            "stay as they are."
-        )
+    if url.harm:
+        print_note(f"{url}: {url.harm}")
 
 
 def print_note(text: str) -> None:

@@ -21,6 +21,7 @@ from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics, describe
+from schemas.links import LINK_HELP
 from schemas.words import FrameVerdict, Platform
 
 DESCRIPTION: Final = "Show what a car sends, decoded beside the raw bytes. Send nothing; Ctrl-C ends."
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
     source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--link", metavar="URL", help=cli_support.LINK_HELP)
+    source.add_argument("--link", metavar="URL", help=LINK_HELP)
     source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="show a file that --raw wrote")
     parser.add_argument(
         "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + "; decides what is filler"

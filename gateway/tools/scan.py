@@ -1,6 +1,6 @@
 """`gateway scan`: lists ports and Bluetooth devices, and listens for cars on the ports.
 
-Sends nothing without `--probe`. `discovery` lists the ports, `probe` listens to one.
+Sends nothing without `--probe`. `gateway.link` lists the ports, `probe` listens to one.
 """
 
 import argparse
@@ -14,12 +14,13 @@ from typing import Any, Final
 
 from gateway.drivers.yahboom.protocol.frames import encode
 from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
-from gateway.link import parse_url
+from gateway.link import CannotList, Device, kind_of, parse_url
 from gateway.tools import cli_support
-from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
 from gateway.tools.probe import LinkProbe
+from schemas.links import KINDS, LINK_HELP, LinkUrl
 from schemas.process.stdio import printable
 from schemas.process.usb_bus import explain_missing_port
+from schemas.suggestion import how_to_install
 from schemas.words import LinkVerdict
 
 DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
@@ -43,7 +44,7 @@ PROGRESS_INTERVAL_S: Final = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
-    parser.add_argument("--link", action="append", metavar="URL", help=f"check only this link; {cli_support.LINK_HELP}")
+    parser.add_argument("--link", action="append", metavar="URL", help=f"check only this link; {LINK_HELP}")
     parser.add_argument(
         "--for",
         dest="listen",
@@ -65,10 +66,11 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.link:
         probes = [LinkProbe(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
     else:
-        probes = [LinkProbe(parse_url(port.device), port) for port in serial_ports()]
+        ports = [port for kind in _kinds() if not kind.module for port in kind_of(kind.scheme).ports()]
+        probes = [LinkProbe(parse_url(port.device), port) for port in ports]
     for probe in probes:
         cli_support.warn_before_opening(probe.url)
-    scan = _Scan(probes, listen_s, probe=arguments.probe, bluetooth=not arguments.link)
+    scan = _Scan(probes, listen_s, probe=arguments.probe, devices=not arguments.link)
     cli_support.run_until_interrupted(scan.run())
     if arguments.json:
         for fields in scan.fields():
@@ -85,12 +87,12 @@ def _run(arguments: argparse.Namespace) -> None:
 class _Scan:
     """Scans all links and Bluetooth at once."""
 
-    def __init__(self, probes: Sequence[LinkProbe], seconds: float, *, probe: bool, bluetooth: bool) -> None:
+    def __init__(self, probes: Sequence[LinkProbe], seconds: float, *, probe: bool, devices: bool) -> None:
         self._probes = probes
         self._seconds = seconds
         self._probe = probe
-        self._bluetooth = bluetooth
-        self._devices: list[BleDevice] = []
+        self._looks_for_devices = devices
+        self._devices: list[tuple[type[LinkUrl], Device]] = []
 
     async def run(self) -> None:
         """Open, listen, probe and close."""
@@ -107,18 +109,20 @@ class _Scan:
         async with asyncio.TaskGroup() as tasks:
             for probe in self._probes:
                 tasks.create_task(self._hear(probe))
-            if self._bluetooth:
-                tasks.create_task(self._look_for_devices())
+            for kind in _kinds() if self._looks_for_devices else ():
+                tasks.create_task(self._look_for_devices(kind))
 
     async def _hear(self, probe: LinkProbe) -> None:
         await probe.open()
         if probe.link is not None:
             await probe.listen(self._seconds)
 
-    async def _look_for_devices(self) -> None:
+    async def _look_for_devices(self, kind: type[LinkUrl]) -> None:
         try:
-            self._devices = await ble_devices(self._seconds)
-        except NoBluetooth as error:
+            self._devices += [(kind, device) for device in await kind_of(kind.scheme).devices(self._seconds)]
+        except ImportError:
+            cli_support.print_note(f"{kind.needs} was not searched. Type: {how_to_install(kind.extra)}")
+        except CannotList as error:
             cli_support.print_note(str(error))
 
     async def _probe_silent(self) -> None:
@@ -173,8 +177,8 @@ class _Scan:
                 "probed": probe.probed,
                 **probe.statistics.fields(),
             }
-        for device in self._devices:
-            yield {"kind": "ble", **asdict(device)}
+        for kind, device in self._devices:
+            yield {"kind": kind.scheme, **device.fields()}
 
     def lines(self, paint: cli_support.Paint) -> Iterator[str]:
         """Yield the result as text for a person."""
@@ -185,13 +189,19 @@ class _Scan:
             yield f"  {_words(probe)}"
             if probe.port is not None:
                 yield f"  --link '{probe.port.url}'"
-        likely = [device for device in self._devices if device.uart is not None]
+        likely = [device for _, device in self._devices if device.likely]
         for device in likely:
-            yield f"{paint('cyan', device.address)}  {printable(device.name) or 'no name'}, {device.rssi} dBm"
-            yield f"  likely a car: it has the Bluetooth service {device.uart}; not connected to"
+            address, about = device.heading
+            yield f"{paint('cyan', address)}  {about}"
+            yield f"  likely a car: {device.likely}; not connected to"
             yield f"  --link '{device.url}'"
         if others := len(self._devices) - len(likely):
             yield f"{others} other Bluetooth device{'' if others == 1 else 's'} (--json lists them)"
+
+
+def _kinds() -> Iterator[type[LinkUrl]]:
+    """Yield one kind of link of each scheme."""
+    yield from {kind.scheme: kind for kind in KINDS}.values()
 
 
 async def _all(probing: "asyncio.Future[list[None]]") -> None:

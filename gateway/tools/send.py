@@ -26,7 +26,7 @@ from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.link import LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
-from schemas.links import TcpUrl
+from schemas.links import LINK_HELP, TcpUrl
 from schemas.words import Mode, Motion, Platform
 
 DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
@@ -56,7 +56,7 @@ _EXPANDED: Final = re.compile(r"(?P<name>[^,$]*)(?P<rest>(?:,\d){8}#?)|(?P<named
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
-    parser.add_argument("--link", required=True, metavar="URL", help=cli_support.LINK_HELP)
+    parser.add_argument("--link", required=True, metavar="URL", help=LINK_HELP)
     platform_help = cli_support.PLATFORM_HELP + "; decides which frames the command sends"
     parser.add_argument("--platform", default=Platform.UNKNOWN, help=platform_help)
     parser.add_argument("--wait", metavar="DURATION", help="time between opening the link and sending")

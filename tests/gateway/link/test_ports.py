@@ -165,7 +165,8 @@ def test_a_gateway_says_which_program_takes_the_bytes(tmp_path: Path) -> None:
 def test_a_port_that_another_has_open_is_said_by_the_check_before_it_is_opened(peer: PtyPeer, tmp_path: Path) -> None:
     reader = Reader(tmp_path / "tty")
     try:
-        ok, words = check_device(str(peer.url.path))
+        assert isinstance(peer.url, SerialUrl)
+        ok, words = check_device(peer.url.path)
     finally:
         reader.close()
     assert ok
