@@ -123,8 +123,8 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--platform",
         default="auto",
-        help="arduino, stm32, raspberry_pi, unknown; with options as in arduino+arm (default auto: found out); not found "
-        "out: wave_rover, ugv01, ugv02, ugv_rover, ugv_beast, and those of installed drivers",
+        help="arduino, stm32, raspberry_pi, unknown; with options as in arduino+arm (default auto: found out); to be "
+        "named: wave_rover, ugv01, ugv02, ugv_rover, ugv_beast, and those of installed drivers",
     )
     run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
     run.add_argument(

@@ -68,8 +68,8 @@ faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may b
 faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends a fault (rename and
 cut_write end as link_drop does); without "for_s" a fault lasts until then:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
-infrared remote, which only an Arduino or STM32 car in mode remote_control obeys, or the web page of a ugv; buttons: forward, back, left, right,
-spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
+infrared remote, which only an Arduino or STM32 car in mode remote_control obeys (of the ugv cars: their web page);
+buttons: forward, back, left, right, spin_left, spin_right, stop, whistle, faster, slower; it holds until the next:
   --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
 worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
 other's way come from a file; `fleet example copy follow` writes one with a comment for each field. On stdin:

@@ -1,0 +1,108 @@
+"""Cars of other families behind real gateways: Waveshare's over a terminal, and a tank of another package over TCP."""
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from schemas.words import Basis, Motors, Phase
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses, wait_for
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
+    made = FleetProcesses(free_endpoint(), tmp_path)
+    yield made
+    made.close()
+
+
+def test_a_rover_drives_shows_its_stop_and_publishes_what_it_measures(fleet: FleetProcesses) -> None:
+    sim, links = fleet.simulate("red:ugv_rover:pty", truth=True)
+    fleet.gateway(links[0], platform="ugv_rover")
+    fleet.ready()
+    assert fleet.ask("mode", mode="tracking")["reason"] == "unsupported"
+    assert fleet.ask("drive", motion="forward", duration_s=2.0)["status"] in (Phase.SENT, Phase.QUEUED)
+    wait_for(lambda: driven(fleet), "wheels that turn")
+    fleet.ask("stop")
+    safety = wait_for(lambda: shown(fleet), "a shown stop")
+    assert (safety.motors, safety.motors_basis) == (Motors.OFF, Basis.SHOWN)
+    assert fleet.get("fleet/red/sensor/odometer")[-1].left_m > 0
+    assert 9 < fleet.get("fleet/red/sensor/battery")[-1].voltage_v < 13
+    health = fleet.state("health")
+    assert (health.platform, health.shows_stops) == ("ugv_rover", "yes")
+    assert sim.popen.poll() is None
+
+
+def driven(fleet: FleetProcesses) -> bool:
+    """Return True if the last wheel speeds are of a drive."""
+    wheels = fleet.get("fleet/red/sensor/wheels")
+    return bool(wheels) and wheels[-1].left_m_s > 0.1
+
+
+def shown(fleet: FleetProcesses) -> object:
+    """Return the safety state if the car has shown its stop."""
+    safety = fleet.state("safety")
+    return safety if safety.motors_basis == Basis.SHOWN else None
+
+
+class TankServer:
+    """A tank behind a port. It obeys, and reports five times a second."""
+
+    def __init__(self) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.moves: list[list[float]] = []
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self._serve, daemon=True)
+        self.thread.start()
+
+    @property
+    def url(self) -> str:
+        """The link to it."""
+        return f"tcp://127.0.0.1:{self.server.getsockname()[1]}"
+
+    def _serve(self) -> None:
+        peer, _ = self.server.accept()
+        with peer:
+            peer.settimeout(0.2)
+            rest = b""
+            while not self.ended.is_set():
+                try:
+                    data = peer.recv(4096)
+                    if not data:
+                        return
+                    *lines, rest = (rest + data).split(b"\n")
+                    self.moves += [json.loads(line)["move"] for line in lines if line]
+                except TimeoutError:
+                    pass
+                peer.sendall(b'{"v":7.9,"dist_cm":42}\n')
+
+    def close(self) -> None:
+        """End it."""
+        self.ended.set()
+        self.server.close()
+        self.thread.join(timeout=5)
+
+
+def test_a_car_of_another_package_is_named_driven_and_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
+    found = tmp_path / "packages" / "tank_driver-1.0.dist-info"
+    found.mkdir(parents=True)
+    (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
+    (found / "entry_points.txt").write_text("[zenoh_car_fleet.drivers]\ntank = tests.support.tank\n")
+    root = Path(__file__).parents[2]
+    fleet.environment["PYTHONPATH"] = f"{found.parent}:{root}"
+    tank = TankServer()
+    try:
+        fleet.gateway(tank.url, platform="tank")
+        fleet.ready()
+        fleet.ask("drive", motion="spin_left", duration_s=0.5)
+        wait_for(lambda: [-0.5, 0.5] in tank.moves, "a spin")
+        wait_for(lambda: tank.moves[-2:] == [[0, 0], [0, 0]], "the stop after it")
+        assert fleet.get("fleet/red/sensor/range")[-1].range_m == pytest.approx(0.42)
+        safety = wait_for(lambda: (fleet.state("safety").motors == Motors.OFF) and fleet.state("safety"), "off")
+        assert safety.motors_basis == Basis.SENT, "nothing that a tank sends shows a stop"
+    finally:
+        tank.close()
