@@ -85,7 +85,7 @@ class CommandHandler:
         if "*" in verb:
             bus.refuse(query, f"{expression}: name the command, there is no command {verb}")
             return
-        request = requests.ParsedRequest(
+        request = requests.RawRequest(
             verb,
             payload,
             encoding,
@@ -112,7 +112,7 @@ class CommandHandler:
     def on_sample(self, sample: bus.Sample) -> None:
         """Pass a drive of a stream to control."""
         if not sample.deleted:
-            request = requests.ParsedRequest(
+            request = requests.RawRequest(
                 Verb.DRIVE,
                 sample.payload,
                 sample.encoding,
@@ -126,7 +126,7 @@ class CommandHandler:
             self._carry_out(request)
             self._wake()
 
-    def _carry_out(self, request: requests.ParsedRequest) -> tuple[Command, Answer]:
+    def _carry_out(self, request: requests.RawRequest) -> tuple[Command, Answer]:
         """Parse a request and pass it to control. Its first record has the original request."""
         now = self._clock()
         try:
@@ -177,7 +177,7 @@ class CommandHandler:
                 answer = replace(each.answer, words="; ".join(filter(None, (each.answer.words, f"not saved: {error}"))))
                 self._pending_queries[index] = replace(each, answer=answer)
 
-    def _publish_records(self, command_id: str = "", request: requests.ParsedRequest | None = None) -> None:
+    def _publish_records(self, command_id: str = "", request: requests.RawRequest | None = None) -> None:
         for record in self._control.take_records():
             if isinstance(record, LogRecord):
                 self._print(record)

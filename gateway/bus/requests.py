@@ -58,7 +58,7 @@ WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wild
 
 
 @dataclass(frozen=True, slots=True)
-class ParsedRequest:
+class RawRequest:
     """A request before parsing: the verb, the payload, and its times."""
 
     verb: str
@@ -91,7 +91,7 @@ class BadRequest(ValueError):
         self.command = command
 
 
-def parse(request: ParsedRequest) -> Command:
+def parse(request: RawRequest) -> Command:
     """Parse a request. Raises BadRequest."""
     verb = request.verb
     blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
@@ -116,13 +116,13 @@ def parse(request: ParsedRequest) -> Command:
         return _stop_anyway(error.command, error.words, request)
 
 
-def _stop_anyway(command: Command, words: str, request: ParsedRequest) -> Command:
+def _stop_anyway(command: Command, words: str, request: RawRequest) -> Command:
     """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
     what = Stop() if request.verb == Verb.STOP else _readable_estop(request)
     return replace(command, what=what, note=f"the gateway stops the car in spite of an error: {words}")
 
 
-def _id(request: ParsedRequest) -> str:
+def _id(request: RawRequest) -> str:
     """Return an id for a request without one. For an e-stop to all cars every gateway makes the same id."""
     if request.verb != Verb.ESTOP or not request.by_wildcard:
         return uuid.uuid4().hex
@@ -130,7 +130,7 @@ def _id(request: ParsedRequest) -> str:
     return hashlib.sha256(query).hexdigest()[:32]
 
 
-def _readable_estop(request: ParsedRequest) -> EmergencyStop:
+def _readable_estop(request: RawRequest) -> EmergencyStop:
     """Return the readable part of an invalid e-stop: its scope and its reason."""
     try:
         fields = json.loads(request.payload or b"{}")
@@ -146,7 +146,7 @@ def _readable_estop(request: ParsedRequest) -> EmergencyStop:
     return EmergencyStop(_why(why) if isinstance(why, str) else "", fields.get("scope") == Scope.FLEET)
 
 
-def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
+def _parse_payload(blank: Command, request: RawRequest) -> Command:
     verb = blank.verb
     try:
         message: Any = messages.parse(COMMANDS[verb].message, request.payload or b"", _encoding(request))
@@ -170,7 +170,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     )
 
 
-def _action(verb: str, message: Any, request: ParsedRequest) -> Action:
+def _action(verb: str, message: Any, request: RawRequest) -> Action:
     """Return the action of a message. Raises ValueError for a wrong field."""
     if verb == Verb.DRIVE:
         return _drive(message, request.longest_drive_s, request.car)
@@ -183,13 +183,13 @@ def _action(verb: str, message: Any, request: ParsedRequest) -> Action:
     return plain(**values)
 
 
-def _encoding(request: ParsedRequest) -> str:
+def _encoding(request: RawRequest) -> str:
     if request.payload:
         return request.encoding
     return PROTOBUF  # zero bytes are a message without fields
 
 
-def _age_s(message: Any, request: ParsedRequest) -> float | None:
+def _age_s(message: Any, request: RawRequest) -> float | None:
     """Return the age of a request, s; None if unknown, negative if its sender's clock is ahead of ours."""
     if message.HasField("asked"):
         age_ns: int = request.now_ns - messages.stamp_ns(message.asked)

@@ -37,7 +37,7 @@ class CommandLog:
         """Return True if there are records to take."""
         return bool(self._records)
 
-    def take(self) -> list[Record]:
+    def take_records(self) -> list[Record]:
         """Return the records since the last call."""
         records, self._records = self._records, []
         return records

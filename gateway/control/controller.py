@@ -105,7 +105,7 @@ class Controller(Generic[D_co]):
 
     def take_records(self) -> list[Record]:
         """Return the records since the last call."""
-        return self._log.take()
+        return self._log.take_records()
 
     # ------------------------------------------------------------------ link, frames, readings, time
 

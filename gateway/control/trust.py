@@ -94,7 +94,7 @@ class TrustState:
     shown_at: float | None = None
     """When the car showed its last stop."""
 
-    def take(self, event: TrustEvent, now: float, evidence: str = "") -> bool:
+    def apply(self, event: TrustEvent, now: float, evidence: str = "") -> bool:
         """Apply an event. Return True if the state or its basis has changed."""
         before = self.state, self.basis
         self.state = TRANSITIONS[self.state, event]

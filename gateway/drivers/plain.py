@@ -667,7 +667,7 @@ class PlainDriver(Driver):
 
     def _learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
         """Update the trust state, and log each change."""
-        if self._model.trust.take(event, now, evidence):
+        if self._model.trust.apply(event, now, evidence):
             trust = self._model.trust
             basis = f" ({trust.basis})" if trust.basis is not None else ""
             words = f"{self._model.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"

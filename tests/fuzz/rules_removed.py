@@ -19,7 +19,7 @@ Patch = Callable[[object, str, Any], None]
 
 def _time_decides(patch: Patch) -> None:
     def await_time(self: StopExecutor, running: StopInProgress, now: float) -> None:
-        if now >= running.obeyed_at:
+        if now >= running.obeys_by:
             self._finish(running, Basis.SHOWN, "time", now)
 
     patch(StopExecutor, "_await", await_time)
@@ -92,7 +92,7 @@ def _shutdown_waits_for_time(patch: Patch) -> None:
 
 def _sent_without_a_report(patch: Patch) -> None:
     def ends(self: StopExecutor, running: StopInProgress, now: float) -> StopCase | None:
-        return StopCase.NO_ECHO if running.frames_sent and now >= running.obeyed_at else None
+        return StopCase.NO_ECHO if running.frames_sent and now >= running.obeys_by else None
 
     patch(StopExecutor, "_ends_as_sent", ends)
 

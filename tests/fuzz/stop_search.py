@@ -834,7 +834,7 @@ class Episode:
     def _judge_sent(self, *, driving: bool) -> None:
         control = self.control
         case = (
-            control.driver.model.rest.value
+            control.driver.model.rest_case.value
             if self._linked and control.driver.model.motors == "off" and control.driver.model.basis == "sent"
             else ""
         )

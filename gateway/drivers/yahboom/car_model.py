@@ -43,7 +43,7 @@ class CarModel:
     believed: StateEstimate = field(init=False)
     evidence: StopEvidence = field(init=False)
     trust: TrustState = field(default_factory=TrustState)
-    rest: StopCase = StopCase.SOFT
+    rest_case: StopCase = StopCase.SOFT
     """The case of the stop, if the claim of rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
@@ -75,7 +75,7 @@ class CarModel:
 
     def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
         """Update the trust state, and log each change. Only this function changes it."""
-        if self.trust.take(event, now, evidence):
+        if self.trust.apply(event, now, evidence):
             trust = self.trust
             basis = f" ({trust.basis})" if trust.basis is not None else ""
             words = f"{self.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
@@ -144,7 +144,7 @@ class CarModel:
     @property
     def rest_is_sure(self) -> bool:
         """Return True if the car has shown that it stands, or cannot show it."""
-        return self.at_rest and (self.trust.shown or self.rest is not StopCase.SOFT or not self.can_show)
+        return self.at_rest and (self.trust.shown or self.rest_case is not StopCase.SOFT or not self.can_show)
 
     @property
     def can_show(self) -> bool:

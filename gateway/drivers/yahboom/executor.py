@@ -204,7 +204,7 @@ class Executor(Driver):
         if renewal.is_full_stop:
             renewal.schedule(now)
             return self._begin_stop(self.stops.full(now), FrameOrigin.REPEAT, now)
-        return self._write(renewal.take(now), FrameOrigin.REPEAT, None, None)
+        return self._write(renewal.next_frame(now), FrameOrigin.REPEAT, None, None)
 
     def _begin_stop(
         self, sequence: StopSequence, why: FrameOrigin, now: float, before: Pending | None = None
@@ -302,7 +302,7 @@ class Executor(Driver):
 
         See docs/reference/protocol.md#hazards.
         """
-        self.model.rest = StopCase.ACTED
+        self.model.rest_case = StopCase.ACTED
         words = EVIDENCE[StopCase.ACTED].words.format(car=self.model.name)
         self.model.learn(TrustEvent.STOP_SENT, now, words)
         self.stops.renewal.schedule(now)

@@ -221,7 +221,7 @@ class StopExecutor:
         if running.at_rest or model.trust.state is CarTrust.UNHEARD:
             return None
         reported = running.report_at > running.last_at
-        is_time_up = now >= running.obeyed_at
+        is_time_up = now >= running.obeys_by
         if not running.frames_sent or not (is_time_up or reported):
             return None
         match running.case:
@@ -397,7 +397,7 @@ class StopExecutor:
         model, shown = self.model, basis is Basis.SHOWN
         self.running = None
         recovered = model.trust.state in STOP_GOES_ON and not model.known
-        model.rest = case
+        model.rest_case = case
         model.cut_write = False
         self.renewal.left_mode = model.left_at >= running.began_at
         model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
@@ -420,8 +420,8 @@ class StopExecutor:
             times.append(self.model.evidence.settles_at)
         elif running.frames_sent:
             times.append(max(running.next_try_at, self.model.pacing.flight_until))
-        if running.frames_sent and running.obeyed_at > now:
-            times.append(running.obeyed_at)
+        if running.frames_sent and running.obeys_by > now:
+            times.append(running.obeys_by)
         if not running.frames_sent:
             times.append(running.due_at(self.model.pacing))
         return times

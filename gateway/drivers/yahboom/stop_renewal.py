@@ -56,9 +56,9 @@ class StopRenewal:
     @property
     def is_full_stop(self) -> bool:
         """Return True if the whole stop is sent again: the car may still be in the mode that it should leave."""
-        return not self._general_stop_follows and self._model.rest is StopCase.FAN and self.left_mode
+        return not self._general_stop_follows and self._model.rest_case is StopCase.FAN and self.left_mode
 
-    def take(self, now: float) -> Frame:
+    def next_frame(self, now: float) -> Frame:
         """Return the frame that is due, and schedule the next one."""
         if self._general_stop_follows:
             self._general_stop_follows = False
@@ -77,4 +77,4 @@ class StopRenewal:
         model = self._model
         if model.profile.refusal(ModeClose()) is not None:
             return False  # some programs end at a named frame
-        return model.rest in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS
+        return model.rest_case in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS

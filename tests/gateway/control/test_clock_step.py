@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.bus.requests import ParsedRequest, parse
+from gateway.bus.requests import RawRequest, parse
 from gateway.control.commands import Answer
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from schemas import messages
@@ -41,7 +41,7 @@ class Gateway:
         name = COMMANDS[verb].message
         message: Any = messages.message_class(name)(sender=sender, kind="person", **fields)
         message.asked.seconds = min(max(self.wall_ns // S + ahead_s, -(1 << 63)), (1 << 63) - 1)
-        request = ParsedRequest(verb, message.SerializeToString(), messages.encoding_of(name), self.wall_ns)
+        request = RawRequest(verb, message.SerializeToString(), messages.encoding_of(name), self.wall_ns)
         answer = self.desk.control.command(parse(request), self.desk.now)
         self.desk.pump()
         return answer

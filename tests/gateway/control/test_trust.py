@@ -62,7 +62,7 @@ def test_a_transition(state: CarTrust, event: TrustEvent) -> None:
 def test_what_is_taken_from_a_transition(state: CarTrust, event: TrustEvent) -> None:
     basis = Basis.SENT if state is CarTrust.STOPPED else None
     trust = TrustState(state, 1.0, "before", basis)
-    changed = trust.take(event, 2.0, "words")
+    changed = trust.apply(event, 2.0, "words")
     assert trust.state is TRANSITIONS[state, event]
     assert trust.motors == MOTORS[trust.state]
     assert (trust.basis is not None) == (trust.state is CarTrust.STOPPED)
@@ -76,7 +76,7 @@ def test_what_is_taken_from_a_transition(state: CarTrust, event: TrustEvent) -> 
 def test_an_event_is_its_own_evidence() -> None:
     trust = TrustState()
     assert trust.evidence == "not connected yet"
-    trust.take(TrustEvent.LINK_OPENED, 1.0)
+    trust.apply(TrustEvent.LINK_OPENED, 1.0)
     assert trust.evidence == TrustEvent.LINK_OPENED
 
 
@@ -85,11 +85,11 @@ def test_after_any_story_a_stop_goes_on_until_it_is_shown_or_sent(story: list[Tr
     trust = TrustState()
     linked = False
     for number, event in enumerate(story):
-        trust.take(event, float(number))
+        trust.apply(event, float(number))
         linked = event is TrustEvent.LINK_OPENED or (linked and event is not TrustEvent.LINK_LOST)
         assert (trust.state is not CarTrust.UNKNOWN) == linked
         assert (trust.basis is not None) == (trust.motors == "off")
-    trust.take(TrustEvent.STOP_BEGUN, 100.0)
+    trust.apply(TrustEvent.STOP_BEGUN, 100.0)
     assert not linked or trust.state in STOP_GOES_ON
-    trust.take(TrustEvent.STOP_SHOWN, 101.0)
+    trust.apply(TrustEvent.STOP_SHOWN, 101.0)
     assert (trust.motors, trust.shown_at) == ("off", 101.0) if linked else trust.motors == "unknown"

@@ -51,7 +51,7 @@ class ModeEstimator:
     _asked_at: float = field(default=float("-inf"))
     _settled_at: float = field(default=float("-inf"))
     """When an obedient car is in the commanded mode at the latest."""
-    _obeyed_at: float = field(default=float("-inf"))
+    _obeys_by: float = field(default=float("-inf"))
     """The same for a car that was in that mode before the last frame."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
@@ -84,7 +84,7 @@ class ModeEstimator:
         left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
         turn_s = self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE)
         self._settled_at = max(self._settled_at, now + turn_s) + block_s
-        self._obeyed_at = now + self.profile.mode_turn_s(mode) + block_s
+        self._obeys_by = now + self.profile.mode_turn_s(mode) + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
         if mode is not self.asked or self.verdict is not Verdict.ASSUMED:
@@ -130,7 +130,7 @@ class ModeEstimator:
             if len(candidates) > 1:
                 return
             self._matches += 1
-            self._settled_at = min(self._settled_at, self._obeyed_at)
+            self._settled_at = min(self._settled_at, self._obeys_by)
             if at >= self._asked_at and (
                 self._matches >= CONTRADICTING_FRAMES or at > self._other_at + CORRUPTED_MATCH_S
             ):

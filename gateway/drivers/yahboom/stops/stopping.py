@@ -173,7 +173,7 @@ class StopInProgress:
         return self.due
 
     @property
-    def obeyed_at(self) -> float:
+    def obeys_by(self) -> float:
         """Return the latest time at which the car has obeyed, if the frames arrived."""
         return max(self.last_at, self.worst_at)
 
@@ -199,7 +199,7 @@ class StopInProgress:
             return self.began_at
         if not self.sent_all:
             return float("inf")
-        return self.report_at if self.report_at > float("-inf") else self.obeyed_at
+        return self.report_at if self.report_at > float("-inf") else self.obeys_by
 
     def worst_s(self, now: float) -> float:
         """Return the longest time until the motors are off, if the frames arrive."""

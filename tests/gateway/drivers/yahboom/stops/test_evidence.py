@@ -584,7 +584,7 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", basis)
     assert bool(EVIDENCE[case].shown_by) == shown
     assert not pair.car.truth.driving
-    assert shown or pair.control.driver.model.rest is case
+    assert shown or pair.control.driver.model.rest_case is case
 
 
 def test_a_soft_stop_shows_nothing() -> None:
@@ -592,7 +592,7 @@ def test_a_soft_stop_shows_nothing() -> None:
     pair = driven()
     assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
-    assert pair.control.driver.model.rest is StopCase.SOFT
+    assert pair.control.driver.model.rest_case is StopCase.SOFT
 
 
 def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
@@ -601,7 +601,7 @@ def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
     pair.until(lambda: pair.control.driver.model.basis == Basis.SHOWN, 9.0)
     pair.ask(Fan())
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
-    assert pair.control.driver.model.rest is StopCase.ACTED
+    assert pair.control.driver.model.rest_case is StopCase.ACTED
 
 
 def test_every_row_is_played() -> None:
