@@ -25,7 +25,7 @@ STILL = pb.Motion(motion="stop")
 
 
 @dataclass(frozen=True)
-class Case:
+class SeenCase:
     """A car: what its gateway says, how long ago, and what each view makes of it."""
 
     missing: str = ""
@@ -43,32 +43,32 @@ class Case:
 
 
 CASES = {
-    "ready": Case(),
-    "driving": Case(motors="on", safety=pb.Safety(motors="on", trust="driving")),
-    "sends nothing, its stop is sent": Case(unheard=True, link=pb.Link(state="online")),
-    "waits": Case(
+    "ready": SeenCase(),
+    "driving": SeenCase(motors="on", safety=pb.Safety(motors="on", trust="driving")),
+    "sends nothing, its stop is sent": SeenCase(unheard=True, link=pb.Link(state="online")),
+    "waits": SeenCase(
         "waits for its first stop", motors="stopping", safety=pb.Safety(motors="stopping", waits_for="its first stop")
     ),
-    "in doubt": Case(motors="unknown", safety=pb.Safety(motors="unknown", trust="unproven")),
-    "not heard yet": Case(
+    "in doubt": SeenCase(motors="unknown", safety=pb.Safety(motors="unknown", trust="unproven")),
+    "not heard yet": SeenCase(
         NEVER_HEARD,
         unheard=True,
         motors="unknown",
         link=pb.Link(state="online"),
         safety=pb.Safety(motors="unknown"),
     ),
-    "quiet": Case(link=pb.Link(state="quiet", last_rx_s=40)),
-    "unheard in a quiet mode": Case(
+    "quiet": SeenCase(link=pb.Link(state="quiet", last_rx_s=40)),
+    "unheard in a quiet mode": SeenCase(
         silent=True,
         unheard=True,
         motors="unknown",
         link=pb.Link(state="quiet", last_rx_s=40),
         safety=pb.Safety(motors="unknown", trust="unheard"),
     ),
-    "silent": Case("silent: is it switched on?", silent=True, unheard=True, link=pb.Link(state="stale", last_rx_s=12)),
-    "lost": Case("link lost: no such port", link=pb.Link(state="lost", reason="no such port")),
-    "its gateway hangs": Case(NO_ANSWER, age_s=60.0),
-    "its gateway has ended": Case("its gateway is starting", motors="unknown", present=False),
+    "silent": SeenCase("silent: is it switched on?", silent=True, unheard=True, link=pb.Link(state="stale", last_rx_s=12)),
+    "lost": SeenCase("link lost: no such port", link=pb.Link(state="lost", reason="no such port")),
+    "its gateway hangs": SeenCase(NO_ANSWER, age_s=60.0),
+    "its gateway has ended": SeenCase("its gateway is starting", motors="unknown", present=False),
 }
 
 
