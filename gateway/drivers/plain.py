@@ -214,6 +214,8 @@ class PlainDriver(Driver):
     """Number of frames of a stop. Each try sends all of them."""
     STOP_GAP_S: ClassVar[float] = 0.1
     """Time between two frames of a stop."""
+    PART_GAP_S: ClassVar[float] = 0.25
+    """Time between the frames of one action, such as a blink."""
     STOPS_WITHIN_S: ClassVar[float]
     """Time after the last frame of a stop in which a car that got it has stopped."""
     RETRY_S: ClassVar[float] = 2.0
@@ -232,6 +234,8 @@ class PlainDriver(Driver):
         self._log = desk.log
         self._stop: PlainStop | None = None
         self._source: PlainStop | HeldMotion | Pending | None = None
+        self._part_at = float("-inf")
+        """When the next frame of an action on a part of the car may be written."""
         self._resend_at = float("inf")
         """When the held motion is sent again."""
         self._renew_at = float("inf")
@@ -401,9 +405,11 @@ class PlainDriver(Driver):
             return None
         if stop.index < self.STOP_FRAMES:
             return self._write(self.stop_frame(stop.index), stop.why, stop) if now >= stop.next_at else None
-        if self._has_new_command(stop) and self.accepts_commands(now):
+        if self._has_new_motion(stop) and self.accepts_commands(now):
             self._give_way(stop, now)
             return None
+        if self.accepts_commands(now) and (write := self._next_part(now)) is not None:
+            return write
         model = self._model
         answers = model.is_heard and (model.heard_at is not None or not model.profile.has_readings)
         if not self.can_show and answers:
@@ -419,17 +425,28 @@ class PlainDriver(Driver):
         return None if data is None else self._write(data, FrameOrigin.RECOVERY, None)
 
     def _next_command(self, now: float) -> OutgoingFrame | None:
-        queue, model, held = self.queue, self._model, self.queue.held
+        model, held = self._model, self.queue.held
         if held is not None and not held.pending.sent:
             return self._write(self.motion_frame(held.motion), FrameOrigin.COMMAND, held)
-        if queue.one_shots:
-            return self._write(queue.one_shots[0].frames[0], FrameOrigin.COMMAND, queue.one_shots[0])
+        if (write := self._next_part(now)) is not None:
+            return write
         if held is not None and now >= self._resend_at:
             return self._write(self.motion_frame(held.motion), FrameOrigin.REPEAT, held)
         if now >= self._renew_at and model.at_rest and not model.trust.shown:
             self._renew_at = now + RENEWAL_S
             return self._write(self.stop_frame(self.STOP_FRAMES - 1), FrameOrigin.REPEAT, None)
         return None
+
+    def _next_part(self, now: float) -> OutgoingFrame | None:
+        """Return the next frame of an action on a part of the car, if one is due."""
+        if not self.queue.one_shots or now < self._part_at:
+            return None
+        pending, held = self.queue.one_shots[0], self.queue.held
+        data = pending.frames[0]
+        if isinstance(pending.command.what, ChangeSpeed):  # the motion of now: that of its arrival may be over
+            is_driven = held is not None and held.pending.sent and self._stop is None
+            data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
+        return self._write(data, FrameOrigin.COMMAND, pending)
 
     def _write(self, data: bytes, why: FrameOrigin, source: PlainStop | HeldMotion | Pending | None) -> OutgoingFrame:
         self._source = source
@@ -458,6 +475,7 @@ class PlainDriver(Driver):
                     self._log.record_sent(held.pending, now)
             case Pending():
                 source.frames.popleft()
+                self._part_at = now + (self.PART_GAP_S if source.frames else 0.0)
                 self._apply(source.command.what, now)
                 if not source.frames:
                     self._log.record_sent(source, now)
@@ -488,11 +506,13 @@ class PlainDriver(Driver):
             if stop.index >= self.STOP_FRAMES:
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
             times += [stop.next_at, *(each for each in later if each > now)]
-            if self._has_new_command(stop) and not self.wait_words(now):
-                times.append(self.free_at(now))
+            if (self._has_new_motion(stop) or self.queue.one_shots) and not self.wait_words(now):
+                times.append(max(self.free_at(now), self._part_at if self.queue.one_shots else now))
         elif not self.wait_words(now):
-            if self.queue.one_shots or (held is not None and not held.pending.sent):
+            if held is not None and not held.pending.sent:
                 times.append(now)
+            if self.queue.one_shots:
+                times.append(self._part_at)
             if held is not None:
                 times.append(self._resend_at)
             if self._model.at_rest and not self._model.trust.shown:
@@ -524,7 +544,7 @@ class PlainDriver(Driver):
     def frames(self, what: Action) -> tuple[bytes, ...]:
         """Return the frames of an action on a part of the car. One that is no frame still takes its turn."""
         if isinstance(what, ChangeSpeed):
-            return (self.motion_frame(self._model.sent_motion),)
+            return (self.motion_frame(Motion.STOP),)  # its place; what is written is the motion of that moment
         return self.part_frames(what) or ()
 
     def _apply(self, what: Action, now: float) -> None:
@@ -544,10 +564,10 @@ class PlainDriver(Driver):
         """Return when a newer command may take the place of a stop: all frames are out, and the car has stopped."""
         return stop.last_at + self.STOPS_WITHIN_S if stop.last_at > float("-inf") else float("inf")
 
-    def _has_new_command(self, stop: PlainStop) -> bool:
-        held, one_shots = self.queue.held, self.queue.one_shots
-        waiting = [*([held.pending] if held is not None and not held.pending.sent else []), *list(one_shots)[:1]]
-        return any(pending.received_at >= stop.began_at or stop.is_soft for pending in waiting)
+    def _has_new_motion(self, stop: PlainStop) -> bool:
+        held = self.queue.held
+        is_new = held is not None and not held.pending.sent
+        return is_new and held is not None and (held.pending.received_at >= stop.began_at or stop.is_soft)
 
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""

@@ -192,6 +192,8 @@ class UgvEpisode:
         if not moved and not self.faults:
             self.faults.append(f"{self.now:.2f} a calm car does not drive")
         self.drives += 1
+        if self.moments.random() < 0.5:  # it comes as the drive ends, or waits until then
+            self.ask(ChangeSpeed(self.moments.choice(list(SpeedStep))))
         self.run(0.9 + BRAKE_S + 2 * self.delay_s)
         if self.car.moving and self.is_alone and not self.faults:
             self.faults.append(f"{self.now:.2f} it moves on after its drive")

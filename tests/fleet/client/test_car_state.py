@@ -65,7 +65,9 @@ CASES = {
         link=pb.Link(state="quiet", last_rx_s=40),
         safety=pb.Safety(motors="unknown", trust="unheard"),
     ),
-    "silent": SeenCase("silent: is it switched on?", silent=True, unheard=True, link=pb.Link(state="stale", last_rx_s=12)),
+    "silent": SeenCase(
+        "silent: is it switched on?", silent=True, unheard=True, link=pb.Link(state="stale", last_rx_s=12)
+    ),
     "lost": SeenCase("link lost: no such port", link=pb.Link(state="lost", reason="no such port")),
     "its gateway hangs": SeenCase(NO_ANSWER, age_s=60.0),
     "its gateway has ended": SeenCase("its gateway is starting", motors="unknown", present=False),
