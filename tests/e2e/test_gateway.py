@@ -589,7 +589,7 @@ def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProces
         (["--car", "Red"], 2, "car name 'Red' is not allowed: use 1 to 32 of a-z"),
         (["--car", ""], 2, "car name '' is not allowed"),
         (["--fleet", "a/b"], 2, "fleet name 'a/b' is not allowed"),
-        (["--platform", "esp32"], 2, 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown.'),
+        (["--platform", "esp32"], 2, 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown, '),
         (["--platform", "arduino+wings"], 2, 'Unknown option "+wings"'),
         (["--link", "usb://x"], 2, "this is not a link. `fleet scan` lists"),
         (["--link", "tcp://host"], 2, "the port is missing. Write tcp://host:8888"),

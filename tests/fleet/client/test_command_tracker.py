@@ -193,7 +193,7 @@ def test_wait_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
         (["wait", "red/sensor/range", "range < 1"], "column 1: range is not a value. Did you mean range_m?"),
         (["wait", "red/sensor/range", "range_m < 1 and range_m > 2"], "range_m < 1 and range_m > 2 is never true"),
         (["wait", "*/state/motion", "motion == 'forwards'"], "is never true: motion is one of stop, forward, back"),
-        (["wait", "*/sensor/battery", "not voltage_v < 50"], "is never true: voltage_v is 0 .. 12"),
+        (["wait", "*/sensor/battery", "not voltage_v < 50"], "is never true: voltage_v is 0 .. 13"),
         (["watch", "*/state/mode", "--when", "verdict == 'wrong'"], "verdict is one of assumed, confirmed"),
         (["wait", "red/sensor/sonar", "range_m < 1"], "No key red/sensor/sonar."),
         (["wait", "red/@cmd/drive", "motion == 'stop'"], "No key red/@cmd/drive."),

@@ -332,5 +332,6 @@ def test_the_schema_is_one_for_editors() -> None:
     assert made["required"] == ["cars"]
     car = made["$defs"]["CarEntry"]["properties"]
     options = "arm|imu|text|no_readings|3s|fan_level|ptz_direct|head=[A-Za-z0-9]{2,8}"
-    assert car["platform"]["pattern"] == f"^(auto|arduino|stm32|raspberry_pi|unknown)([+]({options}))*$"
+    kinds = "auto|arduino|stm32|raspberry_pi|unknown|wave_rover|ugv01|ugv02|ugv_rover|ugv_beast"
+    assert car["platform"]["pattern"] == f"^({kinds})([+]({options}))*$"
     assert all("description" in field for field in car.values())

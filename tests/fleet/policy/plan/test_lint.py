@@ -69,7 +69,7 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
             "phase x",
             "it never ends. It waits for imu.gyro_x_raw from red, which no mode measures there.",
         ),
-        ("roles: {x: {mode: tracking, needs: battery.voltage_v > 20}}", "role x", "battery.voltage_v is 0 .. 12"),
+        ("roles: {x: {mode: tracking, needs: battery.voltage_v > 20}}", "role x", "battery.voltage_v is 0 .. 13"),
         (
             SCOUT + "rules: [{when: {any_car: mode.asked == 'dancing'}, then: {who: red, mode: manual}}]",
             "rule 1",
