@@ -75,6 +75,11 @@ class GatewayStarts:
         self.current = ""
 
 
+@cache
+def _empty(topic: str) -> Any:
+    return messages.message_class(topics.TOPICS[topic].message)()
+
+
 @dataclass(slots=True)
 class CarState:
     """What the bus has said of one car. All times `at` and `now` are s, of one clock that the caller chooses."""
@@ -175,36 +180,16 @@ class CarState:
         """Return the topics whose newest message is stale, sorted."""
         return sorted(topic for topic in self.newest_by_topic if topic in topics.TOPICS and self.is_stale(topic, now))
 
-    # A message that nobody sent reads as an empty one: its words are empty, its numbers 0.
-
     def last_word(self, topic: str) -> Any:
         """Return the newest message, also of a gateway that has gone since. An empty one if there is none."""
         return self.newest(topic) or _empty(topic)
 
-    @property
-    def link(self) -> Any:
-        """The fleet.v1.Link, of a gateway that is there."""
-        return self.last_word("state/link") if self.present else _empty("state/link")
-
-    @property
-    def mode(self) -> Any:
-        """The fleet.v1.Mode, of a gateway that is there."""
-        return self.last_word("state/mode") if self.present else _empty("state/mode")
-
-    @property
-    def motion(self) -> Any:
-        """The fleet.v1.Motion, of a gateway that is there."""
-        return self.last_word("state/motion") if self.present else _empty("state/motion")
-
-    @property
-    def safety(self) -> Any:
-        """The fleet.v1.Safety, of a gateway that is there."""
-        return self.last_word("state/safety") if self.present else _empty("state/safety")
-
-    @property
-    def health(self) -> Any:
-        """The fleet.v1.Health, of a gateway that is there."""
-        return self.last_word("state/health") if self.present else _empty("state/health")
+    # The states of a gateway that is there, such as a fleet.v1.Link. What nobody said reads as an empty message.
+    link = property(lambda self: self.of("state/link") or _empty("state/link"))
+    mode = property(lambda self: self.of("state/mode") or _empty("state/mode"))
+    motion = property(lambda self: self.of("state/motion") or _empty("state/motion"))
+    safety = property(lambda self: self.of("state/safety") or _empty("state/safety"))
+    health = property(lambda self: self.of("state/health") or _empty("state/health"))
 
     # ------------------------------------------------------------------ what follows from it
 
@@ -272,8 +257,3 @@ class CarState:
         if not self.link.state:
             return "its gateway is starting"
         return NO_ANSWER
-
-
-@cache
-def _empty(topic: str) -> Any:
-    return messages.message_class(topics.TOPICS[topic].message)()

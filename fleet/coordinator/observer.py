@@ -120,8 +120,9 @@ class FleetObserver:
             return  # not from a gateway of this version
         if key.car not in self.listed and not self.cars.get(key.car, CarSnapshot()).present:
             self._absent_since.setdefault(key.car, now)
-        state = self.states.setdefault(key.car, CarState(key.car))
-        state.present = self.cars.get(key.car, CarSnapshot()).present
+        state = self.states.get(key.car)
+        if state is None:
+            state = self.states[key.car] = CarState(key.car, self.cars.get(key.car, CarSnapshot()).present)
         at = now if wall_s is None else now - age_of_answer_s(messages.stamp_ns(value.stamp) / 1e9, wall_s)
         if state.take(key.topic, value, at) and key.topic.startswith("state/"):
             self._update(state)

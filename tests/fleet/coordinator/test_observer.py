@@ -157,6 +157,32 @@ def test_a_late_hold_of_an_earlier_gateway_keeps_nobody_from_a_car() -> None:
     assert observer.cars["red"].held_by is None, "the gateway that said so has ended"
 
 
+@pytest.mark.parametrize(
+    ("motion", "safety", "driver", "taken"),
+    [
+        (pb.Motion(owner="mia"), pb.Safety(lease=pb.Lease(holder="jo", kind="person")), "mia", None),
+        (pb.Motion(), pb.Safety(lease=pb.Lease(holder="jo", kind="person")), "jo", None),
+        (pb.Motion(), pb.Safety(lease=pb.Lease(holder="@coordinator", kind="coordinator")), None, None),
+        (pb.Motion(), pb.Safety(loan=pb.Loan(to="bob", by="ann")), None, "bob"),
+        (pb.Motion(), pb.Safety(pauses=[pb.Pause(by="ann")]), None, "ann"),
+    ],
+)
+def test_who_drives_or_keeps_a_car(motion: pb.Motion, safety: pb.Safety, driver: str | None, taken: str | None) -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    observer.on_sample(published("state/motion", motion), 101.0, None)
+    observer.on_sample(published("state/safety", safety), 101.0, None)
+    assert (observer.cars["red"].driven_by, observer.cars["red"].taken_by) == (driver, taken)
+
+
+def test_a_message_may_come_before_its_gateways_token() -> None:
+    observer = FleetObserver()
+    observer.on_sample(said("sensor/range"), 100.0, None)
+    come(observer, "red", 101.0)
+    observer.on_sample(published("state/mode", pb.Mode(car="red", asked="tracking")), 102.0, None)
+    assert observer.cars["red"].mode == "tracking"
+
+
 def test_an_answer_whose_stamp_is_far_ahead_is_stale() -> None:
     observer = FleetObserver()
     for ahead_s, at in ((9.0, 100.0), (11.0, -inf)):
