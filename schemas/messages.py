@@ -1,6 +1,7 @@
 """Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read. No bus here."""
 
 import json
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
@@ -13,6 +14,14 @@ from schemas.topics import PROTOBUF
 from schemas.words import Level
 
 JSON: Final = "application/json"
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """A message, and since when it counts: s, of the observer's clock."""
+
+    message: Any
+    at: float
 
 
 class BadPayload(ValueError):

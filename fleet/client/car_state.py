@@ -19,7 +19,7 @@ not.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import inf
 from typing import Any, Final, Self
@@ -28,7 +28,8 @@ from fleet.client.claims import CarClaims, claims_of
 from fleet.client.reading import Reading, age_of_answer_s
 from schemas import messages, topics
 from schemas.authority import Authority
-from schemas.words import CarTrust, LinkState, Motors
+from schemas.messages import Observation
+from schemas.words import CarTrust, LinkState, Motors, Rank
 
 NO_ANSWER: Final = "its gateway does not answer"
 NEVER_HEARD: Final = "nothing was heard from it yet"
@@ -74,6 +75,11 @@ class GatewayStarts:
         self.current = ""
 
 
+@cache
+def _empty(topic: str) -> Any:
+    return messages.message_class(topics.TOPICS[topic].message)()
+
+
 @dataclass(slots=True)
 class CarState:
     """What the bus has said of one car. All times `at` and `now` are s, of one clock that the caller chooses."""
@@ -81,9 +87,9 @@ class CarState:
     car: str
     present: bool = True
     """True if its gateway is there, as far as the caller knows."""
-    _newest: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    newest_by_topic: dict[str, Observation] = field(default_factory=dict)
     _boot_id: str = ""
-    """The gateway that said the states in `_newest`."""
+    """The gateway that said the states in `newest_by_topic`."""
     _starts: GatewayStarts = field(default_factory=GatewayStarts)
 
     @classmethod
@@ -101,24 +107,25 @@ class CarState:
 
         Return False if it does not count: it is older than what is known, or of a gateway that has ended.
         """
-        if topic in self._newest and self._newest[topic][1] > at:
+        before = self.newest_by_topic.get(topic)
+        if before is not None and before.at > at:
             return False  # what was published meanwhile has overtaken this answer
         if topic.startswith("state/"):
             if not self._starts.take(message.boot_id, messages.stamp_ns(message.stamp)):
-                if message.boot_id == self._boot_id:
-                    self._newest[topic] = (message, at)  # the last words of a gateway that has just ended
+                if message.boot_id == self._boot_id:  # the last words of a gateway that has just ended
+                    self.newest_by_topic[topic] = Observation(message, at)
                 return False
             boot_id = message.boot_id or self._boot_id
             if self._boot_id not in ("", boot_id):
-                self._forget_states()
+                self.forget_states()
             self._boot_id = boot_id
-        self._newest[topic] = (message, at)
+        self.newest_by_topic[topic] = Observation(message, at)
         return True
 
     def on_presence(self, *, present: bool) -> None:
         """Note that the car's gateway is on the bus, or not. One that has come back says again what is so."""
         if present and not self.present:
-            self._forget_states()
+            self.forget_states()
         self.present = present
 
     def on_gateway_end(self, running: str = "") -> None:
@@ -131,18 +138,20 @@ class CarState:
 
     def on_sleep(self, slept_s: float) -> None:
         """Let all messages age by a sleep of the computer, which the clock of their times does not count."""
-        self._newest = {topic: (message, at - slept_s) for topic, (message, at) in self._newest.items()}
+        for topic, seen in self.newest_by_topic.items():
+            self.newest_by_topic[topic] = replace(seen, at=seen.at - slept_s)
 
-    def _forget_states(self) -> None:
-        for topic in [each for each in self._newest if each.startswith("state/")]:
-            del self._newest[topic]
+    def forget_states(self) -> None:
+        """Forget what its gateway has said of it. Readings stay: they are of the car."""
+        for topic in [each for each in self.newest_by_topic if each.startswith("state/")]:
+            del self.newest_by_topic[topic]
 
     # ------------------------------------------------------------------ what is known
 
     def newest(self, topic: str) -> Any:
         """Return the newest message, also of a gateway that has gone since. None if there is none."""
-        found = self._newest.get(topic)
-        return None if found is None else found[0]
+        found = self.newest_by_topic.get(topic)
+        return None if found is None else found.message
 
     def of(self, topic: str) -> Any:
         """Return the newest message. None if there is none, or if its gateway has gone since."""
@@ -151,7 +160,7 @@ class CarState:
     @property
     def has_states(self) -> bool:
         """True if any state of its gateway is known."""
-        return any(topic.startswith("state/") for topic in self._newest)
+        return any(topic.startswith("state/") for topic in self.newest_by_topic)
 
     def fresh(self, topic: str, now: float) -> Any:
         """Return the newest message. None if there is none, or if it is stale."""
@@ -159,8 +168,8 @@ class CarState:
 
     def age_s(self, topic: str, now: float) -> float:
         """Return the age of the newest message. Infinite if there is none, or if its stamp tells none."""
-        found = self._newest.get(topic)
-        return inf if found is None else max(0.0, now - found[1])
+        found = self.newest_by_topic.get(topic)
+        return inf if found is None else max(0.0, now - found.at)
 
     def is_stale(self, topic: str, now: float) -> bool:
         """Return True if the newest message should have been followed by another meanwhile."""
@@ -169,50 +178,36 @@ class CarState:
 
     def stale_topics(self, now: float) -> list[str]:
         """Return the topics whose newest message is stale, sorted."""
-        return sorted(topic for topic in self._newest if topic in topics.TOPICS and self.is_stale(topic, now))
-
-    # A message that nobody sent reads as an empty one: its words are empty, its numbers 0.
+        return sorted(topic for topic in self.newest_by_topic if topic in topics.TOPICS and self.is_stale(topic, now))
 
     def last_word(self, topic: str) -> Any:
         """Return the newest message, also of a gateway that has gone since. An empty one if there is none."""
         return self.newest(topic) or _empty(topic)
 
-    @property
-    def link(self) -> Any:
-        """The fleet.v1.Link, of a gateway that is there."""
-        return self.last_word("state/link") if self.present else _empty("state/link")
-
-    @property
-    def mode(self) -> Any:
-        """The fleet.v1.Mode, of a gateway that is there."""
-        return self.last_word("state/mode") if self.present else _empty("state/mode")
-
-    @property
-    def motion(self) -> Any:
-        """The fleet.v1.Motion, of a gateway that is there."""
-        return self.last_word("state/motion") if self.present else _empty("state/motion")
-
-    @property
-    def safety(self) -> Any:
-        """The fleet.v1.Safety, of a gateway that is there."""
-        return self.last_word("state/safety") if self.present else _empty("state/safety")
-
-    @property
-    def health(self) -> Any:
-        """The fleet.v1.Health, of a gateway that is there."""
-        return self.last_word("state/health") if self.present else _empty("state/health")
+    # The states of a gateway that is there, such as a fleet.v1.Link. What nobody said reads as an empty message.
+    link = property(lambda self: self.of("state/link") or _empty("state/link"))
+    mode = property(lambda self: self.of("state/mode") or _empty("state/mode"))
+    motion = property(lambda self: self.of("state/motion") or _empty("state/motion"))
+    safety = property(lambda self: self.of("state/safety") or _empty("state/safety"))
+    health = property(lambda self: self.of("state/health") or _empty("state/health"))
 
     # ------------------------------------------------------------------ what follows from it
 
     def claims(self, now: float) -> CarClaims:
         """Return what is claimed of motors, mode and link. Of a gateway that is gone they are past."""
-        states = {topic: message for topic, (message, _) in self._newest.items()}
+        states = {topic: seen.message for topic, seen in self.newest_by_topic.items()}
         return claims_of(states, {topic: self.age_s(topic, now) for topic in states}, present=self.present)
 
     @property
     def authority(self) -> Authority:
         """Who may do what with it, by the last word of a gateway."""
         return Authority.of(self.last_word("state/safety"))
+
+    @property
+    def driver(self) -> str:
+        """Who drives it: the owner of its motion, or the holder of its lease. Empty: nobody, or only a plan."""
+        lease = self.safety.lease
+        return self.motion.owner or ("" if lease.kind == Rank.COORDINATOR else lease.holder)
 
     @property
     def last_rx_s(self) -> float | None:
@@ -262,8 +257,3 @@ class CarState:
         if not self.link.state:
             return "its gateway is starting"
         return NO_ANSWER
-
-
-@cache
-def _empty(topic: str) -> Any:
-    return messages.message_class(topics.TOPICS[topic].message)()

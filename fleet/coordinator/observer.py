@@ -5,19 +5,18 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, Final
 
+from fleet.client.car_state import CarState
+from fleet.client.reading import age_of_answer_s
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import PersonRank
-from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation, Refusal
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from schemas import keys, messages, topics
 from schemas.authority import NO_PEOPLE, People, PersonRole, binding_pause
 from schemas.bus import Sample
-from schemas.gen import fleet_v1_pb2 as pb
 from schemas.platform_name import AUTO
-from schemas.words import Rank
 
 REQUIRED_TOPICS: Final = ("state/link", "state/mode", "state/motion", "state/safety")
 """The states that could forbid a command. A car is confirmed when all of them are known."""
-_HEALTH: Final = "state/health"
 FORGET_AFTER_S: Final = 60.0
 """Time after which a car without a gateway is forgotten, unless the fleet file or the plan names it."""
 MAX_ABSENT_CARS: Final = 256
@@ -32,7 +31,8 @@ class FleetObserver:
 
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     cars: dict[str, CarSnapshot] = field(default_factory=dict)
-    readings: dict[str, dict[str, Observation]] = field(default_factory=dict)
+    states: dict[str, CarState] = field(default_factory=dict)
+    """What was heard of each car."""
     _absent_since: dict[str, float] = field(default_factory=dict)
     """Unlisted cars without a gateway on the bus; the first to leave stands first."""
     _confirmed: set[str] = field(default_factory=set)
@@ -49,13 +49,12 @@ class FleetObserver:
     @property
     def unconfirmed(self) -> frozenset[str]:
         """The present cars with an unknown state among REQUIRED_TOPICS."""
-        return frozenset(car for car in self.present if not _all_known(self.readings.get(car, {})))
+        return frozenset(car for car in self.present if car not in self.states or not _all_known(self.states[car]))
 
     @property
     def people(self) -> People:
         """The people of the fleet, as far as the gateways know them."""
-        states = (readings.get("state/safety") for readings in self.readings.values())
-        return People.merged(People.of(state.fields.get("people")) for state in states if state is not None)
+        return People.merged(state.authority.people for state in self.states.values())
 
     def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
         """Return a snapshot; `busy`: the cars with a pending command."""
@@ -64,7 +63,9 @@ class FleetObserver:
         unconfirmed = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
         cars.update(list(islice(unconfirmed, MAX_UNCONFIRMED_CARS)))
         cars.update({car: replace(cars[car], busy=True) for car in busy if car in cars})
-        return FleetSnapshot(cars, {car: dict(readings) for car, readings in self.readings.items() if car in cars})
+        return FleetSnapshot(
+            cars, {car: dict(state.newest_by_topic) for car, state in self.states.items() if car in cars}
+        )
 
     def on_token(self, car: str, now: float, *, alive: bool) -> None:
         """Note that a gateway came or went, and drop its car's states: a hold may have changed meanwhile."""
@@ -80,8 +81,9 @@ class FleetObserver:
                 return
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
-        for topic in (*REQUIRED_TOPICS, _HEALTH):
-            self.readings.get(car, {}).pop(topic, None)
+        if (state := self.states.get(car)) is not None:
+            state.present = alive
+            state.forget_states()
 
     def forget(self, now: float, needed: Container[str]) -> None:
         """Forget cars that have been absent for FORGET_AFTER_S, except the `needed`."""
@@ -93,14 +95,13 @@ class FleetObserver:
 
     def _forget(self, car: str) -> None:
         self._confirmed.discard(car)
-        for each in (self.cars, self.readings, self._absent_since):
+        for each in (self.cars, self.states, self._absent_since):
             each.pop(car, None)
 
     def on_sleep(self, slept_s: float) -> None:
         """Let all readings age by a sleep of the computer, which the clock of their times does not count."""
-        for readings in self.readings.values():
-            for topic, reading in readings.items():
-                readings[topic] = replace(reading, at=reading.at - slept_s)
+        for state in self.states.values():
+            state.on_sleep(slept_s)
 
     def on_outcome(self, car: str, refusal: Refusal | None) -> None:
         """Note the refusal of a command, or (None) that one succeeded."""
@@ -119,62 +120,42 @@ class FleetObserver:
             return  # not from a gateway of this version
         if key.car not in self.listed and not self.cars.get(key.car, CarSnapshot()).present:
             self._absent_since.setdefault(key.car, now)
-        at = now
-        if wall_s is not None:
-            at -= max(0.0, wall_s - value.stamp.seconds - value.stamp.nanos / 1e9)
-        readings = self.readings.setdefault(key.car, {})
-        if key.topic in readings and readings[key.topic].at > at:
-            return  # a published message overtook this reply
-        measured = {descriptor.name for descriptor, _ in value.ListFields()}
-        fields = {
-            each.name: getattr(value, each.name)
-            for each in value.DESCRIPTOR.fields
-            if not each.has_presence or each.name in measured
-        }
-        readings[key.topic] = Observation(fields, at)
-        if key.topic in REQUIRED_TOPICS or key.topic == _HEALTH:
-            self._update_states(key.car, readings)
+        state = self.states.get(key.car)
+        if state is None:
+            state = self.states[key.car] = CarState(key.car, self.cars.get(key.car, CarSnapshot()).present)
+        at = now if wall_s is None else now - age_of_answer_s(messages.stamp_ns(value.stamp) / 1e9, wall_s)
+        if state.take(key.topic, value, at) and key.topic.startswith("state/"):
+            self._update(state)
 
-    def _update_states(self, car: str, readings: Mapping[str, Observation]) -> None:
-        before = self.cars.get(car, CarSnapshot())
-        health = readings.get(_HEALTH)
+    def _update(self, state: CarState) -> None:
+        before = self.cars.get(state.car, CarSnapshot())
+        health = state.newest("state/health")
         if health is not None:
-            capabilities: Any = health.fields["capabilities"]
-            before = replace(
-                before,
-                platform=str(health.fields["platform"]),
-                capabilities=before.capabilities if before.listed else frozenset(capabilities),
-            )
-            self.cars[car] = before
-        if not before.present or not _all_known(readings):
+            capabilities = before.capabilities if before.listed else frozenset(health.capabilities)
+            before = replace(before, platform=health.platform, capabilities=capabilities)
+            self.cars[state.car] = before
+        if not before.present or not _all_known(state):
             return
-        self._confirmed.add(car)
-        link, mode, motion, safety = (readings[topic].fields for topic in REQUIRED_TOPICS)
-        hold, lease = safety.get("hold"), safety.get("lease")
-        estops: Any = safety.get("estops") or ()
-        pauses: Any = safety.get("pauses") or ()
-        loan = safety.get("loan")
-        driver = motion["owner"]
-        if not driver and isinstance(lease, pb.Lease) and lease.kind != Rank.COORDINATOR:
-            driver = lease.holder
-        self.cars[car] = replace(
+        self._confirmed.add(state.car)
+        authority, pause = state.authority, binding_pause(state.safety.pauses)
+        self.cars[state.car] = replace(
             before,
-            link=str(link["state"]),
-            mode=str(mode["asked"]),
-            verdict=str(mode["verdict"]),
-            evidence=str(mode["evidence"]),
-            motors=str(safety["motors"]),
-            doubted=health is not None and bool(health.fields["doubted"]),
-            held_by=hold.by if isinstance(hold, pb.Hold) else None,
-            estopped_by=estops[0].by if estops else None,
-            paused_by=binding_pause(pauses).by if pauses else None,
-            lent_to=loan.to if isinstance(loan, pb.Loan) else None,
-            driven_by=str(driver) or None,
+            link=state.link.state,
+            mode=state.mode.asked,
+            verdict=state.mode.verdict,
+            evidence=state.mode.evidence,
+            motors=state.safety.motors,
+            doubted=state.health.doubted,
+            held_by=authority.hold.by if authority.hold else None,
+            estopped_by=authority.estops[0].by if authority.estops else None,
+            paused_by=pause.by if pause else None,
+            lent_to=authority.loan.to if authority.loan else None,
+            driven_by=state.driver or None,
         )
 
 
-def _all_known(readings: Mapping[str, Observation]) -> bool:
-    return all(topic in readings for topic in REQUIRED_TOPICS)
+def _all_known(state: CarState) -> bool:
+    return all(topic in state.newest_by_topic for topic in REQUIRED_TOPICS)
 
 
 def listed_people(file: FleetFile) -> People:

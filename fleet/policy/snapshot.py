@@ -16,12 +16,13 @@ from fleet.conditions import Expression, aliases_of
 from gateway import drivers
 from schemas import messages, topics
 from schemas.car_profile import CarProfile
+from schemas.messages import Observation
 
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 
-def _fields() -> dict[str, tuple[str, str, type]]:
-    result: dict[str, tuple[str, str, type]] = {}
+def _fields() -> dict[str, tuple[str, str, type, bool]]:
+    result: dict[str, tuple[str, str, type, bool]] = {}
     kinds = {FieldDescriptor.CPPTYPE_BOOL: bool, FieldDescriptor.CPPTYPE_STRING: str}
     for name, topic in topics.TOPICS.items():
         if topic.family not in ("sensor", "state"):
@@ -31,32 +32,24 @@ def _fields() -> dict[str, tuple[str, str, type]]:
         for each in descriptors:
             if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
                 kind = kinds.get(each.cpp_type, float)
-                result[f"{name.partition('/')[2]}.{each.name}"] = (name, each.name, kind)
+                result[f"{name.partition('/')[2]}.{each.name}"] = (name, each.name, kind, each.has_presence)
     return result
 
 
 _FIELDS: Final = _fields()
-NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind) in _FIELDS.items()})
+NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind, _) in _FIELDS.items()})
 """The names that a plan's expressions may use (`battery.voltage_v`, `light.left`, `mode.asked`), with their types."""
 ALIASES: Final[Mapping[str, str]] = MappingProxyType(aliases_of(NAMES))
 """Other spellings of NAMES: `voltage_v`, `battery_v`."""
 _STALE_S: Final = {
     topic: math.inf if (after_s := topics.TOPICS[topic].stale_after_s) is None else after_s
-    for topic, _, _ in _FIELDS.values()
+    for topic, *_ in _FIELDS.values()
 }
 
 
 def topic_of(name: str) -> str:
     """Return the topic in which a name of NAMES is published."""
     return _FIELDS[name][0]
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """The measured fields of one reading, and when it came."""
-
-    fields: Mapping[str, object]
-    at: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,13 +141,13 @@ class FleetSnapshot:
             return None
 
         def lookup(name: str) -> object | None:
-            topic, member, _ = _FIELDS[name]
+            topic, member, _, optional = _FIELDS[name]
             observation = seen.get(topic)
-            if observation is None:
+            if observation is None or (not old and now - observation.at > _STALE_S[topic]):
                 return None
-            if not old and now - observation.at > _STALE_S[topic]:
-                return None
-            return observation.fields.get(member)
+            # Once per name of a condition, a thousand times in a step.
+            message = observation.message
+            return None if optional and not message.HasField(member) else getattr(message, member)
 
         return expression.value(lookup)
 
@@ -162,13 +155,12 @@ class FleetSnapshot:
         """Return the readings that an expression uses, each with its value and age, for a person."""
         lines = []
         for name in dict.fromkeys(expression.names):
-            topic, member, _ = _FIELDS[name]
+            topic, member, _, optional = _FIELDS[name]
             observation = self.readings.get(car, {}).get(topic)
-            if observation is None or member not in observation.fields:
+            if observation is None or (optional and not observation.message.HasField(member)):
                 lines.append(f"{car}/{topic} {member} not measured")
             else:
-                age_s = max(0.0, now - observation.at)
-                value = format_reading(observation.fields[member])
+                age_s, value = max(0.0, now - observation.at), format_reading(getattr(observation.message, member))
                 lines.append(f"{car}/{topic} {member}={value} ({age_s:.1f} s old)")
         return tuple(lines)
 

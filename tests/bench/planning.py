@@ -5,9 +5,10 @@ from time import perf_counter
 
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot
 from fleet.policy.state import PolicyState
 from tests.bench.measured import Measured, Scale, in_turns, percentile
+from tests.fleet.policy.cars import observed
 
 CARS = tuple(f"car{number:02}" for number in range(50))
 PLAN = parse(
@@ -33,9 +34,9 @@ def _pictures(count: int) -> list[FleetSnapshot]:
     for number in range(count):
         readings = {
             car: {
-                "sensor/battery": Observation({"voltage_v": 7.4}, number * 0.1),
-                "sensor/light": Observation({"left": number % 3 == 0, "right": False}, number * 0.1),
-                "sensor/range": Observation({"range_m": 0.2}, number * 0.1),
+                "sensor/battery": observed("sensor/battery", number * 0.1, voltage_v=7.4),
+                "sensor/light": observed("sensor/light", number * 0.1, left=number % 3 == 0, right=False),
+                "sensor/range": observed("sensor/range", number * 0.1, range_m=0.2),
             }
             for car in CARS
         }
@@ -62,8 +63,8 @@ def _floor(pictures: list[FleetSnapshot]) -> float:
         for _ in PLAN.rules:
             for car in CARS:
                 reading = seen[car]
-                assert reading["sensor/light"].fields["left"] in (True, False)
-                assert reading["sensor/range"].fields["range_m"] == 0.2
+                assert reading["sensor/light"].message.left in (True, False)
+                assert reading["sensor/range"].message.range_m == 0.2
         took.append(perf_counter() - began)
     return percentile(took, 0.95) * 1e3
 

@@ -14,7 +14,10 @@ from fleet.client.diagnosis import CarEvidence, diagnose
 from fleet.client.reading import MAX_STAMP_AHEAD_S, Reading
 from fleet.commands.observe import row_of
 from fleet.console.car_view import CarView
+from fleet.coordinator.observer import FleetObserver
 from fleet.supervisor.car_status import CarStatus
+from schemas import topics
+from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
 NOW = 1_800_000_000.0
@@ -89,12 +92,20 @@ def test_all_views_of_a_car_agree(name: str) -> None:
     if not case.present:
         row.reset()
     card.on_presence(now, present=case.present)
+    observer = FleetObserver()
+    observer.on_token("red", said_at, alive=True)
+    for topic, message in case.states.items():
+        payload, encoding = message.SerializeToString(), topics.TOPICS[topic].encoding
+        observer.on_sample(Sample(f"fleet/red/{topic}", payload, encoding, 0, 1), said_at, None)
+    if not case.present:
+        observer.on_token("red", now, alive=False)
     asked = CarState.of_answers("red", readings.items(), now, present=case.present)
-    for state in (asked, row.state, card.state):
+    for state in (asked, row.state, card.state, observer.states["red"]):
         assert state.why_missing(now) == case.missing
         assert (state.why_not_ready(now) is None) is (case.missing == "")
         assert (state.is_silent, state.is_unheard) == (case.silent, case.unheard)
         assert state.claims(now).motors.what == case.motors
+    assert observer.cars["red"].motors == (case.motors if case.present else "")
 
     listed, page = row_of("red", readings, present=case.present), card.as_dict(now)
     assert (listed["ready"], listed["unheard"], listed["motors"]) == (not case.missing, case.unheard, case.motors)

@@ -1,6 +1,9 @@
 """The coordinator's observations of cars, its pending queries, and the cars that it forgets."""
 
+from math import inf
+
 import pytest
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS, REQUIRED_TOPICS, FleetObserver
 from fleet.policy.decide import step
@@ -107,7 +110,7 @@ def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgot
         now += TURN_S
     assert most <= MAX_ABSENT_CARS + 3
     assert decisions < 400, "one for each that said how it was (100 did), and what its role says of that"
-    assert observer.cars.keys() == observer.readings.keys() == {"red"}
+    assert observer.cars.keys() == observer.states.keys() == {"red"}
     assert memory.decisions.keys() == {"red", "role scout"}
     assert memory.gone_since.keys() <= {"red"}
 
@@ -121,7 +124,7 @@ def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> No
     for each in REQUIRED_TOPICS:
         observer.on_sample(said(each), 100.0, None)
     observer.on_sample(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 101.0, None)
-    assert set(observer.readings["red"]) == set(REQUIRED_TOPICS)
+    assert set(observer.states["red"].newest_by_topic) == set(REQUIRED_TOPICS)
     assert observer.unconfirmed == set()
 
 
@@ -138,6 +141,55 @@ def test_the_people_are_those_that_any_gateway_knows() -> None:
     assert observer.people == People.parse(["teacher:lead", "ann", "bob:other"])
     observer.on_token("blue", 102.0, alive=False)
     assert observer.people == NO_PEOPLE
+
+
+def test_a_late_hold_of_an_earlier_gateway_keeps_nobody_from_a_car() -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    held = pb.Safety(car="red", boot_id="a", hold=pb.Hold(by="ann"))
+    observer.on_sample(published("state/safety", held), 101.0, None)
+    assert observer.cars["red"].held_by == "ann"
+    for topic in REQUIRED_TOPICS:
+        message = messages.message_class(topics.TOPICS[topic].message)(car="red", boot_id="b")
+        observer.on_sample(published(topic, message), 102.0, None)
+    assert observer.cars["red"].held_by is None
+    observer.on_sample(published("state/safety", held), 102.1, None)
+    assert observer.cars["red"].held_by is None, "the gateway that said so has ended"
+
+
+@pytest.mark.parametrize(
+    ("motion", "safety", "driver", "taken"),
+    [
+        (pb.Motion(owner="mia"), pb.Safety(lease=pb.Lease(holder="jo", kind="person")), "mia", None),
+        (pb.Motion(), pb.Safety(lease=pb.Lease(holder="jo", kind="person")), "jo", None),
+        (pb.Motion(), pb.Safety(lease=pb.Lease(holder="@coordinator", kind="coordinator")), None, None),
+        (pb.Motion(), pb.Safety(loan=pb.Loan(to="bob", by="ann")), None, "bob"),
+        (pb.Motion(), pb.Safety(pauses=[pb.Pause(by="ann")]), None, "ann"),
+    ],
+)
+def test_who_drives_or_keeps_a_car(motion: pb.Motion, safety: pb.Safety, driver: str | None, taken: str | None) -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    observer.on_sample(published("state/motion", motion), 101.0, None)
+    observer.on_sample(published("state/safety", safety), 101.0, None)
+    assert (observer.cars["red"].driven_by, observer.cars["red"].taken_by) == (driver, taken)
+
+
+def test_a_message_may_come_before_its_gateways_token() -> None:
+    observer = FleetObserver()
+    observer.on_sample(said("sensor/range"), 100.0, None)
+    come(observer, "red", 101.0)
+    observer.on_sample(published("state/mode", pb.Mode(car="red", asked="tracking")), 102.0, None)
+    assert observer.cars["red"].mode == "tracking"
+
+
+def test_an_answer_whose_stamp_is_far_ahead_is_stale() -> None:
+    observer = FleetObserver()
+    for ahead_s, at in ((9.0, 100.0), (11.0, -inf)):
+        message = pb.Range(car="red", stamp=Timestamp(seconds=int(1e9 + ahead_s)))
+        observer.states.clear()
+        observer.on_sample(published("sensor/range", message), 100.0, 1e9)
+        assert observer.states["red"].newest_by_topic["sensor/range"].at == at
 
 
 def test_a_token_that_names_no_car_is_ignored() -> None:

@@ -28,7 +28,7 @@ def test_the_coordinator_lets_its_readings_age_by_a_sleep(monkeypatch: pytest.Mo
         come(observer, "red", 100.0)
         observer.on_sample(said("sensor/range"), 100.0, None)
         one._check_sleep(observer, 100.1)
-        assert observer.readings["red"]["sensor/range"].at == 100.0
+        assert observer.states["red"].newest_by_topic["sensor/range"].at == 100.0
         slept_s[0] += 3600.0
         one._check_sleep(observer, 100.2)
-        assert observer.readings["red"]["sensor/range"].at == 100.0 - aged_s
+        assert observer.states["red"].newest_by_topic["sensor/range"].at == 100.0 - aged_s

@@ -5,15 +5,21 @@ from typing import Any
 
 from fleet.policy.decide import DecisionStep, step
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot
 from fleet.policy.state import PolicyState
+from schemas import messages, topics
+from schemas.messages import Observation
 
 HERE = CarSnapshot(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
 GONE = CarSnapshot()
 
 
-def seen(at: float, **topics: dict[str, Any]) -> dict[str, Observation]:
-    return {f"sensor/{name}": Observation(fields, at) for name, fields in topics.items()}
+def observed(topic: str, at: float, **fields: Any) -> Observation:
+    return Observation(messages.message_class(topics.TOPICS[topic].message)(**fields), at)
+
+
+def seen(at: float, **readings: dict[str, Any]) -> dict[str, Observation]:
+    return {f"sensor/{name}": observed(f"sensor/{name}", at, **fields) for name, fields in readings.items()}
 
 
 class PolicyRun:

@@ -7,8 +7,8 @@ import pytest
 
 from fleet.policy.decision import DecisionKind
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import Observation, Refusal
-from tests.fleet.policy.cars import HERE, PolicyRun
+from fleet.policy.snapshot import Refusal
+from tests.fleet.policy.cars import HERE, PolicyRun, observed
 from tests.support.vectors import rows
 
 SCOUT = parse("""
@@ -59,13 +59,15 @@ def _last(case: str) -> PolicyRun:
     """Return a coordinator that has made the decision."""
     run = PolicyRun(SCOUT, "red", obey=False)
     run.memory = replace(run.memory, started_at=0.0)
-    run.readings["red"] = {} if "not known" in case else {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
+    run.readings["red"] = (
+        {} if "not known" in case else {"sensor/battery": observed("sensor/battery", 9.5, voltage_v=7.4)}
+    )
     if "too low" in case or case == "role lacks a car":
-        run.readings["red"] = {"sensor/battery": Observation({"voltage_v": 6.8}, 9.5)}
+        run.readings["red"] = {"sensor/battery": observed("sensor/battery", 9.5, voltage_v=6.8)}
     match case:
         case "in place of another" | "no place left" | "role lacks a car" | "rule gives a role" | "rule gives a mode":
             run.cars["blue"] = HERE
-            run.readings["blue"] = {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
+            run.readings["blue"] = {"sensor/battery": observed("sensor/battery", 9.5, voltage_v=7.4)}
             run.cars["red"] = replace(HERE, mode="tracking")
     match case:
         case "in place of another":
@@ -76,9 +78,9 @@ def _last(case: str) -> PolicyRun:
             run.change("blue", mode="tracking")
         case "rule gives a role" | "rule gives a mode":
             for at in (7.5, 8.4):
-                run.readings["red"]["sensor/light"] = Observation({"left": True}, at)
+                run.readings["red"]["sensor/light"] = observed("sensor/light", at, left=True)
                 run.at(at)
-            run.readings["red"]["sensor/light"] = Observation({"left": True}, 9.5)
+            run.readings["red"]["sensor/light"] = observed("sensor/light", 9.5, left=True)
         case "role lacks a car":
             run.cars["blue"] = replace(HERE, present=False)
         case "role filled again":
@@ -90,7 +92,7 @@ def _last(case: str) -> PolicyRun:
             run.change("red", present=False, mode="")
         case "contradicted":
             run.change("red", mode="tracking")
-            run.readings["red"] = {"sensor/battery": Observation({"voltage_v": 7.4}, 7.5)}
+            run.readings["red"] = {"sensor/battery": observed("sensor/battery", 7.5, voltage_v=7.4)}
             run.at(8.0)
     run.change("red", **CHANGES.get(case, {}))
     run.at(10.0)
@@ -108,9 +110,9 @@ def _phase(case: str) -> PolicyRun:
     run = PolicyRun(PHASES, "red")
     run.at(0.0)
     if case == "phase by condition":
-        run.readings["red"] = {"sensor/light": Observation({"left": True}, 9.5)}
+        run.readings["red"] = {"sensor/light": observed("sensor/light", 9.5, left=True)}
     elif case == "phase by rule":
-        run.readings["red"] = {"state/motion": Observation({"fan": True}, 9.5)}
+        run.readings["red"] = {"state/motion": observed("state/motion", 9.5, fan=True)}
     if case != "phase at the start":
         run.at(30.0 if case == "phase by time-out" else 10.0)
     return run
@@ -201,7 +203,7 @@ def _in_vain() -> PolicyRun:
 def _passed_over() -> PolicyRun:
     run = PolicyRun(PASSED_OVER, "red", "pi")
     run.change("pi", platform="raspberry_pi")
-    run.readings["red"] = {"sensor/light": Observation({"left": True}, 0.0)}
+    run.readings["red"] = {"sensor/light": observed("sensor/light", 0.0, left=True)}
     run.at(0.0)
     return run
 
