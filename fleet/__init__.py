@@ -1,6 +1,7 @@
 """Several cars from one laptop: drive, watch, record and replay them.
 
-`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin. `Session` is a recording.
+`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin. `Session` is a recording,
+`Catalog` answers questions about all of them.
 """
 
 # `fleet` handles Ctrl-C only after this module is imported, and `typing` would take longer than all the rest.
@@ -17,9 +18,11 @@ if TYPE_CHECKING:
     from fleet.client.outcome import NotCarriedOut as NotCarriedOut
     from fleet.client.outcome import Outcome as Outcome
     from fleet.client.reading import Reading as Reading
+    from fleet.recording.catalog import Catalog as Catalog
     from fleet.recording.reading.session import Session as Session
 
 _HOME: Final = {
+    "Catalog": "fleet.recording.catalog",
     "Fleet": "fleet.client.client",
     "LeaseLost": "fleet.client.outcome",
     "NotCarriedOut": "fleet.client.outcome",

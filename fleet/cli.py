@@ -110,6 +110,7 @@ COMMANDS: Final = {
         "play": ("fleet.commands.play:play", "Publish a session again, for your own programs."),
         "sessions": ("fleet.commands.sessions:sessions", "List, verify, repair, cut and export."),
         "find": ("fleet.commands.find:find", "When a condition held, in all sessions."),
+        "query": ("fleet.commands.query:query", "SQL over the tables of all sessions."),
     },
 }
 """Subcommands by heading: function and line in `fleet --help`."""
@@ -118,7 +119,7 @@ _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (whe
 
 _EXTRAS: Final = {
     **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
-    **dict.fromkeys(("pyarrow", "pandas", "matplotlib"), "analysis"),
+    **dict.fromkeys(("duckdb", "pyarrow", "pandas", "matplotlib"), "analysis"),
     **dict.fromkeys(("starlette", "uvicorn", "cryptography", "segno", "ifaddr"), "console"),
     "bleak": "ble",
 }

@@ -19,6 +19,7 @@ WITHOUT_BUS: Final = frozenset(
         "init",
         "plan try",
         "play",
+        "query",
         "replay",
         "scan",
         "schema",

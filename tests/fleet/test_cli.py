@@ -179,6 +179,7 @@ WITHOUT_BUS = (
     "play",
     "record",
     "find",
+    "query",
 )
 """Subcommands without a bus, with the bus of the file, or with options in their own subcommands."""
 

@@ -22,7 +22,7 @@ from schemas import keys, messages
 from schemas.topics import PROTOBUF, TOPICS
 
 TIMESTAMP: Final = "google.protobuf.Timestamp"
-_UNIT_NAMES: Final = {"1": "", "B": "bytes"}
+_UNIT_NAMES: Final = {"1": "", "B": "bytes", "m/s": "m_s"}
 _UNITS_BY_MESSAGE: Final[Mapping[str, Mapping[str, str]]] = {topic.message: topic.units for topic in TOPICS.values()}
 
 

@@ -8,10 +8,11 @@ import re
 from collections.abc import Callable
 from enum import StrEnum
 
-from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, Session, aio, conditions
+from fleet import Catalog, LeaseLost, NotCarriedOut, Outcome, Reading, Session, aio, conditions
 from fleet.client import client, reading, wait
 from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
+from fleet.recording.catalog import BadQuery
 from fleet.recording.reading.session import NoSession
 from fleet.recording.tools.analysis import NoTable
 from fleet.recording.tools.table_formats import FormatMissing
@@ -37,6 +38,7 @@ _CLASSES: tuple[tuple[str, type], ...] = (
     ("Reading", Reading),
     ("Watch", reading.Watch),
     ("Session", Session),
+    ("Catalog", Catalog),
 )
 _ERRORS = (
     NotCarriedOut,
@@ -49,6 +51,7 @@ _ERRORS = (
     bus.BusError,
     NoSession,
     NoTable,
+    BadQuery,
     FormatMissing,
 )
 _HIDDEN = {"do", "ask", "call", "begin", "expression"}
@@ -67,7 +70,7 @@ def reference() -> str:
     parts = [_HEAD]
     for name, each in _CLASSES:
         parts.append(f"## {name}\n\n{_text(each)}\n")
-        if each in (client.Fleet, Session):
+        if each in (client.Fleet, Session, Catalog):
             parts.append(f"### `{name}{_signature(inspect.getattr_static(each, '__init__'))}`\n")
         parts.append("\n".join(_attributes(each)))
         parts += [_method(each, method) for method in _methods(each)]
