@@ -22,6 +22,12 @@ class Observation:
 
     message: Any
     at: float
+    earlier: "tuple[Observation, ...]" = ()
+    """Those before it, as far as somebody looks at them; the newest last."""
+
+    def aged(self, by_s: float) -> "Observation":
+        """Return the same, so much older."""
+        return Observation(self.message, self.at - by_s, tuple(each.aged(by_s) for each in self.earlier))
 
 
 class BadPayload(ValueError):

@@ -26,6 +26,7 @@ from typing import Any, Final, Self
 
 from fleet.client.claims import CarClaims, claims_of
 from fleet.client.reading import Reading, age_of_answer_s
+from fleet.conditions.functions import KEPT_READINGS
 from schemas import messages, topics
 from schemas.authority import Authority
 from schemas.messages import Observation
@@ -119,7 +120,8 @@ class CarState:
             if self._boot_id not in ("", boot_id):
                 self.forget_states()
             self._boot_id = boot_id
-        self.newest_by_topic[topic] = Observation(message, at)
+        earlier = () if before is None or KEPT_READINGS == 1 else (*before.earlier, replace(before, earlier=()))
+        self.newest_by_topic[topic] = Observation(message, at, earlier[1 - KEPT_READINGS :])
         return True
 
     def on_presence(self, *, present: bool) -> None:
@@ -139,7 +141,7 @@ class CarState:
     def on_sleep(self, slept_s: float) -> None:
         """Let all messages age by a sleep of the computer, which the clock of their times does not count."""
         for topic, seen in self.newest_by_topic.items():
-            self.newest_by_topic[topic] = replace(seen, at=seen.at - slept_s)
+            self.newest_by_topic[topic] = seen.aged(slept_s)
 
     def forget_states(self) -> None:
         """Forget what its gateway has said of it. Readings stay: they are of the car."""
