@@ -1,4 +1,4 @@
-"""Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read. No bus here."""
+"""Message classes by name, their encodings and JSON (that any Zenoh tool can read), and observations. No bus here."""
 
 import json
 from dataclasses import dataclass

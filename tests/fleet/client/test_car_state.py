@@ -117,6 +117,15 @@ def test_all_views_of_a_car_agree(name: str) -> None:
     assert ("no_gateway" in found) is not case.present
 
 
+@pytest.mark.parametrize("old", ["state/link", "state/safety"])
+def test_with_one_stale_state_a_car_is_not_ready(old: str) -> None:
+    state = CarState("red")
+    for topic, message in (("state/link", ONLINE), ("state/safety", OFF)):
+        state.take(topic, message, 0.0 if topic == old else 10.0)
+    assert (state.why_not_ready(10.0), state.why_missing(10.0)) == ("", NO_ANSWER)
+    assert state.stale_topics(10.0) == [old]
+
+
 def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came() -> None:
     def answered(ahead_s: float) -> CarState:
         reading = Reading.of("fleet/red/state/link", pb.Link(state="online", stamp=_stamp(NOW + ahead_s)), 0)
