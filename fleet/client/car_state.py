@@ -118,7 +118,7 @@ class CarState:
                 return False
             boot_id = message.boot_id or self._boot_id
             if self._boot_id not in ("", boot_id):
-                self.forget_states()
+                self._forget_states()
             self._boot_id = boot_id
         earlier = () if before is None or KEPT_READINGS == 1 else (*before.earlier, replace(before, earlier=()))
         self.newest_by_topic[topic] = Observation(message, at, earlier[1 - KEPT_READINGS :])
@@ -127,7 +127,7 @@ class CarState:
     def on_presence(self, *, present: bool) -> None:
         """Note that the car's gateway is on the bus, or not. One that has come back says again what is so."""
         if present and not self.present:
-            self.forget_states()
+            self._forget_states()
         self.present = present
 
     def on_gateway_end(self, running: str = "") -> None:
@@ -143,7 +143,7 @@ class CarState:
         for topic, seen in self.newest_by_topic.items():
             self.newest_by_topic[topic] = seen.aged(slept_s)
 
-    def forget_states(self) -> None:
+    def _forget_states(self) -> None:
         """Forget what its gateway has said of it. Readings stay: they are of the car."""
         for topic in [each for each in self.newest_by_topic if each.startswith("state/")]:
             del self.newest_by_topic[topic]
