@@ -145,7 +145,7 @@ class CarState:
 
     def _forget_states(self) -> None:
         """Forget what its gateway has said of it. Readings stay: they are of the car."""
-        for topic in [each for each in self.newest_by_topic if each.startswith("state/")]:
+        for topic in self.states():
             del self.newest_by_topic[topic]
 
     # ------------------------------------------------------------------ what is known
@@ -159,10 +159,9 @@ class CarState:
         """Return the newest message. None if there is none, or if its gateway has gone since."""
         return self.newest(topic) if self.present else None
 
-    @property
-    def has_states(self) -> bool:
-        """True if any state of its gateway is known."""
-        return any(topic.startswith("state/") for topic in self.newest_by_topic)
+    def states(self) -> list[str]:
+        """Return the topics of the states that its gateway has said."""
+        return [topic for topic in self.newest_by_topic if topic.startswith("state/")]
 
     def fresh(self, topic: str, now: float) -> Any:
         """Return the newest message. None if there is none, or if it is stale."""
