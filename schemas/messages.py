@@ -1,4 +1,4 @@
-"""Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read. No bus here."""
+"""Message classes by name, their encodings and JSON (that any Zenoh tool can read), and observations. No bus here."""
 
 import json
 from dataclasses import dataclass
@@ -22,6 +22,12 @@ class Observation:
 
     message: Any
     at: float
+    earlier: "tuple[Observation, ...]" = ()
+    """Those before it, as far as somebody looks at them; the newest last."""
+
+    def aged(self, by_s: float) -> "Observation":
+        """Return the same, so much older."""
+        return Observation(self.message, self.at - by_s, tuple(each.aged(by_s) for each in self.earlier))
 
 
 class BadPayload(ValueError):

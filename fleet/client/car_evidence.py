@@ -48,6 +48,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
             recording=recording,
             assignment=assignment,
             coordinated=coordinated,
+            asked=True,
         )
         for car in sorted({*present, *processes})
     }

@@ -26,6 +26,7 @@ from typing import Any, Final, Self
 
 from fleet.client.claims import CarClaims, claims_of
 from fleet.client.reading import Reading, age_of_answer_s
+from fleet.conditions.functions import KEPT_READINGS
 from schemas import messages, topics
 from schemas.authority import Authority
 from schemas.messages import Observation
@@ -117,15 +118,16 @@ class CarState:
                 return False
             boot_id = message.boot_id or self._boot_id
             if self._boot_id not in ("", boot_id):
-                self.forget_states()
+                self._forget_states()
             self._boot_id = boot_id
-        self.newest_by_topic[topic] = Observation(message, at)
+        earlier = () if before is None or KEPT_READINGS == 1 else (*before.earlier, replace(before, earlier=()))
+        self.newest_by_topic[topic] = Observation(message, at, earlier[1 - KEPT_READINGS :])
         return True
 
     def on_presence(self, *, present: bool) -> None:
         """Note that the car's gateway is on the bus, or not. One that has come back says again what is so."""
         if present and not self.present:
-            self.forget_states()
+            self._forget_states()
         self.present = present
 
     def on_gateway_end(self, running: str = "") -> None:
@@ -139,11 +141,11 @@ class CarState:
     def on_sleep(self, slept_s: float) -> None:
         """Let all messages age by a sleep of the computer, which the clock of their times does not count."""
         for topic, seen in self.newest_by_topic.items():
-            self.newest_by_topic[topic] = replace(seen, at=seen.at - slept_s)
+            self.newest_by_topic[topic] = seen.aged(slept_s)
 
-    def forget_states(self) -> None:
+    def _forget_states(self) -> None:
         """Forget what its gateway has said of it. Readings stay: they are of the car."""
-        for topic in [each for each in self.newest_by_topic if each.startswith("state/")]:
+        for topic in self.states():
             del self.newest_by_topic[topic]
 
     # ------------------------------------------------------------------ what is known
@@ -157,10 +159,9 @@ class CarState:
         """Return the newest message. None if there is none, or if its gateway has gone since."""
         return self.newest(topic) if self.present else None
 
-    @property
-    def has_states(self) -> bool:
-        """True if any state of its gateway is known."""
-        return any(topic.startswith("state/") for topic in self.newest_by_topic)
+    def states(self) -> list[str]:
+        """Return the topics of the states that its gateway has said."""
+        return [topic for topic in self.newest_by_topic if topic.startswith("state/")]
 
     def fresh(self, topic: str, now: float) -> Any:
         """Return the newest message. None if there is none, or if it is stale."""

@@ -60,6 +60,8 @@ class CarEvidence:
     """The roles of the plan (fleet.v1.Assignment)."""
     coordinated: bool = False
     """True if a coordinator is on the bus."""
+    asked: bool = False
+    """True if the states are answers. Then a gateway answers, also one that says old things, such as a replay."""
 
     @property
     def failed(self) -> list[tuple[float, Any]]:
@@ -116,7 +118,8 @@ def _absent(e: CarEvidence) -> str:
 
 
 def _hung(e: CarEvidence) -> str:
-    if e.state.has_states or not e.state.present:
+    said = [topic for topic in e.state.states() if e.asked or not e.state.is_stale(topic, e.now)]
+    if said or not e.state.present:
         return ""
     return "Its gateway is on the bus and does not answer. It may hang."
 

@@ -11,7 +11,8 @@ from typing import Final
 
 import click
 
-from fleet.client.claims import CarClaim, motors_claim
+from fleet.client.car_state import CarState
+from fleet.client.claims import CarClaim
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
@@ -102,10 +103,11 @@ def _people(client: Fleet, cars: Sequence[str]) -> tuple[dict[str, list[str]], d
 
     Empty `cars`: all cars.
     """
-    found, motors = {}, {}
+    found, motors, now = {}, {}, time.time()
     for car in cars or ["*"]:
         for reading in client.get(f"{car}/state/safety") if car == "*" or keys.is_name(car) else ():
-            motors[reading.car] = motors_claim(reading.value, reading.age_s())
+            state = CarState.of_answers(reading.car, [("state/safety", reading)], now, present=True)
+            motors[reading.car] = state.claims(now).motors
             deeds = [f"{words}; `{todo}` ends it" for words, todo in describe_people(reading.car, reading.value)]
             if deeds:
                 found[reading.car] = deeds

@@ -1,8 +1,8 @@
 """Conditions as people write them: `range_m < 0.3 and not light.left`. The command line, the SDK and plans use them.
 
 The caller defines the names and looks up their values; no text is executed. A comparison with a value that was not
-measured is unknown (Kleene's logic). Read `expression` (the tree) first, then `parser`, `fields` (names from messages)
-and `satisfiability` (conditions that can never be true).
+measured is unknown (Kleene's logic). Read `expression` (the tree) first, then `parser`, `fields` (names from messages),
+`functions` (of fields, a row for each) and `satisfiability` (conditions that can never be true).
 """
 
 from fleet.conditions.expression import Expression, Lookup

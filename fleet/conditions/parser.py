@@ -7,7 +7,7 @@ words:      in quotes, 'low' or "low", and nothing is escaped in them
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Never
@@ -46,10 +46,16 @@ class BadExpression(ValueError):
         self.words = words
 
 
-def parse(text: str, names: Mapping[str, type], aliases: Mapping[str, str] = MappingProxyType({})) -> Expression:
+def parse(
+    text: str,
+    names: Mapping[str, type],
+    aliases: Mapping[str, str] = MappingProxyType({}),
+    functions: Collection[str] = (),
+) -> Expression:
     """Parse a condition over these names (of type float, int, str or bool); raises BadExpression.
 
-    `aliases`: other spellings of names, each with the name that it stands for.
+    `aliases`: other spellings of names, each with the name that it stands for. `functions`: those that may be applied
+    to a number.
     """
     if len(text) > MAX_CONDITION_LENGTH:
         raise BadExpression(
@@ -57,7 +63,7 @@ def parse(text: str, names: Mapping[str, type], aliases: Mapping[str, str] = Map
             MAX_CONDITION_LENGTH + 1,
             f"it is too long: {len(text)} characters, allowed are {MAX_CONDITION_LENGTH}",
         )
-    tree = Expression(_Parser(text, names, aliases).parse_all())
+    tree = Expression(_Parser(text, names, aliases, functions).parse_all())
     if len(str(tree)) > MAX_CONDITION_LENGTH:
         raise BadExpression(
             text, 1, f"it is too long when its numbers are written out: allowed are {MAX_CONDITION_LENGTH} characters"
@@ -91,10 +97,13 @@ class _Parser:
     # `ast.parse` would save nothing: columns of parentheses and of missing operands, names with dots and words without
     # escapes need these tokens anyway.
 
-    def __init__(self, text: str, names: Mapping[str, type], aliases: Mapping[str, str]) -> None:
+    def __init__(
+        self, text: str, names: Mapping[str, type], aliases: Mapping[str, str], functions: Collection[str]
+    ) -> None:
         self._text = text
         self._names = names
         self._aliases = aliases
+        self._functions = functions
         self._tokens = list(self._tokenize())
         self._at = 0
         self._depth = 0
@@ -198,6 +207,8 @@ class _Parser:
         if token.kind == "name":
             if token.text in ("true", "false"):
                 return Literal(token.text == "true")
+            if token.text in self._functions and self._take("("):
+                return self._parse_call(token.text)
             name = self._aliases.get(token.text, token.text)
             return Name(name, self._kind_of_name(token, name), token.text if token.text != name else "")
         if token.text == "(":
@@ -216,6 +227,16 @@ class _Parser:
         if not isinstance(tree, Name | Literal):
             self._check_condition(opening, tree)
         return tree
+
+    def _parse_call(self, function: str) -> Name:
+        """Parse the rest of `rate(range_m)`. It is a name: a number that somebody else knows."""
+        token = self._next
+        field = None if token.text in self._functions else self._parse_operand()
+        if not isinstance(field, Name) or field.kind is not ValueKind.NUMBER:
+            self._fail(token, f"{function} takes a field that is a number")
+        if not self._take(")"):
+            self._fail(self._next, f"the ( of {function} is not closed")
+        return Name(f"{function}({field.name})", ValueKind.NUMBER, f"{function}({field})" if field.written else "")
 
     def _parse_number(self, token: _Token) -> int | float:
         if re.fullmatch(r"[+-]?[0-9]+", token.text):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind, names_in
+from fleet.conditions.functions import FUNCTIONS, split_call
 from schemas import topics
 
 _MAX_ALTERNATIVES: Final = 512
@@ -43,7 +44,10 @@ def explain_impossible(expression: Expression, of: str = "") -> str:
     if is_contradictory(expression):
         return f"{expression} is never true"
     for name in dict.fromkeys(names_in(expression.root)):
+        function, _ = split_call(name.name)
         words, limits = _DOMAINS.get(f"{of}.{name.name}" if of else name.name, ((), None))
+        if function:
+            limits = FUNCTIONS[function].range
         if words:
             allowed: Node = Or(tuple(Compare(name, Op.EQ, Literal(word)) for word in words))
             domain = f"one of {', '.join(words)}"

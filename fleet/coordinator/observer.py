@@ -82,8 +82,9 @@ class FleetObserver:
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         if (state := self.states.get(car)) is not None:
-            state.present = alive
-            state.forget_states()
+            # Whoever comes counts anew: a recording that is played in a loop has its gateways again.
+            readings = {topic: each for topic, each in state.newest_by_topic.items() if topic.startswith("sensor/")}
+            self.states[car] = CarState(car, alive, readings)
 
     def forget(self, now: float, needed: Container[str]) -> None:
         """Forget cars that have been absent for FORGET_AFTER_S, except the `needed`."""

@@ -5,7 +5,7 @@ observer.py fills the snapshot, decide.py decides by it.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
 from typing import Any, Final
@@ -13,6 +13,7 @@ from typing import Any, Final
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions import Expression, aliases_of
+from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
 from gateway import drivers
 from schemas import messages, topics
 from schemas.car_profile import CarProfile
@@ -21,8 +22,42 @@ from schemas.messages import Observation
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 
-def _fields() -> dict[str, tuple[str, str, type, bool]]:
-    result: dict[str, tuple[str, str, type, bool]] = {}
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """What a name of an expression stands for: a field of a topic, or a function of it."""
+
+    topic: str
+    member: str
+    kind: type
+    optional: bool
+    function: ConditionFunction | None = None
+
+    def value(self, seen: Observation) -> Any:
+        """Return its value. None if it was not measured."""
+        if self.function is not None:
+            readings = ((each.at, self._measured(each)) for each in (*seen.earlier, seen))
+            return self.function.evaluate([(at, value) for at, value in readings if value is not None])
+        return self._measured(seen)
+
+    def _measured(self, seen: Observation) -> Any:
+        if self.optional and not seen.message.HasField(self.member):
+            return None
+        return getattr(seen.message, self.member)
+
+
+class _Fields(dict[str, _Field]):
+    """The fields by name. A function of one is added when a plan names it."""
+
+    def __missing__(self, name: str) -> _Field:
+        function, field_name = split_call(name)
+        if not function:
+            raise KeyError(name)
+        found = self[name] = replace(self[field_name], function=FUNCTIONS[function])
+        return found
+
+
+def _fields() -> _Fields:
+    result = _Fields()
     kinds = {FieldDescriptor.CPPTYPE_BOOL: bool, FieldDescriptor.CPPTYPE_STRING: str}
     for name, topic in topics.TOPICS.items():
         if topic.family not in ("sensor", "state"):
@@ -32,24 +67,24 @@ def _fields() -> dict[str, tuple[str, str, type, bool]]:
         for each in descriptors:
             if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
                 kind = kinds.get(each.cpp_type, float)
-                result[f"{name.partition('/')[2]}.{each.name}"] = (name, each.name, kind, each.has_presence)
+                result[f"{name.partition('/')[2]}.{each.name}"] = _Field(name, each.name, kind, each.has_presence)
     return result
 
 
 _FIELDS: Final = _fields()
-NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind, _) in _FIELDS.items()})
+NAMES: Final[Mapping[str, type]] = MappingProxyType({name: each.kind for name, each in _FIELDS.items()})
 """The names that a plan's expressions may use (`battery.voltage_v`, `light.left`, `mode.asked`), with their types."""
 ALIASES: Final[Mapping[str, str]] = MappingProxyType(aliases_of(NAMES))
 """Other spellings of NAMES: `voltage_v`, `battery_v`."""
 _STALE_S: Final = {
-    topic: math.inf if (after_s := topics.TOPICS[topic].stale_after_s) is None else after_s
-    for topic, *_ in _FIELDS.values()
+    each.topic: math.inf if (after_s := topics.TOPICS[each.topic].stale_after_s) is None else after_s
+    for each in _FIELDS.values()
 }
 
 
 def topic_of(name: str) -> str:
-    """Return the topic in which a name of NAMES is published."""
-    return _FIELDS[name][0]
+    """Return the topic of a name of NAMES, or of a function of one."""
+    return _FIELDS[name].topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,13 +176,12 @@ class FleetSnapshot:
             return None
 
         def lookup(name: str) -> object | None:
-            topic, member, _, optional = _FIELDS[name]
-            observation = seen.get(topic)
-            if observation is None or (not old and now - observation.at > _STALE_S[topic]):
+            what = _FIELDS[name]
+            observation = seen.get(what.topic)
+            if observation is None or (not old and now - observation.at > _STALE_S[what.topic]):
                 return None
-            # Once per name of a condition, a thousand times in a step.
-            message = observation.message
-            return None if optional and not message.HasField(member) else getattr(message, member)
+            value: object = what.value(observation)
+            return value
 
         return expression.value(lookup)
 
@@ -155,13 +189,15 @@ class FleetSnapshot:
         """Return the readings that an expression uses, each with its value and age, for a person."""
         lines = []
         for name in dict.fromkeys(expression.names):
-            topic, member, _, optional = _FIELDS[name]
-            observation = self.readings.get(car, {}).get(topic)
-            if observation is None or (optional and not observation.message.HasField(member)):
-                lines.append(f"{car}/{topic} {member} not measured")
+            what = _FIELDS[name]
+            observation = self.readings.get(car, {}).get(what.topic)
+            value = None if observation is None else what.value(observation)
+            text = f"{what.function.name}({what.member})" if what.function is not None else what.member
+            if observation is None or value is None:
+                lines.append(f"{car}/{what.topic} {text} not measured")
             else:
-                age_s, value = max(0.0, now - observation.at), format_reading(getattr(observation.message, member))
-                lines.append(f"{car}/{topic} {member}={value} ({age_s:.1f} s old)")
+                age_s = max(0.0, now - observation.at)
+                lines.append(f"{car}/{what.topic} {text}={format_reading(value)} ({age_s:.1f} s old)")
         return tuple(lines)
 
 

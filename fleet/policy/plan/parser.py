@@ -6,6 +6,7 @@ from typing import Final
 
 from fleet.conditions import BadExpression, Expression
 from fleet.conditions import parse as parse_expression
+from fleet.conditions.functions import FUNCTIONS
 from fleet.policy.plan.models import (
     BlinkEntry,
     Condition,
@@ -249,7 +250,7 @@ class _PlanParser:
 
     def _expression(self, where: Where, text: str) -> Expression:
         try:
-            return parse_expression(text, NAMES, ALIASES)
+            return parse_expression(text, NAMES, ALIASES, FUNCTIONS)
         except BadExpression as error:
             self._report(where, error.words)
             return parse_expression("false", NAMES)

@@ -10,7 +10,7 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.client.car_state import NEVER_HEARD, NO_ANSWER, CarState
-from fleet.client.diagnosis import CarEvidence, diagnose
+from fleet.client.diagnosis import CHECKS, CarEvidence, diagnose
 from fleet.client.reading import MAX_STAMP_AHEAD_S, Reading
 from fleet.commands.observe import row_of
 from fleet.console.car_view import CarView
@@ -112,9 +112,20 @@ def test_all_views_of_a_car_agree(name: str) -> None:
     is_old = case.age_s > 3.0
     assert ("state/safety" in listed["stale"]) is is_old
     assert page["motors"]["state"] == ("unknown" if is_old else case.motors)
-    found = {each.code for each in diagnose(CarEvidence(asked, now))}
+    found = {each.code for each in diagnose(CarEvidence(asked, now, asked=True))}
     assert ("silent" in found, "link_down" in found) == (case.silent, case.link.state == "lost")
     assert ("no_gateway" in found) is not case.present
+    hangs = next(check.cause(CarEvidence(CarState("red"), now)) for check in CHECKS if check.code == "gateway_hung")
+    assert any(hangs in each for each in card.diagnose(now)["findings"]) is is_old
+
+
+@pytest.mark.parametrize("old", ["state/link", "state/safety"])
+def test_with_one_stale_state_a_car_is_not_ready(old: str) -> None:
+    state = CarState("red")
+    for topic, message in (("state/link", ONLINE), ("state/safety", OFF)):
+        state.take(topic, message, 0.0 if topic == old else 10.0)
+    assert (state.why_not_ready(10.0), state.why_missing(10.0)) == ("", NO_ANSWER)
+    assert state.stale_topics(10.0) == [old]
 
 
 def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came() -> None:

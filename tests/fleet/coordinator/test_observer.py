@@ -155,6 +155,9 @@ def test_a_late_hold_of_an_earlier_gateway_keeps_nobody_from_a_car() -> None:
     assert observer.cars["red"].held_by is None
     observer.on_sample(published("state/safety", held), 102.1, None)
     assert observer.cars["red"].held_by is None, "the gateway that said so has ended"
+    come(observer, "red", 103.0)
+    observer.on_sample(published("state/safety", held), 103.0, None)
+    assert observer.cars["red"].held_by == "ann", "a recording is played again"
 
 
 @pytest.mark.parametrize(

@@ -200,6 +200,33 @@ def test_the_table_fits_and_names_every_car(width: int) -> None:
     assert "obstacle_av" in green
 
 
+def test_the_table_names_who_keeps_or_drives_a_car_and_says_the_last_word_of_a_gateway_that_ended() -> None:
+    spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
+    supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
+    row = supervisor.rows["red"] = CarStatus("red")
+    console = Console(file=io.StringIO(), width=200)
+
+    def line() -> str:
+        with console.capture() as shown:
+            console.print(Table(supervisor, console).rendered())
+        return next(each for each in shown.get().splitlines() if each.startswith("red"))
+
+    row.take("sensor/battery", pb.Battery(voltage_v=7.94, level="ok"), 0.0)
+    leased = pb.Safety(motors="off", motors_basis="sent", lease=pb.Lease(holder="mia@laptop-1"))
+    row.take("state/safety", leased, 0.0)
+    assert {"mia", "(sent)", "7.94"} <= set(line().split())
+    row.take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), 1.0)
+    assert "7.42 V critical" in line()
+    leased.hold.by = "ann@laptop-1"
+    row.take("state/safety", leased, 1.0)
+    assert "hold ann" in line()
+    leased.estops.add(id="e1", by="bob")
+    row.take("state/safety", leased, 2.0)
+    row.reset()
+    assert "e-stop e1" in line()
+    assert "(sent)" not in line(), "nobody claims it now"
+
+
 @pytest.mark.parametrize(
     ("width", "columns"),
     [

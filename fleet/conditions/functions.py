@@ -1,0 +1,39 @@
+"""The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. One row is all that one needs.
+
+To conditions `rate(range.range_m)` is a name like any other, with the range of its row; the snapshot evaluates it. A
+message alone has no past, so `watch`, `wait` and `find` know no functions. There are none yet.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Final, TypeAlias
+
+Measured: TypeAlias = Sequence[tuple[float, float]]
+"""Times (s, of one clock) and values of the newest readings that measured a field, the newest last."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionFunction:
+    """One row: a number from a field that is a number. A field is its only argument."""
+
+    name: str
+    evaluate: Callable[[Measured], float | None]
+    """Returns its value. None: not known."""
+    readings: int = 1
+    """Number of the newest readings that it needs."""
+    range: tuple[float, float] = (-inf, inf)
+    """Lowest and highest value, by which a condition can be found impossible."""
+
+
+ROWS: Final[tuple[ConditionFunction, ...]] = ()
+FUNCTIONS: Final = {row.name: row for row in ROWS}
+"""The functions by name."""
+KEPT_READINGS: Final = max((row.readings for row in ROWS), default=1)
+"""Number of the newest readings of each topic that a function may look at."""
+
+
+def split_call(name: str) -> tuple[str, str]:
+    """Return function and field of a name: (`rate`, `range.range_m`) of `rate(range.range_m)`, else ("", name)."""
+    function, _, rest = name.partition("(")
+    return (function, rest[:-1]) if rest else ("", name)
