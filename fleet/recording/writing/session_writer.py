@@ -14,17 +14,16 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
-from google.protobuf.message import DecodeError
 
 from fleet.recording import session_dir
 from fleet.recording.sequence_tracker import SequenceTracker
-from fleet.recording.stop_count import EVENTS, StopCount
+from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
 from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, free_bytes, shortage
 from fleet.recording.writing.retention import Quota
+from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
-from schemas import messages
 from schemas.bus import sequence_of
 
 MAX_BUFFERED_MESSAGES: Final = 100_000
@@ -34,7 +33,6 @@ MAX_SEGMENTS: Final = 9990
 """Maximum segments of a session: their names have four digits."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
-_EVENT_CLASS: Final = messages.message_class(EVENTS.message)
 
 
 class Sync(StrEnum):
@@ -58,25 +56,6 @@ class Options:
     reserve: Reserve = field(default_factory=Reserve)
     copied: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
     """Files to copy into each session, by their names there."""
-
-
-class KeyState:
-    """Counters of one key and encoding in one segment."""
-
-    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "tracker")
-
-    def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
-        self.key = key
-        self.encoding = encoding
-        self.tracker = tracker
-        self.channel = channel
-        self.count = self.first = self.final = 0
-        self.has_events = messages.name_in(str(encoding)) == EVENTS.message
-        """True for the events of commands, in which stops are counted."""
-
-
-_BufferedRow = tuple[KeyState, int, bytes, int, int]
-"""State of the key, receive time, payload, publish time, sequence."""
 
 
 class SessionWriter:
@@ -119,7 +98,7 @@ class SessionWriter:
         self._stops = StopCount()
         self._unended = 0
         """Rows at the begin of the buffer that are in a segment whose end a full disk did not take."""
-        self._unflushed: list[_BufferedRow] = []
+        self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
         self._open(now_ns, self._options.reserve.to_begin)
 
@@ -184,7 +163,7 @@ class SessionWriter:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
 
-    def _write(self, row: _BufferedRow) -> None:
+    def _write(self, row: Row) -> None:
         self._unflushed.append(row)
         if self.full:
             self._limit_buffer()
@@ -193,13 +172,11 @@ class SessionWriter:
 
     def _key_state(self, key: str, encoding: zenoh.Encoding) -> KeyState:
         """Return the state of a key and an encoding. A key has a second state only if its encoding changes."""
-        words = str(encoding)
-        state = self._states_by_encoding.get((key, words))
+        state = self._counts.find(key, encoding)
         if state is None:
-            channel = -1 if self.full or self._segment is None else self._segment.channel(key, words)
+            channel = -1 if self.full or self._segment is None else self._segment.channel(key, str(encoding))
             state = KeyState(key, encoding, self._trackers.setdefault(key, SequenceTracker()), channel)
-            self._states_by_encoding[key, words] = state
-        self._states[key] = state
+            self._counts.add(state)
         return state
 
     # ------------------------------------------------------------------ status
@@ -279,7 +256,7 @@ class SessionWriter:
             self._try_to_finish()
         if self._segment is not None:
             self._segment.cut()
-            if self._index and not any(state.count for state in self._states_by_encoding.values()):
+            if self._index and self._counts.is_empty:
                 self._segment.path.unlink(missing_ok=True)  # an empty one
             else:
                 self._add_to_index()
@@ -340,9 +317,9 @@ class SessionWriter:
         return True
 
     def _reset_segment(self, now_ns: int) -> None:
-        self._states: dict[str, KeyState] = {}
-        self._states_by_encoding: dict[tuple[str, str], KeyState] = {}
-        self._segment_started_ns, self._first_ns, self._last_ns = now_ns, 0, 0
+        self._counts = SegmentCounts()
+        self._states = self._counts.states
+        self._segment_started_ns = now_ns
         self._segment: Segment | None = None
 
     def _begin_segment(self, now_ns: int) -> None:
@@ -368,19 +345,7 @@ class SessionWriter:
         self._unended = 0
         if not rows:
             return
-        first_ns, last_ns = rows[0][1], rows[-1][1]
-        if last_ns - first_ns < 0 or first_ns < self._last_ns:  # the clock went back
-            first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
-        self._first_ns = min(self._first_ns or first_ns, first_ns)
-        self._last_ns = max(self._last_ns, last_ns)
-        for state, _, payload, _, sequence in rows:
-            if not state.count:
-                state.first = sequence
-            if state.has_events:
-                with contextlib.suppress(DecodeError):  # any program can publish there
-                    self._stops.add(_EVENT_CLASS.FromString(payload))
-            state.count += 1
-            state.final = sequence
+        self._counts.count(rows, self._stops)
         self._written += len(rows)
 
     def _try_to_finish(self) -> None:
@@ -401,15 +366,7 @@ class SessionWriter:
     def _add_to_index(self) -> None:
         """Add the closed segment to index.json."""
         assert self._segment is not None
-        counts: dict[str, dict[str, int]] = {}
-        for state in self._states_by_encoding.values():
-            if state.count:
-                known = counts.setdefault(state.key, {"count": 0, "first": state.first, "last": 0})
-                known["count"] += state.count
-                known["last"] = state.final
-        entry = {"file": self._segment.path.name, "bytes": self._segment.bytes, "keys": counts}
-        entry |= {"first_ns": self._first_ns, "last_ns": self._last_ns}
-        self._index.append({**entry, "messages": sum(each["count"] for each in counts.values())})
+        self._index.append(self._counts.entry(self._segment.path.name, self._segment.bytes))
         self._closed_bytes += self._segment.bytes
         self._segment = None
         with contextlib.suppress(OSError):  # a cache; session.json is written again at the end
@@ -467,7 +424,7 @@ class SessionWriter:
         rows, self._unflushed = self._unflushed, []
         return self._drop_all(rows)
 
-    def _drop_all(self, rows: Sequence[_BufferedRow]) -> int:
+    def _drop_all(self, rows: Sequence[Row]) -> int:
         for state, *_ in rows:
             self.drop(state.key)
         return len(rows)
@@ -501,7 +458,7 @@ class SessionWriter:
             self._unflushed += rest
             self._pause(f"{len(self._unflushed)} waiting messages need more space")
 
-    def _write_buffered(self, keep_bytes: int) -> list[_BufferedRow]:
+    def _write_buffered(self, keep_bytes: int) -> list[Row]:
         """Write the buffer while this much stays free, and return the rest."""
         rows, self._unflushed = self._unflushed, []
         done = size = 0
