@@ -12,9 +12,9 @@ from typing import Final
 import zenoh
 
 from fleet.client.client import Fleet
-from fleet.coordinator.car_commands import CarCommands
 from fleet.coordinator.inbox import Inbox, Item, QueriedSample
 from fleet.coordinator.observer import FleetObserver
+from fleet.coordinator.open_commands import OpenCommands
 from fleet.coordinator.other_coordinators import declare_alone, yield_to_another
 from fleet.coordinator.publications import Publications, assignment_message, decision_message, in_force
 from fleet.coordinator.requests import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
@@ -72,12 +72,12 @@ class Coordinator:
     """Commands that came before that."""
     _inbox: Inbox = field(init=False)
     _publications: Publications = field(init=False)
-    _commands: CarCommands = field(init=False)
+    _commands: OpenCommands = field(init=False)
 
     def __post_init__(self) -> None:
         self._inbox = Inbox(self.client, lambda: {"state/*", *(topic_of(name) for name in self.plan.names)})
         self._publications = Publications(self.client, self.on_failure)
-        self._commands = CarCommands(self.client, self.on_failure)
+        self._commands = OpenCommands(self.client, self.on_failure)
 
     def run(self, has_ended: Callable[[], bool]) -> None:
         """Coordinate until `has_ended()`; raises AnotherCoordinator. The cars keep their modes afterwards."""

@@ -9,7 +9,7 @@ from fleet.client.outcome import Outcome
 from fleet.policy.decide import Ask
 
 
-class CarCommands:
+class OpenCommands:
     """The open commands of one coordinator. Tells each new failure once."""
 
     def __init__(self, client: Fleet, on_failure: Callable[[str], None]) -> None:
