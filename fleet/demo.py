@@ -27,6 +27,7 @@ from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
+from schemas.process.ending import end
 from schemas.process.parent import parent_option
 from schemas.suggestion import how_to_install
 from schemas.words import Basis, LinkState, Mode, Motion, Motors, Platform, Rank, Verdict
@@ -395,12 +396,7 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
     try:
         yield process
     finally:
-        if process.poll() is None:
-            process.terminate()
-        try:
-            process.wait(PROCESS_EXIT_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        if not end(process, PROCESS_EXIT_TIMEOUT_S):
             run.check(f"{name} ends", f"it did not within {PROCESS_EXIT_TIMEOUT_S:g} s and was killed", ok=False)
         reader.join()
         for pipe in (process.stdin, process.stdout, process.stderr):

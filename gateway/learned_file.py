@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from schemas.atomic_file import write_atomically
+from schemas.atomic_file import DAMAGE, write_state
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ class LearnedFile:
             return use(dict(content["learned"]))
         except FileNotFoundError:
             return use({})
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (OSError, *DAMAGE) as error:
             self.trouble = f"{self.path} is damaged ({type(error).__name__}), so it does not count"
             return use({})
 
@@ -47,6 +47,5 @@ class LearnedFile:
         text = json.dumps(self._owner | {"learned": learned})
         if text == self._saved:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, text.encode())
+        write_state(self.path, text)
         self._saved = text

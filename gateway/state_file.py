@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gateway.control.safety import PersistedSafety
-from schemas.atomic_file import write_atomically
+from schemas.atomic_file import DAMAGE, write_state
 from schemas.authority import Estop, FleetPause, Hold, Loan
 from schemas.process.stdio import printable
 from schemas.words import Rank
@@ -61,7 +61,7 @@ class SafetyStateFile:
             state, others = _parse(content, now_ns), tuple(_parse_others(content, now_ns))
             # Files of older versions name no link: they are of the only car of that name.
             link = _text(content.get("link", self._link))
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        except DAMAGE:
             return self._unreadable("", now_ns)
         if link != self._link:
             others, state = _exchanged(others, state, was=link, now=self._link)
@@ -73,8 +73,7 @@ class SafetyStateFile:
     def save(self, state: PersistedSafety) -> None:
         """Replace the file atomically; raise OSError."""
         content = asdict(state) | {"link": self._link, "others": [asdict(each) for each in self._others]}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, json.dumps(content).encode(), sync=True)
+        write_state(self.path, json.dumps(content), sync=True)
 
     def _unreadable(self, why: str, now_ns: int) -> PersistedSafety:
         words = f"the state file {self.path} is unreadable{why}: the car is on hold until somebody resumes it"

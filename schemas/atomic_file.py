@@ -1,8 +1,12 @@
-"""Writes files atomically: readers see the old file or the whole new one, never a part."""
+"""Writes files atomically: readers see the old file or the whole new one, never a part. State files are such files."""
 
 import contextlib
 import os
 from pathlib import Path
+from typing import Final
+
+DAMAGE: Final = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
+"""What reading a JSON file of ours raises if somebody else has written into it."""
 
 
 def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bool = False) -> None:
@@ -27,3 +31,9 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bo
         with contextlib.suppress(OSError):
             scratch.unlink()
         raise
+
+
+def write_state(path: Path, text: str, *, sync: bool = False, private: bool = False) -> None:
+    """Write a state file, whose directory may be missing. As `write_atomically`, which it uses."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text.encode(), sync=sync, private=private)

@@ -6,11 +6,12 @@ A kind is a class here and a row in `KINDS`; `gateway.link` has its bytes, under
 import os.path
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import combinations
-from typing import ClassVar, Final, Protocol
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Protocol
 from urllib.parse import SplitResult, parse_qs, quote, unquote, urlsplit
 
 from schemas.suggestion import how_to_install, nearest
@@ -51,10 +52,10 @@ class Look(Protocol):
         """Look for a host, and not at a port whose car would take harm."""
 
 
+@dataclass(frozen=True, slots=True)
 class LinkUrl(ABC):
     """A link: how it is written, and what is known of it before it is opened. Its text is its URL."""
 
-    __slots__ = ()
     scheme: ClassVar[str]
     forms: ClassVar[tuple[str, ...]]
     """How it is written, for the help."""
@@ -66,6 +67,8 @@ class LinkUrl(ABC):
     needs: ClassVar[str] = ""
     harm: ClassVar[str] = ""
     """What opening and closing it may do to a car, in words. Empty if nothing."""
+    same_car: ClassVar[Mapping[str, Any]] = {}
+    """Options that do not tell cars apart, as they are if left out."""
 
     @classmethod
     @abstractmethod
@@ -93,10 +96,6 @@ class LinkUrl(ABC):
         """Yield the keys of all links that may name the port of this one."""
         yield self.port_key
 
-    def without_options(self) -> "LinkUrl":
-        """Return the link without the options that do not tell cars apart."""
-        return self
-
     def check(self, look: Look) -> tuple[bool, str]:  # noqa: ARG002 - Bluetooth cannot be looked at
         """Return whether a car may be there, with the words. Nothing is opened that could move, reset or end a car."""
         if missing := self.missing():
@@ -112,8 +111,9 @@ class _SerialLine(LinkUrl):
     """A serial port, named in one of two ways."""
 
     __slots__ = ()
-    scheme = "serial"
     baud: int
+    scheme = "serial"
+    same_car = MappingProxyType({"baud": BAUD})
 
     @classmethod
     def parse(cls, text: str) -> "LinkUrl | None":
@@ -147,10 +147,6 @@ class SerialUrl(_SerialLine):
         # Resolve symlinks such as those in /dev/serial/by-id. On Windows, COM3 and com3 are one port.
         device = self.path.upper() if _WINDOWS_PORT.fullmatch(self.path) else os.path.realpath(self.path)
         return ("device", device, frozenset())
-
-    def without_options(self) -> LinkUrl:
-        """Return the link without the option that does not tell cars apart."""
-        return replace(self, baud=BAUD)
 
     def check(self, look: Look) -> tuple[bool, str]:
         """Look at it as far as nothing is opened."""
@@ -189,10 +185,6 @@ class UsbUrl(_SerialLine):
         for count in range(1, len(ids) + 1):
             for fewer in combinations(sorted(ids), count):
                 yield (kind, where, frozenset(fewer))
-
-    def without_options(self) -> LinkUrl:
-        """Return the link without the option that does not tell cars apart."""
-        return replace(self, baud=BAUD)
 
     def check(self, look: Look) -> tuple[bool, str]:
         """Look at it as far as nothing is opened."""
@@ -269,6 +261,7 @@ class BleUrl(LinkUrl):
     name: str | None = None
     adapter: str | None = None
     scheme = "ble"
+    same_car = MappingProxyType({"adapter": None})
     forms = ("ble://ADDRESS or ble://name=BT04",)
     options = ", both also with ?adapter=hci1 or auto"
     module, extra, needs = "bleak", "ble", "Bluetooth"
@@ -289,10 +282,6 @@ class BleUrl(LinkUrl):
         """The port that it names."""
         return ("ble", self.address or "", frozenset() if self.name is None else frozenset({("name", self.name)}))
 
-    def without_options(self) -> LinkUrl:
-        """Return the link without the option that does not tell cars apart."""
-        return replace(self, adapter=None)
-
     def __str__(self) -> str:
         adapter = "" if self.adapter is None else f"?adapter={self.adapter}"
         module = self.address if self.name is None else f"name={quote(self.name, safe='')}"
@@ -309,7 +298,7 @@ LINK_HELP_OPTIONS: Final = "".join(kind.options for kind in KINDS)
 
 def car_link(url: LinkUrl) -> str:
     """Return the text of a link without the options that do not tell cars apart: baud rate and adapter."""
-    return str(url.without_options())
+    return str(replace(url, **url.same_car))
 
 
 def parse_link(text: str) -> LinkUrl:

@@ -28,7 +28,7 @@ from fleet.fleetfile.models import validate_link
 from fleet.fleetfile.scan import FoundLink
 from fleet.links import may_be_same, parse_fleet_link
 from fleet.supervisor.temporary_gateway import temporary_gateway
-from schemas.links import TcpUrl
+from schemas.links import parse_link
 from schemas.process import signals
 from schemas.words import LinkVerdict
 from schemas.yaml_document.document import BadFile, read_text
@@ -81,8 +81,8 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
 
 
 def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
-    link = parse_fleet_link(found.url)
-    if isinstance(link, TcpUrl):
+    link = parse_link(found.url)
+    if link.harm:
         return False
     return not any(may_be_same(link, parse_fleet_link(car.link)) for car in fleet.cars.values())
 

@@ -9,8 +9,9 @@ import click
 from fleet.client.client import Fleet, default_sender
 from fleet.commands.group import starter_option
 from fleet.commands.options import bus_options, json_option
-from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinator
+from fleet.coordinator.coordinator import Coordinator
 from fleet.coordinator.observer import listed_cars, listed_people
+from fleet.coordinator.other_coordinators import SENDER, AnotherCoordinator
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
 from fleet.policy.plan.lint import find_faults

@@ -139,22 +139,21 @@ def run(
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
+    from fleet.recording.writing.disk_space import Reserve
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
+    from fleet.recording.writing.retention import Quota
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
-    if session_size and quota and session_size > quota // 2:
-        raise click.UsageError(
-            f"--session-size: {session_size / 10**6:g} MB is more than half of --quota: at most "
-            f"{quota / 2 / 10**6:g} MB are allowed, because the quota removes whole sessions"
-        )
+    limits = Quota(quota or 0, session_size or 0)
+    if limits.refusal:
+        raise click.UsageError(limits.refusal)
     options = Options(
         segment_bytes=segment_size,
         segment_s=segment_time,
         sync=Sync(sync),
-        session_bytes=session_size or 0,
-        root_bytes=quota or 0,
-        keep_free_bytes=keep_free,
+        quota=limits,
+        reserve=Reserve(keep_free),
         copied={name: path for name, path in copied.items() if path is not None},
     )
     parent = watched_pid(starter)

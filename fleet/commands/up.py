@@ -24,7 +24,7 @@ from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
-from fleet.recording.writing.session_writer import Options, why_unwritable
+from fleet.recording.writing.disk_space import Reserve
 from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
@@ -126,7 +126,7 @@ def up(
         endpoint = resolve_endpoint(spec.endpoint)
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)
-        if spec.record and (why := why_unwritable(spec.recordings, Options())):
+        if spec.record and (why := Reserve().why_unwritable(spec.recordings)):
             raise click.ClickException(
                 f"No session can be made in {spec.recordings}: {why}. "
                 "Name another place with --sessions, or drive without a recording: --no-record."

@@ -24,12 +24,11 @@ from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
+from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
 from fleet.console.permissions import management_refusal, rights_of
-from fleet.console.plan_checks import PlanChecks
-from fleet.console.plan_process import PlanProcess
-from fleet.console.plan_view import PlanView, coordinator_topic
+from fleet.console.plan_feed import PlanFeed
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
@@ -37,8 +36,6 @@ from fleet.console.requests import BadPageMessage, PageMessage
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
-from fleet.policy.requests import PlanRequest
-from schemas import keys
 from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
@@ -58,8 +55,6 @@ KEPT_FOR_THIS_COMPUTER: Final = 8
 STOP_ANSWER_TIMEOUT_S: Final = 1.0
 """Timeout for the first answer to a STOP by POST. Of fifty gateways on two busy cores, the last takes 0.11 s."""
 _MAX_EVENTS: Final = 4096
-MAX_PLOT_S: Final = 600
-"""Maximum time that a plot shows, s."""
 _MAX_MERGES: Final = 256
 """Number of remembered merges of stops, by person and cars."""
 _MAX_STOP_IDS: Final = 256
@@ -103,23 +98,30 @@ class Console:
         self._stops = 0
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
-        self.plan_checks = PlanChecks()
-        self._plan_process = PlanProcess(fleet, file)
-        self._coordinators: set[str] = set()
-        """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
-        self._inspections = Inspections(fleet, self._view.look_up)
-        self._plots = PlotFeed(fleet)
-        self._plan = PlanView()
-        self._plan_samples: Handover[Sample] = Handover(
-            asyncio.get_running_loop(), self._on_plan_sample, limit=_MAX_EVENTS, newest=True
-        )
+        self.plan = PlanFeed(fleet, file, self.operator, self.sender_of, self.management_refusal)
+        self._plots = PlotFeed(fleet, self.operator.spawn)
+        self._feeds: Sequence[PageFeed] = (self._plots, Inspections(fleet, self._view.look_up), self.plan)
         self._statuses: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_status, limit=_MAX_EVENTS, newest=True
         )
         self._events: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_event, limit=_MAX_EVENTS, newest=True
         )
+        self._handlers: dict[str, Handler] = {
+            "echo": self._on_echo,
+            "press": self._on_press,
+            "release": self._on_release,
+            Verb.STOP: lambda page, message: self.stop_all(message.text("id"), page.operator),
+            Verb.ESTOP: self._on_estop,
+            Verb.PAUSE: self._on_pause,
+            Verb.UNPAUSE: self._on_unpause,
+            "take": self._on_take,
+            "give_back": self._on_give_back,
+            "do": self._on_command,
+        }
+        for feed in self._feeds:
+            self._handlers |= feed.messages
 
     # ------------------------------------------------------------------ the bus
 
@@ -132,17 +134,8 @@ class Console:
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
-        bus.subscribe(f"{name}/{keys.COORDINATOR}/*", self._plan_samples)
         bus.subscribe(f"{name}/{SUPERVISOR_STATUS.name}", self._statuses)
-        loop = asyncio.get_running_loop()
-
-        def on_token(token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-            change = self._coordinators.add if alive else self._coordinators.discard
-            with suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(change, token)
-
-        await self._fleet.call(bus.watch_tokens, f"{name}/{keys.COORDINATOR}", on_token)
-        self.operator.spawn(self._read_plan())
+        await self.plan.begin()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
             tasks.create_task(self._renew_leases())
@@ -170,11 +163,6 @@ class Console:
         self._readings(sample.key, sample)
         self._plots.on_sample(sample)
 
-    async def _read_plan(self) -> None:
-        """Read what the coordinator published before the console started."""
-        for reading in await self._fleet.get(f"{self._fleet.sync.name}/{keys.COORDINATOR}/*"):
-            self._plan.on_message(coordinator_topic(reading.key, self._fleet.sync.name), reading.value)
-
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
         next_at = loop.time()
@@ -193,14 +181,8 @@ class Console:
             if self._pages:
                 self._show("state", self._state(now))
                 self._show_rights()
-            self._plots.take_samples()
-            for page in self._pages.values():
-                self._plots.send(page)
-            for number, text in self._inspections.texts().items():
-                self._pages[number].show("inspection", text)
-            if self._plan.changed:
-                self._plan.changed = False
-                self._show("plan", self._plan_text())
+            for feed in self._feeds:
+                feed.tick(self._pages)
             next_at = max(next_at + TICK_INTERVAL_S, loop.time())
             await asyncio.sleep(next_at - loop.time())
 
@@ -229,13 +211,6 @@ class Console:
         for page in self._pages.values():
             page.show(kind, text)
 
-    def _plan_text(self) -> str:
-        return json.dumps({"t": "plan", **self._plan.as_dict()}, separators=(",", ":"))
-
-    def _on_plan_sample(self, sample: Sample) -> None:
-        if (found := message_in(sample, logging.WARNING)) is not None:
-            self._plan.on_message(coordinator_topic(sample.key, self._fleet.sync.name), found[1])
-
     def _take_readings(self, now: float) -> None:
         for sample in self._readings.take().values():
             if (found := message_in(sample, logging.WARNING)) is not None:
@@ -254,8 +229,6 @@ class Console:
             )  # fmt: skip
         if self._report is not None:
             self._report.on_presence(present)
-        token = f"{self._fleet.sync.name}/{keys.COORDINATOR}"
-        self._plan.on_presence(running=token in self._coordinators)
 
     def _state(self, now: float) -> str:
         report = self._report
@@ -352,15 +325,16 @@ class Console:
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
         names = {"sender": operator.sender, "fleet": self._fleet.sync.name}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), plottable=plottable())
-        page.show("plan", self._plan_text())
+        for feed in self._feeds:
+            feed.on_page(page)
         return page
 
     def remove_page(self, page: PageLink) -> None:
         """Remove a page that has gone, and stop the cars that it drives."""
         if page.number not in self._pages:
             return
-        self._inspections.end(page.number)
-        self._plots.end(page.number)
+        for feed in self._feeds:
+            feed.end(page.number)
         for press in self._presses.drop_client(page.number):
             self._end(press, "The page has gone.")
         self._count(page, page.operator.release_leases(page.number))
@@ -376,18 +350,6 @@ class Console:
             if shown is not None:
                 log.warning("%s", shown)
             page.answer(t="bad", words=str(error))
-
-    async def set_plan(self, text: str, person: PagePerson | None) -> tuple[bool, str]:
-        """Put a plan in force for this person. Return whether it is, and words, or the faults, one per line.
-
-        If no plan runs, the console starts a coordinator. Raises TooManyChecks.
-        """
-        sender = self.sender_of(person)
-        ok, words = await self.plan_checks.check(text, person and person.name)
-        if not ok:
-            return ok, words
-        ask = partial(self.operator.ask_coordinator, "plan", text, sender)
-        return await self._plan_process.set_plan(text, ask)
 
     def stop_all(
         self, stop_id: str, operator: ConsoleOperator | None = None, request: CommandRequest | None = None
@@ -459,66 +421,55 @@ class Console:
             cars = () if message.kind == Verb.UNPAUSE else message.cars()
             if words := self._command_refusal(page, cars, now):
                 raise BadPageMessage(words)
-        match message.kind:
-            case "echo":
-                press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)
-                if press is not None:
-                    page.operator.renew_press(press, now)
-            case "press":
-                self._on_press(page, message, now)
-            case "release":
-                released = self._presses.release(page.number, message.number("press"))
-                if released is not None:
-                    page.operator.end_press(released)
-            case Verb.STOP:
-                self.stop_all(message.text("id"), page.operator)
-            case Verb.ESTOP:
-                why = message.text("why", MAX_REASON_LENGTH)
-                self.stop_all(message.text("id"), page.operator, estop_request(why, Scope.FLEET))
-            case Verb.PAUSE:
-                why = message.text("why", MAX_REASON_LENGTH)
-                if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
-                    raise BadPageMessage(refused)  # it stops no car, so it ends no press
-                self.stop_all(message.text("id"), page.operator, pause_request(why))
-            case Verb.UNPAUSE:
-                unpause = plain_request(Verb.UNPAUSE)
-                self._count(page, page.operator.command(unpause, None, self._answer_to(page, message)))
-            case "take":
-                taking = page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
-                self._count(page, taking)
-            case "give_back":
-                self._end_all(
-                    self._presses.drop_cars_of(set(message.cars()), page.person.name), "The car was given back."
-                )
-                giving = page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
-                self._count(page, giving)
-            case "inspect":
-                self._inspections.begin(page.number, message.cars()[0])
-            case "inspect_end":
-                self._inspections.end(page.number)
-            case "plot":
-                since_s = float(min(message.number("since_s"), MAX_PLOT_S))
-                self.operator.spawn(self._plots.begin(page.number, message.series(), since_s))
-            case "plan":
-                request_id, verb = message.number("id"), message.one_of("verb", frozenset(PlanRequest))
-                if words := self.management_refusal(page.person):
-                    page.answer(t="plan_done", id=request_id, ok=False, words=words)
-                else:
-                    page.operator.spawn(self._ask_coordinator(page, request_id, verb))
-            case "do":
-                request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
-                if request.verb in STOPS:
-                    self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
-                    who = (page.operator.sender, request.verb)
-                    self._waiting_stops.setdefault(who, []).append((cars, answer))
-                    self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
-                else:
-                    if request.verb == Verb.MODE:
-                        theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
-                        self._end_all(theirs, "The car is in a mode.")
-                    self._count(page, page.operator.command(request, cars, answer))
-            case kind:
-                raise BadPageMessage(f"unknown message {kind!r}")
+        handle = self._handlers.get(message.kind)
+        if handle is None:
+            raise BadPageMessage(f"unknown message {message.kind!r}")
+        handle(page, message)
+
+    def _on_echo(self, page: PageLink, message: PageMessage) -> None:
+        now = time.monotonic()
+        press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)
+        if press is not None:
+            page.operator.renew_press(press, now)
+
+    def _on_release(self, page: PageLink, message: PageMessage) -> None:
+        released = self._presses.release(page.number, message.number("press"))
+        if released is not None:
+            page.operator.end_press(released)
+
+    def _on_estop(self, page: PageLink, message: PageMessage) -> None:
+        why = message.text("why", MAX_REASON_LENGTH)
+        self.stop_all(message.text("id"), page.operator, estop_request(why, Scope.FLEET))
+
+    def _on_pause(self, page: PageLink, message: PageMessage) -> None:
+        why = message.text("why", MAX_REASON_LENGTH)
+        if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
+            raise BadPageMessage(refused)  # it stops no car, so it ends no press
+        self.stop_all(message.text("id"), page.operator, pause_request(why))
+
+    def _on_unpause(self, page: PageLink, message: PageMessage) -> None:
+        answer = self._answer_to(page, message)
+        self._count(page, page.operator.command(plain_request(Verb.UNPAUSE), None, answer))
+
+    def _on_take(self, page: PageLink, message: PageMessage) -> None:
+        self._count(page, page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message)))
+
+    def _on_give_back(self, page: PageLink, message: PageMessage) -> None:
+        self._end_all(self._presses.drop_cars_of(set(message.cars()), page.person.name), "The car was given back.")
+        self._count(page, page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message)))
+
+    def _on_command(self, page: PageLink, message: PageMessage) -> None:
+        request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
+        if request.verb in STOPS:
+            self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
+            who = (page.operator.sender, request.verb)
+            self._waiting_stops.setdefault(who, []).append((cars, answer))
+            self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
+            return
+        if request.verb == Verb.MODE:
+            theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
+            self._end_all(theirs, "The car is in a mode.")
+        self._count(page, page.operator.command(request, cars, answer))
 
     def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
         """Count a command to these cars. Return why it is not sent, empty if it is."""
@@ -538,11 +489,8 @@ class Console:
             self.budgets.on_command_begun(device)
             command.add_done_callback(lambda _: self.budgets.on_command_ended(device))
 
-    async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
-        ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
-        page.answer(t="plan_done", id=request_id, ok=ok, words=words)
-
-    def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
+    def _on_press(self, page: PageLink, message: PageMessage) -> None:
+        now = time.monotonic()
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()
         before, person = self._presses.current(page.number), page.person.name
         if not self._fleet.sync.bus.connected:
@@ -594,6 +542,5 @@ class Console:
         for press in self._presses.alive:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
-        await self.plan_checks.close()
-        await self._plan_process.close()
+        await self.plan.close()
         await self.sessions.close()

@@ -3,20 +3,23 @@
 import asyncio
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fleet.aio import Fleet
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import CarView
 from fleet.console.frame_log import FrameLog
+from fleet.console.page_feed import Handler, PageFeed
+from fleet.console.page_link import PageLink
+from fleet.console.requests import PageMessage
 from schemas import keys
 from schemas.bus import Handover, Sample
 
 _MAX_QUEUED_FRAMES = 1024
 
 
-class Inspections:
+class Inspections(PageFeed):
     """Which page inspects which car."""
 
     def __init__(self, fleet: Fleet, view_of: Callable[[str], CarView]) -> None:
@@ -26,9 +29,14 @@ class Inspections:
         self._logs: dict[str, FrameLog] = {}
         self._subscriptions: dict[str, Any] = {}
 
-    def begin(self, page: int, car: str) -> None:
+    @property
+    def messages(self) -> Mapping[str, Handler]:
+        """Begin and end to inspect a car."""
+        return {"inspect": self._begin, "inspect_end": lambda page, _: self.end(page.number)}
+
+    def _begin(self, page: PageLink, message: PageMessage) -> None:
         """Show a car to a page, instead of the car before."""
-        self._cars[page] = car
+        car = self._cars[page.number] = message.cars()[0]
         if car not in self._logs:
             self._logs[car] = FrameLog()
             frames = Handover[Sample](asyncio.get_running_loop(), self._on_frame, limit=_MAX_QUEUED_FRAMES, newest=True)
@@ -41,10 +49,11 @@ class Inspections:
         if self._cars.pop(page, None) is not None:
             self._forget()
 
-    def texts(self) -> dict[int, str]:
-        """Return the message for each page."""
+    def tick(self, pages: Mapping[int, PageLink]) -> None:
+        """Show each page its car."""
         by_car = {car: self._text(car) for car in self._logs}
-        return {page: by_car[car] for page, car in self._cars.items()}
+        for page, car in self._cars.items():
+            pages[page].show("inspection", by_car[car])
 
     def _text(self, car: str) -> str:
         view = self._view_of(car)

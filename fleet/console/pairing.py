@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal, Self
 
 from schemas import keys
+from schemas.backoff import backoff_s
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.words import Rank
@@ -201,8 +202,7 @@ class GuessLimit:
         count, last = self._guessers.get(address, (0, now))
         if count < FREE_GUESSES or now - last >= GUESS_MEMORY_S:
             return 0.0
-        delay = min(2.0 ** min(count - FREE_GUESSES, 32), MAX_GUESS_DELAY_S)
-        return max(0.0, last + delay - now)
+        return max(0.0, last + backoff_s(count - FREE_GUESSES + 1, 1.0, MAX_GUESS_DELAY_S) - now)
 
     def on_wrong(self, address: str, now: float) -> int:
         """Count a wrong code. Return the number of those of this address."""

@@ -12,11 +12,11 @@ import sys
 from asyncio.subprocess import PIPE, Process
 from collections import Counter
 from collections.abc import Hashable
-from contextlib import suppress
 from typing import Final
 
 from fleet.console.budgets import MAX_OPEN_CHECKS
 from fleet.policy.plan.parser import BadPlan, parse
+from schemas.process.ending import kill
 
 PLAN_CHECK_TIMEOUT_S: Final = 20.0
 """Timeout of a check. The largest plan takes 0.14 s, at the lowest share of a busy processor ten times that, and the
@@ -92,7 +92,7 @@ class PlanChecks:
             return ok, words
         finally:
             if not answered:
-                _kill(process)
+                kill(process)
 
     async def _start(self) -> Process:
         command = (sys.executable, "-m", "fleet.console.plan_checks")
@@ -103,7 +103,7 @@ class PlanChecks:
     def _kill(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            _kill(process)
+            kill(process)
 
     async def close(self) -> None:
         """End the process."""
@@ -111,13 +111,8 @@ class PlanChecks:
             self._idle.cancel()
         self._kill()
         for each in self._started:
-            _kill(each)
+            kill(each)
             await each.wait()
-
-
-def _kill(process: Process) -> None:
-    with suppress(ProcessLookupError):
-        process.kill()
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any, Final
 
 from fleet.conditions import fields_of, value_in
+from fleet.console.requests import BadPageMessage, PageMessage
 from schemas import messages, topics
 
 MAX_SERIES: Final = 80
@@ -63,3 +64,20 @@ class PlotBuffer:
         """Return the values by the number of their series, and forget them."""
         values, self._values, self._count = self._values, {}, 0
         return values
+
+
+def series_of(message: PageMessage) -> list[Series]:
+    """Return what to plot, perhaps nothing. Raises BadPageMessage."""
+    value = message.fields.get("series")
+    if not isinstance(value, list) or len(value) > MAX_SERIES:
+        raise BadPageMessage(f"series is not a list of at most {MAX_SERIES}")
+    allowed = {(topic, field) for topic, field, _ in plottable()}
+    found = []
+    for each in value:
+        if not isinstance(each, list) or len(each) != 3 or not all(isinstance(part, str) for part in each):
+            raise BadPageMessage("a series is not car, topic and field")
+        car, topic, field = each
+        if (topic, field) not in allowed:
+            raise BadPageMessage(f"{topic} {field} cannot be plotted")
+        found.append(Series(PageMessage({"cars": [car]}).cars()[0], topic, field))
+    return found

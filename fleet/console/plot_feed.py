@@ -4,13 +4,15 @@ import asyncio
 import json
 import logging
 from collections import deque
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, Final
 
 from fleet.aio import Fleet
 from fleet.console.bus_message import message_in
+from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
-from fleet.console.plot_buffer import PlotBuffer, Series
+from fleet.console.plot_buffer import PlotBuffer, series_of
+from fleet.console.requests import PageMessage
 from schemas import keys, topics
 from schemas.bus import BusError, Sample
 
@@ -18,15 +20,18 @@ _MAX_PLOT_SAMPLES: Final = 16_384
 # A gateway answers `busy` to whoever asks when some questions wait there. Pages must not take all these places.
 MAX_HISTORY_QUESTIONS: Final = 2
 """Maximum number of questions for history at a time, of all pages. One page has one."""
+MAX_PLOT_S: Final = 600
+"""Maximum time that a plot shows, s."""
 
 log = logging.getLogger("fleet")
 
 
-class PlotFeed:
+class PlotFeed(PageFeed):
     """Which page plots what."""
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: Fleet, spawn: Callable[[Coroutine[Any, Any, None]], object]) -> None:
         self._fleet = fleet
+        self._spawn = spawn
         self._buffers: dict[int, PlotBuffer] = {}
         self._wanted: dict[int, tuple[PlotBuffer, float]] = {}
         """The newest plot of each page whose history is not being read yet, and how far back it goes, s."""
@@ -38,12 +43,18 @@ class PlotFeed:
         # Twenty cars send 500 samples a second. To wake the loop for each would cost more than to decode it.
         self._samples: deque[Sample] = deque(maxlen=_MAX_PLOT_SAMPLES)
 
-    def begin(self, page: int, series: Sequence[Series], since_s: float) -> Coroutine[Any, Any, None]:
-        """Plot these series on a page instead of those before. Return what reads the gateways' history."""
-        self._buffers[page] = PlotBuffer(series)
+    @property
+    def messages(self) -> Mapping[str, Handler]:
+        """Plot some series."""
+        return {"plot": self._begin}
+
+    def _begin(self, page: PageLink, message: PageMessage) -> None:
+        """Plot these series on a page instead of those before, and read the gateways' history."""
+        since_s = float(min(message.number("since_s"), MAX_PLOT_S))
+        buffer = self._buffers[page.number] = PlotBuffer(series_of(message))
         self._note_plotted()
-        self._wanted[page] = self._buffers[page], since_s
-        return self._read_histories(page)
+        self._wanted[page.number] = buffer, since_s
+        self._spawn(self._read_histories(page.number))
 
     async def _read_histories(self, page: int) -> None:
         """Read the history for the newest plot of a page, unless that is being done: then it follows."""
@@ -82,19 +93,21 @@ class PlotFeed:
         if sample.key in self._plotted:
             self._samples.append(sample)
 
-    def take_samples(self) -> None:
-        """Give the samples since the last call to the pages that plot them."""
+    def tick(self, pages: Mapping[int, PageLink]) -> None:
+        """Give the samples since the last tick to the pages that plot them.
+
+        A page whose last values still wait gets the new ones together with them.
+        """
         for _ in range(len(self._samples)):
             if (found := message_in(self._samples.popleft())) is not None:
                 key, message = found
                 for buffer in self._buffers.values():
                     buffer.add(key.car, key.topic, message)
 
-    def send(self, page: PageLink) -> None:
-        """Send the new values to a page, unless the last ones still wait: then they go together."""
-        buffer = self._buffers.get(page.number)
-        if buffer is not None and not page.has_unsent("samples") and (values := buffer.take()):
-            page.show("samples", json.dumps({"t": "samples", "values": values}, separators=(",", ":")))
+        for number, page in pages.items():
+            wanted = self._buffers.get(number)
+            if wanted is not None and not page.has_unsent("samples") and (values := wanted.take()):
+                page.show("samples", json.dumps({"t": "samples", "values": values}, separators=(",", ":")))
 
     def _note_plotted(self) -> None:
         name = self._fleet.sync.name

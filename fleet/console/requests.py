@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
 from fleet.client import commands
-from fleet.console.plot_buffer import MAX_SERIES, Series, plottable
 from schemas import keys
 from schemas.commands import STOPPING_VERBS, STOPS
 from schemas.limits import MAX_REASON_LENGTH
@@ -97,22 +96,6 @@ class PageMessage:
         if not isinstance(value, list) or len(value) != count:
             raise BadPageMessage(f"{name} is not a list of {count} numbers")
         return [PageMessage({name: each}).number(name) for each in value]
-
-    def series(self) -> list[Series]:
-        """Return what to plot, perhaps nothing. Raises BadPageMessage."""
-        value = self.fields.get("series")
-        if not isinstance(value, list) or len(value) > MAX_SERIES:
-            raise BadPageMessage(f"series is not a list of at most {MAX_SERIES}")
-        allowed = {(topic, field) for topic, field, _ in plottable()}
-        found = []
-        for each in value:
-            if not isinstance(each, list) or len(each) != 3 or not all(isinstance(part, str) for part in each):
-                raise BadPageMessage("a series is not car, topic and field")
-            car, topic, field = each
-            if (topic, field) not in allowed:
-                raise BadPageMessage(f"{topic} {field} cannot be plotted")
-            found.append(Series(PageMessage({"cars": [car]}).cars()[0], topic, field))
-        return found
 
     def request(self) -> commands.CommandRequest:
         """Return the command that the page wants. Raises BadPageMessage."""

@@ -231,13 +231,13 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:
-        return await _answer_plan(request, console, console.plan_checks.check)
+        return await _answer_plan(request, console, console.plan.checks.check)
 
     async def set_plan(request: Request) -> Response:
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
-        return await _answer_plan(request, console, console.set_plan)
+        return await _answer_plan(request, console, console.plan.set_plan)
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
@@ -309,7 +309,7 @@ async def _answer_plan(
     """Answer a request with the text of a plan."""
     person: PagePerson | None = request.scope.get(PERSON)
     may_check = console.budgets.may_check(person and person.name, time.monotonic())
-    if not may_check or console.plan_checks.is_busy(person):
+    if not may_check or console.plan.checks.is_busy(person):
         return _too_much(TOO_MANY_PLANS)
     text = await read_text(request, LARGEST_PAYLOAD - _PLAN_MESSAGE_ROOM)
     if text is None:

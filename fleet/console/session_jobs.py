@@ -12,6 +12,7 @@ from typing import Final
 from starlette.requests import Request
 
 from fleet.console.guard import PERSON
+from schemas.process.ending import kill
 
 MAX_SESSION_JOBS: Final = 2
 """Maximum number of processes at work. More requests wait."""
@@ -33,8 +34,7 @@ class SessionJobs:
     def kill(self) -> None:
         """End the processes."""
         for process in list(self._running):
-            with suppress(ProcessLookupError):
-                process.kill()
+            kill(process)
 
     async def run_for(self, request: Request, *arguments: str) -> tuple[int, str, str]:
         """Run `fleet` for a person, as `run` does. End it if the client of the request has gone."""
@@ -78,8 +78,7 @@ class SessionJobs:
                 out, err = await process.communicate()
             finally:
                 if process.returncode is None:  # cancelled
-                    with suppress(ProcessLookupError):
-                        process.kill()
+                    kill(process)
                 self._running.discard(process)
         said = err.decode("utf-8", "replace").strip().splitlines()
         return process.returncode or 0, out.decode("utf-8", "replace"), said[-1].removeprefix("fleet: ") if said else ""

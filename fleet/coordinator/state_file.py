@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.policy.state import PersistedPolicy
-from schemas.atomic_file import write_atomically
+from schemas.atomic_file import DAMAGE, write_state
 from schemas.state_dir import directory_of
 
 MAX_CLOCK_NOISE_S: Final = 1.0
@@ -52,7 +52,7 @@ class CoordinatorStateFile:
                 str(content.get("stopped_by", "")),
                 tuple(map(str, content.get("to_rest", ()))),
             )
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        except (OSError, *DAMAGE):
             return PersistedPolicy()
 
     def save(self, state: PersistedPolicy) -> bool:
@@ -64,8 +64,7 @@ class CoordinatorStateFile:
         self._last = state
         content = {"endpoint": self._endpoint, "run": self._run, **asdict(state)}
         with contextlib.suppress(OSError):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.path, json.dumps(content).encode())
+            write_state(self.path, json.dumps(content))
             return True
         return False
 

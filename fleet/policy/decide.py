@@ -30,13 +30,19 @@ from fleet.policy.explain import (
 from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
-from fleet.policy.state import HUB_RETURN_GRACE_S, BlinkState, HeldRole, LedRequest, ModeAttempts, PolicyState
+from fleet.policy.state import (
+    HUB_RETURN_GRACE_S,
+    MODE_RETRY_MAX_S,
+    BlinkState,
+    HeldRole,
+    LedRequest,
+    ModeAttempts,
+    PolicyState,
+)
 from schemas.colors import COLORS, Rgb
 from schemas.keys import name_of
 from schemas.words import UNKNOWN, LinkState, Mode, Motors, Verdict
 
-MODE_RETRY_MAX_S: Final = 30.0
-"""Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
 FIRST_STATE_TIMEOUT_S: Final = 1.5
 """Timeout for the first states of the cars on the bus; the first roles wait for them."""
 ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
@@ -179,7 +185,7 @@ def _step_stopped(
         waits = car in memory.to_rest and not taken and (barrier is not None or known.busy or not rests)
         if waits:
             if barrier is None and not known.busy and now >= tried.again_at:
-                tried = ModeAttempts(Mode.MANUAL, tried.count + 1, now + min(MODE_RETRY_MAX_S, 2.0**tried.count))
+                tried = replace(tried, mode=Mode.MANUAL).after(now)
                 asks.append(Ask(car, Mode.MANUAL))
             attempts[car] = tried
         if barrier is not None:
@@ -424,8 +430,7 @@ def _command_modes(
         elif known.busy or now < attempts.again_at:
             result[car] = replace(attempts, fine_since=None)
         else:
-            wait_s = min(MODE_RETRY_MAX_S, 2.0**attempts.count)
-            result[car] = ModeAttempts(mode, attempts.count + 1, now + wait_s)
+            result[car] = attempts.after(now)
             asks.append(Ask(car, mode))
     return result, asks
 

@@ -9,6 +9,7 @@ from fleet.policy.decision import Decision
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
+from schemas.backoff import backoff_s
 from schemas.colors import Rgb
 from schemas.words import Mode
 
@@ -16,6 +17,8 @@ TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
 HUB_RETURN_GRACE_S: Final = 5.0
 """Maximum wait for gateways after the hub returns; their cars keep their roles. Gateways reconnect every 0.5 s."""
+MODE_RETRY_MAX_S: Final = 30.0
+"""Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
 IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
@@ -27,6 +30,10 @@ class ModeAttempts:
     count: int = 0
     again_at: float = 0.0
     fine_since: float | None = None
+
+    def after(self, now: float) -> "ModeAttempts":
+        """Return the attempts after one more command."""
+        return ModeAttempts(self.mode, self.count + 1, now + backoff_s(self.count + 1, 1.0, MODE_RETRY_MAX_S))
 
 
 @dataclass(frozen=True, slots=True)

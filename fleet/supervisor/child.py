@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.atomic_file import write_atomically
+from schemas.process.ending import kill
 from schemas.state_dir import directory_of
 
 MAX_LOG_BYTES: Final = 1_000_000
@@ -144,8 +145,7 @@ class Child:
 
     def kill(self) -> None:
         """Kill the process."""
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
+        kill(self._process)
 
     def write_line(self, line: str) -> None:
         """Write a line to the process's stdin. Do nothing if stdin is closed."""

@@ -8,6 +8,7 @@ from enum import StrEnum
 from math import inf
 from typing import Final
 
+from schemas.backoff import backoff_s
 from schemas.limits import SHUTDOWN_S
 from schemas.words import RunState
 
@@ -51,8 +52,7 @@ def delay_s(failures: int, chance: float) -> float:
 
     chance: in 0..1, varies the delay by RESTART_JITTER either way.
     """
-    delay: float = min(MAX_RESTART_DELAY_S, FIRST_RESTART_DELAY_S * 2.0 ** min(failures - 1, 16))
-    return delay * (1 + RESTART_JITTER * (2 * chance - 1))
+    return backoff_s(failures, FIRST_RESTART_DELAY_S, MAX_RESTART_DELAY_S) * (1 + RESTART_JITTER * (2 * chance - 1))
 
 
 @dataclass(slots=True)

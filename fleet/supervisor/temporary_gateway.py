@@ -11,6 +11,7 @@ from typing import Final
 
 from fleet.client.client import Fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from schemas.process.ending import end
 from schemas.process.parent import parent_option
 from schemas.words import Motors
 
@@ -33,12 +34,7 @@ def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[s
         try:
             yield name if _is_ready(client, name, gateway, log.name, on_error) else None
         finally:
-            gateway.terminate()
-            try:
-                gateway.wait(GATEWAY_GRACE_S)
-            except subprocess.TimeoutExpired:
-                gateway.kill()
-                gateway.wait()
+            end(gateway, GATEWAY_GRACE_S)
 
 
 def _is_ready(

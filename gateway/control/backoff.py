@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from schemas.backoff import backoff_s
+
 FIRST_DELAY_S: Final = 0.25
 MAX_RECONNECT_DELAY_S: Final = 1.0
 """Delay after the first failure, and maximum delay: a car may be driving while its link is down."""
@@ -14,8 +16,7 @@ _OPENED: Final = ""
 
 def delay_s(failures: int, jitter: float) -> float:
     """Return the delay after `failures` (1..) in a row, s. `jitter` 0..1 spreads it over the upper half."""
-    longest = min(MAX_RECONNECT_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures - 1, 10))
-    return longest * (0.5 + 0.5 * jitter)
+    return backoff_s(failures, FIRST_DELAY_S, MAX_RECONNECT_DELAY_S) * (0.5 + 0.5 * jitter)
 
 
 class Attempts:

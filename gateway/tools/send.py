@@ -26,7 +26,7 @@ from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.link import LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
-from schemas.links import LINK_HELP, TcpUrl
+from schemas.links import LINK_HELP
 from schemas.words import Mode, Motion, Platform
 
 DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
@@ -111,7 +111,7 @@ def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
         raise cli_support.WrongUse(
             f"frame {text!r}: {refusal} (--platform says what the car is, --raw sends it anyway)"
         )
-    if isinstance(url, TcpUrl) and moves(frame) and profile.stop_style is not StopStyle.MODE_FRAME:
+    if url.harm and moves(frame) and profile.stop_style is not StopStyle.MODE_FRAME:
         raise cli_support.WrongUse(
             f"frame {text!r}: the car would drive, and a Raspberry Pi car's program dies when this connection closes, "
             "after which nothing can stop the car: use `gateway run` (or --platform arduino behind a bridge, or --raw)"

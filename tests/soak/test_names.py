@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet.coordinator.coordinator import REPUBLISH_INTERVAL_S
 from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS
+from fleet.coordinator.publications import REPUBLISH_INTERVAL_S
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 

@@ -29,9 +29,6 @@ const listeners = new Set();
 export const store = {
   state: null,
   rights: { cars: {}, pause: "", unpause: "", manage: "", lead: false }, // what this person may not do: words by car and action
-  plan: null,
-  inspection: null,
-  planAnswer: null, // of the last request about the plan: {ok, words}
   hello: null,
   connected: false,
   lost: false,
@@ -238,36 +235,26 @@ export function lease(kind, cars) {
   send({ t: kind, id: requestNumber, cars });
 }
 
-let plotted = { series: [], since_s: 60 };
-export function plot(series, since_s) {
-  plotted = { series, since_s };
-  send({ t: "plot", ...plotted });
+// What a page shows beside the cars: it registers what it does with a message of the console, by its `t`. The page is
+// drawn again afterwards, unless the handler returns false.
+const handlers = new Map();
+export function on(kind, handler) {
+  handlers.set(kind, handler);
 }
 
-const sampleListeners = new Set();
-export function onSamples(listener) {
-  sampleListeners.add(listener);
-  return () => sampleListeners.delete(listener);
+export function askBySocket(kind, fields) {
+  send({ t: kind, id: ++requestNumber, ...fields });
 }
 
-let inspected = null;
-export function inspect(car) {
-  inspected = car;
-  send(car === null ? { t: "inspect_end" } : { t: "inspect", cars: [car] });
+// What a page wants from now on, also of a console that was started again. `end` is sent when it wants nothing more.
+const wishes = new Map();
+export function wish(message) {
+  wishes.set(message.t, message);
+  send(message);
 }
-
-export function plan(verb) {
-  send({ t: "plan", id: ++requestNumber, verb });
-}
-
-// Check the text of a plan, or put it in force.
-export async function sendPlan(what, text) {
-  try {
-    store.planAnswer = { what, ...(await request(`/plan/${what}`, text)) };
-  } catch {
-    store.planAnswer = { what, ok: false, words: describe.unreachable };
-  }
-  changed();
+export function unwish(kind, end) {
+  wishes.delete(kind);
+  send(end);
 }
 
 async function request(path, body) {
@@ -308,18 +295,6 @@ function onMessage(text) {
     case "rights":
       store.rights = message;
       break;
-    case "samples":
-      for (const listener of sampleListeners) listener(message.values);
-      return;
-    case "inspection":
-      store.inspection = message;
-      break;
-    case "plan":
-      store.plan = message;
-      break;
-    case "plan_done":
-      store.planAnswer = message;
-      break;
     case "hello":
       store.hello = message;
       break;
@@ -343,6 +318,8 @@ function onMessage(text) {
     case "bad":
       note(message.words, true);
       break;
+    default:
+      if (handlers.get(message.t)?.(message) === false) return;
   }
   changed();
 }
@@ -371,8 +348,7 @@ async function connect() {
   socket.onopen = () => {
     store.connected = true;
     pressNumber = 0;
-    if (inspected !== null) inspect(inspected);
-    if (plotted.series.length > 0) plot(plotted.series, plotted.since_s);
+    for (const message of wishes.values()) send(message);
     changed();
   };
   socket.onmessage = (event) => onMessage(event.data);

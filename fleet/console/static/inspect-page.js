@@ -1,8 +1,13 @@
 // The inspect page: raw frames beside what they became, the ledger of commands, and what the gateway knows.
 
-import { clock, inspect, store } from "./console.js";
+import { clock, on, store, unwish, wish } from "./console.js";
 import { t } from "./texts.js";
 import { html, useEffect, useState } from "./ui.js";
+
+let inspection = null;
+on("inspection", (message) => {
+  inspection = message;
+});
 
 const time = (at_ms) => clock(at_ms, 12);
 
@@ -66,10 +71,10 @@ export function InspectPage({ cars }) {
   const [car, setCar] = useState([...store.selected][0] ?? cars[0]?.name ?? null);
   const [frozen, setFrozen] = useState(null);
   useEffect(() => {
-    if (car !== null) inspect(car);
-    return () => inspect(null);
+    if (car !== null) wish({ t: "inspect", cars: [car] });
+    return () => unwish("inspect", { t: "inspect_end" });
   }, [car]);
-  const shown = frozen ?? (store.inspection?.car === car ? store.inspection : null);
+  const shown = frozen ?? (inspection?.car === car ? inspection : null);
   return html`
     <h1>${t.inspect}</h1>
     <div class="controls">

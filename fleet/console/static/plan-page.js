@@ -1,9 +1,26 @@
 // The plan page: the plan in force, who has which role and why, and another plan.
 
-import { clock, plan, sendPlan, store, who } from "./console.js";
+import { ask, askBySocket, changed, clock, on, store, who } from "./console.js";
 import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, Refused, useRef, useState } from "./ui.js";
+
+let inForce = { plan: null, running: false, log: [] };
+on("plan", (message) => {
+  inForce = message;
+});
+let answer = null; // of the last request about the plan: {ok, words}
+on("plan_done", (message) => {
+  answer = message;
+});
+
+const request = (verb) => askBySocket("plan", { verb });
+
+// Check the text of a plan, or put it in force.
+async function sendPlan(what, text) {
+  answer = await ask(`/plan/${what}`, text);
+  changed();
+}
 
 const FAULT = /^\u2068?plan:(\d+):(\d+): error: (.*)$/;
 
@@ -20,9 +37,9 @@ function Status({ shown }) {
     ${shown.phase && html`<p>${t.phase(shown.phase)}</p>`}
     ${shown.rules?.length > 0 && html`<p>${t.rules(shown.rules)}</p>`}
     <div class="controls">
-      <button data-plan="restart" disabled=${refused !== ""} onClick=${() => plan("restart")}>${t.planRestart}</button>
-      ${shown.phase && html`<button data-plan="next" disabled=${refused !== ""} onClick=${() => plan("next")}>${t.planNext}</button>`}
-      <button data-plan="stop" disabled=${refused !== ""} onClick=${() => plan("stop")}>${t.planStop}</button>
+      <button data-plan="restart" disabled=${refused !== ""} onClick=${() => request("restart")}>${t.planRestart}</button>
+      ${shown.phase && html`<button data-plan="next" disabled=${refused !== ""} onClick=${() => request("next")}>${t.planNext}</button>`}
+      <button data-plan="stop" disabled=${refused !== ""} onClick=${() => request("stop")}>${t.planStop}</button>
     </div>
     ${refused && html`<${Refused} words=${[refused]} />`}`;
 }
@@ -50,7 +67,7 @@ const Decisions = ({ decisions }) => html`<section>
   )}
 </section>`;
 
-function Answer({ answer, onFault }) {
+function Answer({ onFault }) {
   if (answer === null) return null;
   const words = answer.words || (answer.ok ? t.planGood : "");
   return html`<div role="status"><ul class="plain">
@@ -65,7 +82,7 @@ function Answer({ answer, onFault }) {
   </ul></div>`;
 }
 
-function Editor({ inForce }) {
+function Editor({ current }) {
   const [text, setText] = useState("");
   const area = useRef(null);
   // Select the line of a fault in the text.
@@ -83,7 +100,7 @@ function Editor({ inForce }) {
     <h2>${t.otherPlan}</h2>
     <div class="controls">
       <label>${t.planFile} <input type="file" accept=".yaml,.yml" onChange=${load} /></label>
-      ${inForce && html`<button onClick=${() => setText(inForce)}>${t.planCurrent}</button>`}
+      ${current && html`<button onClick=${() => setText(current)}>${t.planCurrent}</button>`}
     </div>
     <textarea ref=${area} aria-label=${t.planText} rows="14" spellcheck="false" value=${text}
       onInput=${(event) => setText(event.target.value)}></textarea>
@@ -92,12 +109,12 @@ function Editor({ inForce }) {
       <button data-plan="set" disabled=${store.rights.manage !== ""} onClick=${() => sendPlan("set", text)}>${t.planSet}</button>
     </div>
     ${store.rights.manage && html`<${Refused} words=${[store.rights.manage]} />`}
-    <${Answer} answer=${store.planAnswer} onFault=${show} />
+    <${Answer} onFault=${show} />
   </section>`;
 }
 
 export function PlanPage() {
-  const shown = store.plan ?? { plan: null, running: false, log: [] };
+  const shown = inForce;
   return html`
     <h1>${t.plan}</h1>
     <div class="columns">
@@ -113,7 +130,7 @@ export function PlanPage() {
           </ul>
         </section>`}
       </div>
-      <${Editor} inForce=${shown.plan?.text} />
+      <${Editor} current=${shown.plan?.text} />
     </div>
   `;
 }

@@ -1,6 +1,6 @@
 // The plots page: up to four readings, each of several cars, over thirty seconds to ten minutes.
 
-import { consoleNow, onSamples, plot, store } from "./console.js";
+import { consoleNow, on, store, unwish, wish } from "./console.js";
 import { t } from "./texts.js";
 import { html, useEffect, useRef, useState } from "./ui.js";
 import uPlot from "./vendor/uplot.js";
@@ -101,16 +101,19 @@ export function PlotsPage({ cars }) {
       });
     });
     setGrids(made);
-    const off = onSamples((values) => {
+    on("samples", ({ values }) => {
       for (const [number, some] of Object.entries(values)) {
         const place = places[number];
         if (place !== undefined) made[place[0]].add(place[1], some);
       }
+      return false;
     });
-    plot(series, span_s);
+    const wanted = { t: "plot", series, since_s: span_s };
+    if (series.length > 0) wish(wanted);
+    else unwish("plot", wanted);
     return () => {
-      off();
-      plot([], span_s);
+      on("samples", () => false);
+      unwish("plot", { ...wanted, series: [] });
     };
   }, [names, span_s, readings.join("|")]);
 

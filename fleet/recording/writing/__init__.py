@@ -1,1 +1,1 @@
-"""Writes sessions: the recorder, segments, rollover, backfill and retention. Read `recorder` first."""
+"""Writes sessions: the recorder, segments, rollover, backfill, quota and disk space. Read `recorder` first."""

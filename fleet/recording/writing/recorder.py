@@ -20,6 +20,7 @@ import zenoh
 
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.receive_clock import ReceiveClock
+from fleet.recording.writing.retention import Quota
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
 from schemas.bus import Bus, messages_of, reply_value
@@ -330,7 +331,7 @@ class Recorder:
     def _report_news(self, session: SessionWriter) -> None:
         """Notify of each removed session, failed copy and new state once."""
         for removed in session.removed:
-            self._notify(f"{removed} is removed, the oldest session without a mark: the quota is full")
+            self._notify(Quota.removal(removed))
         for words in session.uncopied:
             self._notify(words)
         session.removed.clear()

@@ -1,55 +1,81 @@
-"""Measures disk space, and removes old sessions to enforce a quota."""
+"""The quota of a recorder: how large all sessions may be together, and which ones it removes."""
 
 import contextlib
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fleet.recording.session_dir import SESSION_FILE, SessionInfo
+from fleet.recording.writing.disk_space import MB
 
+SESSIONS_PER_QUOTA: Final = 10
+"""Minimum sessions in a quota. The quota removes whole sessions, so each uses at most a tenth unless told otherwise."""
 _UNCLOSED_IN_USE_S: Final = 60.0
 """Age below which an unclosed session may still belong to another recorder."""
 
 
-def free_bytes(path: Path) -> int:
-    """Return the free space on the disk of `path` in bytes; raises OSError."""
-    return shutil.disk_usage(path).free
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """Maximum size of all sessions together, and of one, in bytes; 0 is no limit."""
+
+    total: int = 0
+    """The oldest unmarked sessions are removed first."""
+    session: int = 0
+    """Size at which a session is closed and the next one begins; 0: a tenth of `total`."""
+
+    @property
+    def session_limit(self) -> int:
+        """Return the maximum size of one session in bytes; 0 is no limit."""
+        return self.session or self.total // SESSIONS_PER_QUOTA
+
+    @property
+    def refusal(self) -> str:
+        """Return why the two sizes do not fit each other. Empty if they do."""
+        if not self.session or not self.total or self.session <= self.total // 2:
+            return ""
+        return (
+            f"--session-size: {self.session / 10**6:g} MB is more than half of --quota: at most "
+            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota removes whole sessions"
+        )
+
+    def enforce(self, root: Path, keep: Path) -> tuple[list[Path], str]:
+        """Remove the oldest sessions below `root` until all fit: (removed sessions, a warning if they still do not).
+
+        Spare `keep`, marked sessions, directories of other programs and sessions that cannot be removed.
+        """
+        if not self.total:
+            return [], ""
+        sizes = {path.parent: _size(path.parent) for path in root.glob(f"*/{SESSION_FILE}")}
+        over = sum(sizes.values()) - self.total
+        removed = []
+        for session in sorted(sizes, key=lambda session: session.name):
+            if over <= 0:
+                break
+            if session != keep and _may_go(session):
+                try:
+                    shutil.rmtree(session)
+                except OSError:
+                    continue  # perhaps another user's; the warning reports the excess
+                removed.append(session)
+                over -= sizes[session]
+        why = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
+        return removed, f"{root} has more than its quota, {why}" if over > 0 else ""
+
+    @staticmethod
+    def removal(session: Path) -> str:
+        """Return the news that this session was removed."""
+        return f"{session} is removed, the oldest session without a mark: the quota is full"
 
 
-def free_bytes_for(path: Path) -> int:
-    """Return the free space on the disk where `path` would be created; raises OSError."""
-    return free_bytes(next(each for each in (path, *path.absolute().parents) if each.exists()))
-
-
-def size(session: Path) -> int:
+def _size(session: Path) -> int:
     """Return the size of a session in bytes. Ignore files that disappear meanwhile."""
     found = 0
     for each in session.rglob("*"):
         with contextlib.suppress(OSError):
             found += each.stat().st_size if each.is_file() else 0
     return found
-
-
-def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int]:
-    """Remove the oldest sessions below `root` until all fit the limit: (removed sessions, bytes still over the limit).
-
-    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be removed.
-    """
-    sizes = {path.parent: size(path.parent) for path in root.glob(f"*/{SESSION_FILE}")}
-    over = sum(sizes.values()) - limit_bytes
-    removed = []
-    for session in sorted(sizes, key=lambda session: session.name):
-        if over <= 0:
-            break
-        if session != keep and _may_go(session):
-            try:
-                shutil.rmtree(session)
-            except OSError:
-                continue  # perhaps another user's; the caller reports the excess
-            removed.append(session)
-            over -= sizes[session]
-    return removed, max(0, over)
 
 
 def _may_go(session: Path) -> bool:

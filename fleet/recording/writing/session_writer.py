@@ -4,9 +4,7 @@ All methods are called from one thread. The module knows no bus and starts no th
 """
 
 import contextlib
-import os
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,40 +14,25 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
-from google.protobuf.message import DecodeError
 
 from fleet.recording import session_dir
 from fleet.recording.sequence_tracker import SequenceTracker
-from fleet.recording.stop_count import EVENTS, StopCount
+from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
-from fleet.recording.writing import resume, retention
+from fleet.recording.writing import resume
+from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, free_bytes, shortage
+from fleet.recording.writing.retention import Quota
+from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
-from schemas import messages
 from schemas.bus import sequence_of
 
-MB: Final = 1_000_000
 MAX_BUFFERED_MESSAGES: Final = 100_000
 MAX_BUFFERED_BYTES: Final = 64 * MB
 """Maximum size of the buffer while the disk is full. Further messages are dropped and counted."""
-FREE_WARNING_FACTOR: Final = 4
-"""Warn if less than this multiple of `keep_free_bytes` is free."""
 MAX_SEGMENTS: Final = 9990
 """Maximum segments of a session: their names have four digits."""
-MIN_START_BYTES: Final = 500_000
-"""Minimum free space above the reserve to begin a session."""
-MAX_RESUME_BYTES: Final = 5 * MB
-"""Maximum space above the reserve to wait for before resuming. With less, files of a second follow each other.
-
-More would keep a small disk, on which a session can begin, from ever recording again."""
-PROBE_BYTES: Final = 4096
-"""Size of the file that tries whether a directory takes files: a block of most disks."""
-MIN_CLOSE_BYTES: Final = 200_000
-"""Minimum free space to write the end of a session: the index of its last file needs it."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
-_EVENT_CLASS: Final = messages.message_class(EVENTS.message)
-SESSIONS_PER_QUOTA: Final = 10
-"""Minimum sessions in a quota. The quota removes whole sessions, so each may use at most a tenth."""
 
 
 class Sync(StrEnum):
@@ -69,57 +52,10 @@ class Options:
     segment_s: float = 600.0
     """Age at which a segment is rolled over. The index of an open file grows in memory: 0.1 MB/s for 100 cars."""
     sync: Sync = Sync.SEGMENT
-    session_bytes: int = 0
-    """Size at which a session is closed and the next one begins; 0: a tenth of `root_bytes`."""
-    root_bytes: int = 0
-    """Quota of all sessions together. The oldest unmarked sessions are removed first."""
-    keep_free_bytes: int = 50 * MB
-    """Reserve on the disk. If less is free, recording pauses."""
+    quota: Quota = field(default_factory=Quota)
+    reserve: Reserve = field(default_factory=Reserve)
     copied: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
     """Files to copy into each session, by their names there."""
-
-    @property
-    def session_limit(self) -> int:
-        """Return the maximum size of one session in bytes; 0 is no limit."""
-        return self.session_bytes or self.root_bytes // SESSIONS_PER_QUOTA
-
-
-def why_unwritable(root: Path, options: Options) -> str:
-    """Return why no session can begin in this directory, which is made if it is missing. Empty if one can."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=root) as file:
-            file.write(bytes(PROBE_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-        free, needed = retention.free_bytes_for(root), options.keep_free_bytes + MIN_START_BYTES
-    except OSError as error:
-        return error.strerror or str(error)
-    return "" if free >= needed else describe_shortage(free, needed)
-
-
-def describe_shortage(free_bytes: int, needed_bytes: int) -> str:
-    """Return how much space is missing, in words."""
-    return f"{free_bytes / MB:.1f} MB are left on the disk, {needed_bytes / MB:.1f} MB are needed"
-
-
-class KeyState:
-    """Counters of one key and encoding in one segment."""
-
-    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "tracker")
-
-    def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
-        self.key = key
-        self.encoding = encoding
-        self.tracker = tracker
-        self.channel = channel
-        self.count = self.first = self.final = 0
-        self.has_events = messages.name_in(str(encoding)) == EVENTS.message
-        """True for the events of commands, in which stops are counted."""
-
-
-_BufferedRow = tuple[KeyState, int, bytes, int, int]
-"""State of the key, receive time, payload, publish time, sequence."""
 
 
 class SessionWriter:
@@ -162,9 +98,9 @@ class SessionWriter:
         self._stops = StopCount()
         self._unended = 0
         """Rows at the begin of the buffer that are in a segment whose end a full disk did not take."""
-        self._unflushed: list[_BufferedRow] = []
+        self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
-        self._open(now_ns, self._options.keep_free_bytes + MIN_START_BYTES)
+        self._open(now_ns, self._options.reserve.to_begin)
 
     # ------------------------------------------------------------------ messages
 
@@ -227,7 +163,7 @@ class SessionWriter:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
 
-    def _write(self, row: _BufferedRow) -> None:
+    def _write(self, row: Row) -> None:
         self._unflushed.append(row)
         if self.full:
             self._limit_buffer()
@@ -236,13 +172,11 @@ class SessionWriter:
 
     def _key_state(self, key: str, encoding: zenoh.Encoding) -> KeyState:
         """Return the state of a key and an encoding. A key has a second state only if its encoding changes."""
-        words = str(encoding)
-        state = self._states_by_encoding.get((key, words))
+        state = self._counts.find(key, encoding)
         if state is None:
-            channel = -1 if self.full or self._segment is None else self._segment.channel(key, words)
+            channel = -1 if self.full or self._segment is None else self._segment.channel(key, str(encoding))
             state = KeyState(key, encoding, self._trackers.setdefault(key, SequenceTracker()), channel)
-            self._states_by_encoding[key, words] = state
-        self._states[key] = state
+            self._counts.add(state)
         return state
 
     # ------------------------------------------------------------------ status
@@ -270,7 +204,7 @@ class SessionWriter:
     @property
     def free_bytes(self) -> int:
         """Return the free space on the disk in bytes; raises OSError."""
-        return retention.free_bytes(self.path) if self._made else retention.free_bytes_for(self._root)
+        return shutil.disk_usage(self.path).free if self._made else free_bytes(self._root)
 
     @property
     def missed(self) -> dict[str, int]:
@@ -280,7 +214,7 @@ class SessionWriter:
     @property
     def over(self) -> bool:
         """True if the session has reached its limit of bytes or segments."""
-        return 0 < self._options.session_limit <= self.bytes or self.segments >= MAX_SEGMENTS
+        return 0 < self._options.quota.session_limit <= self.bytes or self.segments >= MAX_SEGMENTS
 
     # ------------------------------------------------------------------ every second, and the end
 
@@ -322,7 +256,7 @@ class SessionWriter:
             self._try_to_finish()
         if self._segment is not None:
             self._segment.cut()
-            if self._index and not any(state.count for state in self._states_by_encoding.values()):
+            if self._index and self._counts.is_empty:
                 self._segment.path.unlink(missing_ok=True)  # an empty one
             else:
                 self._add_to_index()
@@ -360,8 +294,8 @@ class SessionWriter:
         free = self.free_bytes
         if self._unflushed:  # else a large first message would begin an empty file at each attempt
             room_bytes += len(self._unflushed[0][2])
-        if free < room_bytes:
-            self._pause(describe_shortage(free, room_bytes))
+        if why := shortage(free, room_bytes):
+            self._pause(why)
             return False
         made = self._made
         try:
@@ -383,9 +317,9 @@ class SessionWriter:
         return True
 
     def _reset_segment(self, now_ns: int) -> None:
-        self._states: dict[str, KeyState] = {}
-        self._states_by_encoding: dict[tuple[str, str], KeyState] = {}
-        self._segment_started_ns, self._first_ns, self._last_ns = now_ns, 0, 0
+        self._counts = SegmentCounts()
+        self._states = self._counts.states
+        self._segment_started_ns = now_ns
         self._segment: Segment | None = None
 
     def _begin_segment(self, now_ns: int) -> None:
@@ -411,19 +345,7 @@ class SessionWriter:
         self._unended = 0
         if not rows:
             return
-        first_ns, last_ns = rows[0][1], rows[-1][1]
-        if last_ns - first_ns < 0 or first_ns < self._last_ns:  # the clock went back
-            first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
-        self._first_ns = min(self._first_ns or first_ns, first_ns)
-        self._last_ns = max(self._last_ns, last_ns)
-        for state, _, payload, _, sequence in rows:
-            if not state.count:
-                state.first = sequence
-            if state.has_events:
-                with contextlib.suppress(DecodeError):  # any program can publish there
-                    self._stops.add(_EVENT_CLASS.FromString(payload))
-            state.count += 1
-            state.final = sequence
+        self._counts.count(rows, self._stops)
         self._written += len(rows)
 
     def _try_to_finish(self) -> None:
@@ -444,15 +366,7 @@ class SessionWriter:
     def _add_to_index(self) -> None:
         """Add the closed segment to index.json."""
         assert self._segment is not None
-        counts: dict[str, dict[str, int]] = {}
-        for state in self._states_by_encoding.values():
-            if state.count:
-                known = counts.setdefault(state.key, {"count": 0, "first": state.first, "last": 0})
-                known["count"] += state.count
-                known["last"] = state.final
-        entry = {"file": self._segment.path.name, "bytes": self._segment.bytes, "keys": counts}
-        entry |= {"first_ns": self._first_ns, "last_ns": self._last_ns}
-        self._index.append({**entry, "messages": sum(each["count"] for each in counts.values())})
+        self._index.append(self._counts.entry(self._segment.path.name, self._segment.bytes))
         self._closed_bytes += self._segment.bytes
         self._segment = None
         with contextlib.suppress(OSError):  # a cache; session.json is written again at the end
@@ -510,51 +424,41 @@ class SessionWriter:
         rows, self._unflushed = self._unflushed, []
         return self._drop_all(rows)
 
-    def _drop_all(self, rows: Sequence[_BufferedRow]) -> int:
+    def _drop_all(self, rows: Sequence[Row]) -> int:
         for state, *_ in rows:
             self.drop(state.key)
         return len(rows)
 
     def _check_disk(self) -> None:
         """Enforce the quota, and pause if the disk is nearly full."""
-        keep, limit = self._options.keep_free_bytes, self._options.root_bytes
-        self.warning = ""
-        if limit:
-            removed, over = retention.make_room(self._root, limit, self.path)
-            self.removed += removed
-            if over:
-                what = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
-                self.warning = f"{self._root} has more than its quota, {what}"
-        free = self.free_bytes
-        if free < keep * FREE_WARNING_FACTOR:
-            self.warning = f"{self._root}: the disk is nearly full, {free / MB:.0f} MB are left"
-        if free < keep:
+        removed, self.warning = self._options.quota.enforce(self._root, self.path)
+        self.removed += removed
+        reserve, free = self._options.reserve, self.free_bytes
+        self.warning = reserve.warning(self._root, free) or self.warning
+        if why := reserve.why_broken(free):
             try:
                 self._finish_segment()
             except OSError as error:
                 self._on_write_error(error)
                 return
-            self._pause(f"{free / MB:.1f} MB are left on the disk, {keep / MB:g} MB must stay free")
+            self._pause(why)
 
     def _resume(self, now_ns: int) -> None:
-        keep = self._options.keep_free_bytes
+        reserve = self._options.reserve
         if self._segment is not None:
-            free, needed = self.free_bytes, keep + MIN_CLOSE_BYTES + self._segment.waiting_bytes
-            if free < needed:
-                self._pause(describe_shortage(free, needed))
+            if why := shortage(self.free_bytes, reserve.to_end + self._segment.waiting_bytes):
+                self._pause(why)
                 return
             self._try_to_finish()
-        if self._segment is not None or not self._open(
-            now_ns, keep + max(min(keep, MAX_RESUME_BYTES), MIN_START_BYTES)
-        ):
+        if self._segment is not None or not self._open(now_ns, reserve.to_resume):
             return
-        if rest := self._write_buffered(keep + MIN_CLOSE_BYTES):
+        if rest := self._write_buffered(reserve.to_end):
             if not self.full:
                 self._try_to_finish()
             self._unflushed += rest
             self._pause(f"{len(self._unflushed)} waiting messages need more space")
 
-    def _write_buffered(self, keep_bytes: int) -> list[_BufferedRow]:
+    def _write_buffered(self, keep_bytes: int) -> list[Row]:
         """Write the buffer while this much stays free, and return the rest."""
         rows, self._unflushed = self._unflushed, []
         done = size = 0

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from fleet.console.plot_buffer import MAX_BUFFERED_VALUES, PlotBuffer, Series, plottable
+from fleet.console.plot_buffer import MAX_BUFFERED_VALUES, PlotBuffer, Series, plottable, series_of
 from fleet.console.requests import BadPageMessage, PageMessage
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -49,4 +49,4 @@ def test_only_numbers_and_lamps_can_be_plotted() -> None:
 )
 def test_bad_series_are_refused(series: object) -> None:
     with pytest.raises(BadPageMessage):
-        PageMessage.of(json.dumps({"series": series})).series()
+        series_of(PageMessage.of(json.dumps({"series": series})))

@@ -13,7 +13,9 @@ from click.testing import CliRunner
 
 from fleet import Fleet
 from fleet.cli import cli
-from fleet.coordinator.coordinator import INTERNAL_ERROR, SENDER, Coordinator
+from fleet.coordinator.coordinator import Coordinator
+from fleet.coordinator.other_coordinators import SENDER
+from fleet.coordinator.publications import INTERNAL_ERROR
 from fleet.policy.decision import Decision
 from fleet.policy.plan.parser import parse
 from schemas import keys, messages

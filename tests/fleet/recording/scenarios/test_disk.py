@@ -16,7 +16,8 @@ import pytest
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.verify import verify
-from fleet.recording.writing.session_writer import MB, Options, SessionWriter
+from fleet.recording.writing.disk_space import MB, Reserve
+from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
@@ -210,7 +211,7 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
 def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
     with disk("really full", tmp_path) as there:
-        tape = SessionWriter(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
+        tape = SessionWriter(there.root, "fleet", Options(reserve=Reserve(0)), BEGUN_NS)
         there.fill()
         written = []
         for second in range(3):

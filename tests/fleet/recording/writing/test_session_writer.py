@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -13,7 +12,9 @@ from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.verify import verify
-from fleet.recording.writing.session_writer import MB, Options, SessionWriter, Sync
+from fleet.recording.writing.disk_space import MB
+from fleet.recording.writing.retention import Quota
+from fleet.recording.writing.session_writer import Options, SessionWriter, Sync
 
 BEGUN_NS = 1_790_000_000_000_000_000
 SECOND_NS = 1_000_000_000
@@ -85,7 +86,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
 
 
 def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
-    tape = SessionWriter(tmp_path, "fleet", Options(session_bytes=100_000), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(session=100_000)), BEGUN_NS)
     feed(tape, BEGUN_NS)
     tape.tick(BEGUN_NS)
     assert not tape.over
@@ -95,9 +96,9 @@ def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
     tape.close(BEGUN_NS)
 
 
-@pytest.mark.parametrize("limit", [{"session_bytes": 100_000}, {"root_bytes": MB}])
-def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, Any], tmp_path: Path) -> None:
-    tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, **limit), BEGUN_NS)
+@pytest.mark.parametrize("limit", [Quota(session=100_000), Quota(MB)])
+def test_a_session_that_has_enough_begins_no_other_file(limit: Quota, tmp_path: Path) -> None:
+    tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, quota=limit), BEGUN_NS)
     feed(tape, BEGUN_NS, count=200)
     tape.tick(BEGUN_NS)
     assert tape.over
@@ -126,7 +127,7 @@ def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: 
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_bytes(b"x" * MB)
     one = sum(path.stat().st_size for path in paths[0].iterdir())
-    tape = SessionWriter(tmp_path, "fleet", Options(root_bytes=4 * one), BEGUN_NS + 7 * 3600 * SECOND_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(4 * one)), BEGUN_NS + 7 * 3600 * SECOND_NS)
     tape.tick(BEGUN_NS + 7 * 3600 * SECOND_NS)
     assert tape.removed == [paths[0], paths[2], paths[3]]
     assert not tape.warning
@@ -136,12 +137,12 @@ def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: 
 
 
 def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp_path: Path) -> None:
-    tape = SessionWriter(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(100_000)), BEGUN_NS)
     tape.mark("keep this", "me", BEGUN_NS)
     feed(tape, BEGUN_NS, count=400)
     tape.tick(BEGUN_NS)
     tape.close(BEGUN_NS)
-    after = SessionWriter(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS + SECOND_NS)
+    after = SessionWriter(tmp_path, "fleet", Options(quota=Quota(100_000)), BEGUN_NS + SECOND_NS)
     after.tick(BEGUN_NS + SECOND_NS)
     assert "has more than its quota, by 0." in after.warning
     assert "MB that are marked, in use or not to be removed" in after.warning

@@ -1,0 +1,31 @@
+"""What a page shows beside the state of the cars: a feed registers the messages of its page, and answers them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+
+from fleet.console.page_link import PageLink
+from fleet.console.requests import PageMessage
+
+Handler = Callable[[PageLink, PageMessage], None]
+"""Handles one message of a page; raises BadPageMessage, and then has changed nothing."""
+
+
+class PageFeed(ABC):
+    """The data of one kind of page, for all pages that show it. All methods run on the loop."""
+
+    @property
+    @abstractmethod
+    def messages(self) -> Mapping[str, Handler]:
+        """The messages that such a page sends, by their `t`."""
+
+    def on_page(self, page: PageLink) -> None:  # noqa: ARG002 - a page may begin empty
+        """Greet a new page."""
+        return
+
+    @abstractmethod
+    def tick(self, pages: Mapping[int, PageLink]) -> None:
+        """Show the pages what is new, ten times a second."""
+
+    def end(self, page: int) -> None:  # noqa: ARG002 - a feed may know no page
+        """Forget a page that has gone."""
+        return

@@ -1,0 +1,128 @@
+"""What comes over the bus for the coordinator: samples and queries in order, and the gateways that come and go.
+
+Zenoh's threads fill the inbox, the coordinator's own thread empties it. It is bounded: what is too much is dropped and
+counted.
+"""
+
+import queue
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+
+from fleet.client.client import Fleet
+from schemas import keys
+from schemas.bus import Latest, Sample
+from schemas.topics import Qos
+
+_STATE_QUERY_TIMEOUT_S: Final = 1.0
+_INBOX_SIZE: Final = 4096
+_MAX_WAITING_QUERIES: Final = 64
+"""Maximum queries in the inbox."""
+_MAX_STATE_QUERIES_AT_ONCE: Final = 4
+_MAX_CARS_QUERIED_SINGLY: Final = 8
+"""Maximum cars with a query of their own. If more arrive together, one query asks all cars."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueriedSample:
+    """A sample from a query, so it may be old."""
+
+    sample: Sample
+
+
+Item = Sample | QueriedSample | zenoh.Query
+
+
+class Inbox:
+    """The inbox of one coordinator. `topics_wanted` returns the topics of which the cars are asked."""
+
+    def __init__(self, client: Fleet, topics_wanted: Callable[[], set[str]]) -> None:
+        self._client = client
+        self._topics_wanted = topics_wanted
+        self.dropped = 0
+        """Number of samples and queries dropped because the inbox was full."""
+        self._subscribed: set[str] = set()
+        self._items: queue.Queue[Item] = queue.Queue(_INBOX_SIZE)
+        self._query_slots = threading.Semaphore(_MAX_WAITING_QUERIES)
+        """Free places for queries in the inbox."""
+        self._tokens: Latest[bool] = Latest()
+        """Changes of tokens by car: True if the gateway is on the bus."""
+        self._arrived: set[str] = set()
+        """Cars whose gateways arrived and whose states were not queried yet."""
+        self._state_queries: list[Future[None]] = []
+
+    # ------------------------------------------------------------------ filling it
+
+    def subscribe(self, expression: str) -> None:
+        """Take the samples of these keys, too."""
+        if expression not in self._subscribed:
+            self._subscribed.add(expression)
+            self._client.bus.subscribe(expression, self._enqueue)
+
+    def watch_gateways(self) -> None:
+        """Take the changes of the gateways' tokens."""
+        token = keys.car_token(self._client.name, "*")
+        self._client.bus.watch_tokens(token, lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
+
+    def on_query(self, query: zenoh.Query) -> bool:
+        """Put a query into the inbox; False if too many wait. Runs on a Zenoh thread."""
+        if not self._query_slots.acquire(blocking=False):
+            return False
+        if self._enqueue(query):
+            return True
+        self._query_slots.release()
+        return False
+
+    def query_states(self, car: str = "*") -> None:
+        """Query the last states and readings of all cars, or of one."""
+        for topic in sorted(self._topics_wanted()):
+            selector = f"{self._client.name}/{car}/{topic}"
+            for answer in self._client.bus.query(selector, timeout_s=_STATE_QUERY_TIMEOUT_S, qos=Qos.STATE):
+                if isinstance(answer, Sample):
+                    self._enqueue(QueriedSample(answer))
+
+    def _enqueue(self, item: Item) -> bool:
+        """Put an item into the inbox; False if it is full. Runs on a Zenoh thread."""
+        try:
+            self._items.put_nowait(item)
+        except queue.Full:
+            self.dropped += 1
+            return False
+        return True
+
+    # ------------------------------------------------------------------ emptying it
+
+    def items(self, wait_s: float) -> Iterator[Item]:
+        """Yield the items in the inbox, as many as it holds. Wait at most `wait_s` for the first."""
+        for _ in range(_INBOX_SIZE):  # later items are for the next step
+            try:
+                item = self._items.get(timeout=wait_s) if wait_s else self._items.get_nowait()
+            except queue.Empty:
+                return
+            wait_s = 0.0
+            if isinstance(item, zenoh.Query):
+                self._query_slots.release()
+            yield item
+
+    def gateways(self) -> Mapping[str, bool]:
+        """Return the cars whose gateways arrived (True) or left since the last call."""
+        return self._tokens.take()
+
+    def query_arrived(self, changes: Mapping[str, bool], pool: ThreadPoolExecutor, *, began: bool) -> None:
+        """Query the states of the cars that arrived. Until the plan `began`, all cars are queried anyway."""
+        for car, alive in changes.items():
+            if alive and began:
+                self._arrived.add(car)
+            elif not alive:
+                self._arrived.discard(car)
+        self._state_queries = [each for each in self._state_queries if not each.done()]
+        if self._arrived and len(self._state_queries) < _MAX_STATE_QUERIES_AT_ONCE:
+            cars, self._arrived = sorted(self._arrived), set()
+            self._state_queries += [
+                pool.submit(self.query_states, car)
+                for car in (cars if len(cars) <= _MAX_CARS_QUERIED_SINGLY else ["*"])
+            ]

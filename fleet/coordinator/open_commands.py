@@ -1,0 +1,65 @@
+"""The commands that the coordinator has sent and that have no outcome yet: modes and colors, and what failed before."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from fleet.client.client import Fleet
+from fleet.client.commands import led_request, mode_request
+from fleet.client.outcome import Outcome
+from fleet.policy.decide import Ask
+
+
+class OpenCommands:
+    """The open commands of one coordinator. Tells each new failure once."""
+
+    def __init__(self, client: Fleet, on_failure: Callable[[str], None]) -> None:
+        self._client = client
+        self._on_failure = on_failure
+        self._modes: dict[str, tuple[Ask, Future[list[Outcome]]]] = {}
+        self._leds: list[tuple[Ask, Future[list[Outcome]]]] = []
+        self._last_failures: dict[str, str] = {}
+
+    @property
+    def busy(self) -> Collection[str]:
+        """The cars that have a command for a mode without an outcome."""
+        return self._modes.keys()
+
+    def send(self, asks: Iterable[Ask], pool: ThreadPoolExecutor) -> None:
+        """Send commands. A car that has not answered for its color yet gets no other color of a blink."""
+        for ask in asks:
+            if ask.blink and any(ask.car == other.car for other, _ in self._leds):
+                continue  # its link or the car is slower than the LED should blink
+            request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
+            future = pool.submit(self._client.ask, request, [ask.car])
+            if ask.mode is not None:
+                self._modes[ask.car] = (ask, future)
+            else:
+                self._leds.append((ask, future))
+
+    def outcomes(self) -> Iterator[tuple[Ask, Outcome]]:
+        """Yield the mode commands that have an outcome by now."""
+        for car, (ask, future) in list(self._modes.items()):
+            if future.done():
+                del self._modes[car]
+                outcome = future.result()[0]
+                yield ask, outcome
+                self._note(car, "" if outcome.ok else f"{car}: {_words(outcome)}")
+        for ask, future in [each for each in self._leds if each[1].done()]:
+            self._leds.remove((ask, future))
+            outcome = future.result()[0]
+            self._note(f"{ask.car} led", "" if outcome.ok else f"{ask.car}: the color of a rule: {_words(outcome)}")
+
+    def forget(self, cars: Iterable[str]) -> None:
+        """Forget the failures of these cars."""
+        for car in cars:
+            self._last_failures.pop(car, None)
+            self._last_failures.pop(f"{car} led", None)
+
+    def _note(self, what: str, words: str) -> None:
+        if words and words != self._last_failures.get(what):  # a blinking LED fails every second
+            self._on_failure(words)
+        self._last_failures[what] = words
+
+
+def _words(outcome: Outcome) -> str:
+    return f"{outcome.reason or outcome.phase}: {outcome.words}"
