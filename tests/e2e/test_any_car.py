@@ -130,7 +130,9 @@ def test_what_a_car_can_show_is_found_out_and_said(cars: KindsUnderTest) -> None
 
     for _ in range(3):
         outcomes = commands(cars, "stop")
-        if all(found(kind) == kind.shows for kind in KINDS):
+        # On a busy machine a report is read late, and its stop is not shown in time. The next one is.
+        ended = all((code, outcome["ok"]) == (0, True) for code, outcome in outcomes.values())
+        if ended and all(found(kind) == kind.shows for kind in KINDS):
             break
     for kind in KINDS:
         assert found(kind) == kind.shows, f"{kind.name}: {cars.fleet.state('health', kind.name)}"

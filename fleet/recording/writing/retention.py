@@ -83,7 +83,7 @@ def _may_go(session: Path) -> bool:
     if description is None or description.kept:
         return False
     try:
-        newest = max((each.stat().st_mtime for each in session.iterdir()), default=0.0)
+        newest = max((each.stat().st_mtime for each in session.iterdir() if not each.name.startswith(".")), default=0.0)
     except OSError:
         return False
     return description.closed or time.time() - newest > _UNCLOSED_IN_USE_S
