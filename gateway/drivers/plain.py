@@ -122,6 +122,8 @@ class PlainModel:
     link_reason: str = "not connected yet"
     range_cm: float | None = None
     range_at: float = float("-inf")
+    turned_at: float = float("-inf")
+    """When its wheels were last seen to turn, if they are measured."""
     sent_motion: Motion = Motion.STOP
     """The last motion written."""
     speed: float = 0.5
@@ -180,7 +182,9 @@ class PlainModel:
         return now - max(self.link_since, self.link_since if self.heard_at is None else self.heard_at)
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
+        """Return in words what shows that a drive moved the car since it began; empty if no reading does."""
+        if self.turned_at > since:
+            return "its wheels turned"
         if range_cm is None or self.range_cm is None or self.range_at < since or abs(self.range_cm - range_cm) < 5.0:
             return ""
         return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"

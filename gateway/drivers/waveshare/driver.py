@@ -332,6 +332,8 @@ class WaveshareDriver(PlainDriver):
         """Take measured wheel speeds: as evidence of a stop, of encoders, or of a motion that nobody commanded."""
         model = self._model
         turning = [abs(speed) >= TURNS_M_S for speed in (event.left_m_s, event.right_m_s)]
+        if any(turning):
+            model.turned_at = event.at
         if model.motors is Motors.ON:
             self._turned = [seen or turns for seen, turns in zip(self._turned, turning, strict=True)]
         self._check_stuck(turning, now)

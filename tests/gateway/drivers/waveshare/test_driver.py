@@ -77,6 +77,8 @@ def test_only_measured_wheels_show_a_stop(platform: str, options: frozenset[str]
     assert model.basis is Basis.SENT, "it was not driven yet"
     episode.ask(Drive(Motion.FORWARD, 0.8))
     episode.run(3.0)
+    drive = next(each for each in episode.records if each.basis)
+    assert bool(drive.evidence) is (shows is not Shows.NO), "wheels that turn show that it drove"
     episode.ask(Stop())
     episode.run(3.0)
     assert (model.motors, model.basis, model.shows) == (Motors.OFF, basis, shows)
