@@ -144,6 +144,17 @@ def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came
     assert published.is_stale("state/link", NOW + 3.1)
 
 
+def test_of_the_answers_of_two_gateways_those_of_the_newer_one_count() -> None:
+    said = {
+        "state/link": (2.0, pb.Link(state="online", boot_id="b")),
+        "state/mode": (1.0, pb.Mode(asked="tracking", boot_id="a")),
+        "state/safety": (2.0, pb.Safety(motors="off", boot_id="b")),
+    }
+    answers = [(topic, Reading("", datetime.fromtimestamp(NOW + at, UTC), each)) for topic, (at, each) in said.items()]
+    state = CarState.of_answers("red", answers, NOW + 2.0, present=True)
+    assert (state.link.state, state.mode.asked, state.safety.motors) == ("online", "", "off")
+
+
 def test_an_answer_that_was_overtaken_and_the_words_of_an_earlier_gateway_do_not_count() -> None:
     state = CarState("red")
     assert state.take("state/link", pb.Link(state="online", boot_id="a"), 10.0)
