@@ -3,6 +3,7 @@
 A kind is a class here and a row in `KINDS`; `gateway.link` has its bytes, under the same scheme.
 """
 
+import ipaddress
 import os.path
 import re
 from abc import ABC, abstractmethod
@@ -332,8 +333,6 @@ def _split(text: str) -> SplitResult:
 
 
 def _host(host: str) -> str:
-    import ipaddress  # a gateway starts faster without it
-
     if host == "localhost":
         return "127.0.0.1"
     try:

@@ -16,6 +16,7 @@ from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_opt
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
+from fleet.recording.writing.disk_space import Reserve
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
@@ -139,7 +140,6 @@ def run(
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
-    from fleet.recording.writing.disk_space import Reserve
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
     from fleet.recording.writing.retention import Quota
     from fleet.recording.writing.session_writer import Options, Sync
