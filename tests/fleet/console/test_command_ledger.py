@@ -44,8 +44,11 @@ def test_the_panel_has_the_doctors_lines() -> None:
     view.on_presence(0.0, present=True)
     view.on_message("state/link", pb.Link(state="lost", reason="unplugged", since_s=4), 1.0)
     view.on_message("event/command", event("rejected", reason="link_down"), 2.0)
-    shown = view.diagnose(5.0)
-    assert shown["findings"] == ["The link has been lost for 4 s: unplugged. Type: fleet scan"]
+    lost = "The link has been lost for 4 s: unplugged. Type: fleet scan"
+    assert view.diagnose(4.0)["findings"] == [lost]
+    shown = view.diagnose(5.0)  # its gateway has said nothing for 4 s
+    hangs, *others = shown["findings"]
+    assert (hangs.rpartition("Type: ")[2], others) == ("fleet logs red", [lost])
     facts = dict(shown["facts"])
     assert facts["link"].startswith("lost (4 s old) for 4 s, 0 frames in")
     assert facts["refused"] == "stop of mia 3 s ago: rejected [link_down]"
