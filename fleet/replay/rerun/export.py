@@ -32,6 +32,8 @@ from fleet.replay.rerun.prepare import Prepared, as_recorded, copied, unreadable
 from schemas.topics import TOPICS
 
 APPLICATION: Final = "zenoh-car-fleet"
+_BAD_SCHEMA: Final = re.compile(r"Invalid schema ([\w.]+)")
+"""In Rerun's error for a file with a damaged schema that we can read. It reads nothing of such a file."""
 _INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
 _TOPIC: Final = "McapChannel:topic"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
@@ -84,6 +86,14 @@ class Part:
 WHOLE_SESSION: Final = Part()
 
 
+class _SchemaRefused(Exception):
+    """Rerun refuses the schema of this name."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the schema {name} is damaged")
+        self.name = name
+
+
 @dataclass(frozen=True, slots=True)
 class Replayed:
     """The recorded messages by result: recorded = shown + left out."""
@@ -109,17 +119,29 @@ def export(
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
         rrd = Path(scratch) / "whole.rrd"
         prepared = as_recorded(session, part.selection, part.has_key, whole=whole)
-        readers = [part.reader(segment) for segment in prepared.files] if prepared is not None else []
-        replayed = _write(session, rrd, out, prepared, readers, part, tab, seen) if prepared is not None else None
-        if replayed is None:
+        replayed: Replayed | None = None
+        refused: set[str] = set()
+        if prepared is not None:
+            readers = [part.reader(segment) for segment in prepared.files]
+            try:
+                replayed = _write(session, rrd, out, prepared, readers, part, tab, seen)
+            except _SchemaRefused as error:
+                refused.add(error.name)
+        while replayed is None:
             # Rerun reads less than there is. A copy costs time and disk space, so it is not made for each session.
-            copies = copied(session, part.selection, part.has_key, Path(scratch))
+            place = Path(scratch) / str(len(refused))
+            place.mkdir()
+            copies = copied(session, part.selection, part.has_key, place, refused)
             if not copies.recorded:
                 damage = f": {session.damage_words}" if session.damage else ""
                 raise NoSession(f"{session.path} has no intact message{part.words}{damage}")
             readers = [WHOLE_SESSION.reader(each) for each in copies.files]
-            replayed = _write(session, rrd, out, copies, readers, part, tab, seen, final=True)
-            assert replayed is not None
+            try:
+                replayed = _write(session, rrd, out, copies, readers, part, tab, seen, final=True)
+            except _SchemaRefused as error:
+                if error.name in refused:
+                    raise ExportFailed(f"Rerun cannot read {session.path}: {error}") from None
+                refused.add(error.name)
         rrd.replace(out)
     return replayed
 
@@ -152,6 +174,9 @@ def _write(
         words = " ".join(str(error).split())
         if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun passes on only the text
             raise KeyboardInterrupt from None
+        if refused := _BAD_SCHEMA.search(words):
+            recording.disconnect()
+            raise _SchemaRefused(refused[1]) from None
         raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
     replayed, missed = tally.compare(prepared)
     if missed and not final:

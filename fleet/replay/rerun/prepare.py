@@ -6,7 +6,7 @@ these, its messages are copied first: into one file for the first schema of each
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -66,10 +66,12 @@ def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole
     return prepared
 
 
-def copied(session: Session, selection: Selection, wanted: Wanted, scratch: Path) -> Prepared:
+def copied(
+    session: Session, selection: Selection, wanted: Wanted, scratch: Path, refused: Collection[str] = ()
+) -> Prepared:
     """Copy the messages into files that Rerun reads whole; raises OSError.
 
-    wanted: whether to copy a key. scratch: an existing directory.
+    wanted: whether to copy a key. scratch: an existing directory. refused: names of schemas that Rerun refuses.
     """
     prepared = Prepared([])
     decoder = MessageDecoder()
@@ -90,7 +92,7 @@ def copied(session: Session, selection: Selection, wanted: Wanted, scratch: Path
                 if schema not in schemas:
                     schemas.append(schema)
                 number = min(schemas.index(schema), MAX_VARIANTS - 1)
-                entry = known[id(info)] = (info, number, _may_abort(decoder, info), _refusal(decoder, info))
+                entry = known[id(info)] = (info, number, _may_abort(decoder, info), _refusal(decoder, info, refused))
             _, number, checked, cause = entry
             if cause is None and checked and _aborts(decoder, row):
                 cause = LeftOutCause.UNKNOWN_ENUM
@@ -134,12 +136,12 @@ def _schema_of(info: ChannelInfo) -> tuple[str, str, bytes]:
     return (info.channel.message_encoding, "", b"") if schema is None else (schema.encoding, schema.name, schema.data)
 
 
-def _refusal(decoder: MessageDecoder, info: ChannelInfo) -> LeftOutCause | None:
+def _refusal(decoder: MessageDecoder, info: ChannelInfo, refused: Collection[str] = ()) -> LeftOutCause | None:
     """Return why a channel must not reach Rerun. One bad schema would fail its reader for all keys."""
     if info.schema is not None and info.schema.encoding == "protobuf":
         if info.channel.message_encoding != "protobuf":
             return LeftOutCause.NOT_PROTOBUF
-        if decoder.class_of(info) is None:
+        if decoder.class_of(info) is None or info.schema.name in refused:
             return LeftOutCause.BAD_SCHEMA
     return None
 

@@ -121,6 +121,10 @@ def test_recorded_is_shown_and_named_in_files_of_chance(tmp_path: Path, first: i
         check(tmp_path, seed)
 
 
+def test_a_schema_that_only_rerun_refuses_costs_its_messages_only(tmp_path: Path) -> None:
+    check(tmp_path, 827)  # one bit of the schema of a plan is another
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_recorded_is_shown_and_named_in_many_files(tmp_path: Path) -> None:
