@@ -1,7 +1,7 @@
 """The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. One row is all that one needs.
 
 To conditions `rate(range.range_m)` is a name like any other, with the range of its row; the snapshot evaluates it. A
-message alone has no past, so `watch`, `wait` and `find` know no functions. There are none yet.
+message alone has no past, so `watch`, `wait` and `find` know no functions.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,10 +26,18 @@ class ConditionFunction:
     """Lowest and highest value, by which a condition can be found impossible."""
 
 
-ROWS: Final[tuple[ConditionFunction, ...]] = ()
+def rate(readings: Measured) -> float | None:
+    """Return the change of a value per second, between the two newest readings that measured it."""
+    if len(readings) < 2:
+        return None
+    (before_at, before), (last_at, last) = readings[-2:]
+    return (last - before) / (last_at - before_at) if last_at > before_at else None
+
+
+ROWS: Final[tuple[ConditionFunction, ...]] = (ConditionFunction("rate", rate, readings=2),)
 FUNCTIONS: Final = {row.name: row for row in ROWS}
 """The functions by name."""
-KEPT_READINGS: Final = max((row.readings for row in ROWS), default=1)
+KEPT_READINGS: Final = max(row.readings for row in ROWS)
 """Number of the newest readings of each topic that a function may look at."""
 
 

@@ -1,4 +1,4 @@
-"""A function of a plan's condition is one row: here one that tells how fast a field changes, and one with a range."""
+"""A function of a plan's condition is one row: `rate`, and here one over three readings and one with a range."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from fleet.client import car_state
 from fleet.client.condition import KeyCondition
 from fleet.conditions import BadExpression, is_contradictory
 from fleet.conditions import parse as parse_condition
-from fleet.conditions.functions import FUNCTIONS, ConditionFunction
+from fleet.conditions.functions import FUNCTIONS, KEPT_READINGS, ROWS, ConditionFunction, rate
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.plan.parser import parse
@@ -21,14 +21,14 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Mode
 
 
-def rate(readings: Sequence[tuple[float, float]]) -> float | None:
+def slope(readings: Sequence[tuple[float, float]]) -> float | None:
     (first_at, first), (last_at, last) = readings[0], readings[-1]
     return None if first_at == last_at else (last - first) / (last_at - first_at)
 
 
 @pytest.fixture(autouse=True)
 def _rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(FUNCTIONS, "rate", ConditionFunction("rate", rate, readings=3))
+    monkeypatch.setitem(FUNCTIONS, "slope", ConditionFunction("slope", slope, readings=3))
     monkeypatch.setitem(FUNCTIONS, "size", ConditionFunction("size", lambda seen: abs(seen[-1][1]), range=(0.0, 9.0)))
     monkeypatch.setattr(car_state, "KEPT_READINGS", 3)
 
@@ -43,7 +43,7 @@ def came(observer: FleetObserver, at: float, range_m: float | None) -> None:
 
 
 def test_a_plan_reads_a_function_of_the_newest_readings() -> None:
-    expression = parse(needs("rate(range_m) < -0.5")).roles["scout"].needs
+    expression = parse(needs("slope(range_m) < -0.5")).roles["scout"].needs
     assert expression is not None
     assert parse(needs(str(expression))).roles["scout"].needs == expression, "its text is a condition, too"
     observer = FleetObserver()
@@ -54,7 +54,7 @@ def test_a_plan_reads_a_function_of_the_newest_readings() -> None:
         held.append(observer.snapshot(()).holds(expression, "red", at))
     assert held == [None, True, True, False, False], "three readings back, and one of them measured nothing"
     used = observer.snapshot(()).used(expression, "red", 3.0)
-    assert used == ("red/sensor/range rate(range_m)=-0.1 (0.0 s old)",)
+    assert used == ("red/sensor/range slope(range_m)=-0.1 (0.0 s old)",)
     observer.on_sleep(60.0)
     assert observer.snapshot(()).holds(expression, "red", 3.0) is None, "stale"
     assert observer.snapshot(()).holds(expression, "red", 3.0, old=True) is False, "all of them slept alike"
@@ -93,3 +93,20 @@ def test_a_function_has_a_range_and_is_measured_where_its_field_is() -> None:
 def test_one_message_has_no_past_so_a_watch_knows_no_function() -> None:
     with pytest.raises(BadExpression, match="rate is not a value"):
         KeyCondition.of("rate(range_m) < 1", "fleet/red/sensor/range")
+
+
+def test_rate_is_the_change_per_second_of_the_two_newest_readings() -> None:
+    assert [row.name for row in ROWS] == ["rate"]
+    assert KEPT_READINGS == 2
+    assert rate([(1.0, 2.0)]) is None
+    assert rate([(0.0, 9.0), (1.0, 2.0), (3.0, 1.0)]) == -0.5
+    assert rate([(1.0, 2.0), (1.0, 1.0)]) is None
+    expression = parse(needs("rate(range_m) < -0.2")).roles["scout"].needs
+    assert expression is not None
+    observer = FleetObserver()
+    observer.on_token("red", 0.0, alive=True)
+    held = []
+    for at, range_m in ((0.0, 2.0), (1.0, 1.9), (2.0, 1.5), (3.0, 1.5)):
+        came(observer, at, range_m)
+        held.append(observer.snapshot(()).holds(expression, "red", at))
+    assert held == [None, False, True, False]
