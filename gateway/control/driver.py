@@ -9,7 +9,7 @@ The two meet in three places. `Desk` is what the gateway shares with its driver:
 writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more than one
 frame in flight.
 
-Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` leads through a driver of 150 lines.
+Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` leads through a whole driver.
 """
 
 from abc import ABC, abstractmethod

@@ -7,7 +7,7 @@ wrong use.
 
 import random
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, Final
@@ -32,6 +32,8 @@ from gateway.control.controller import Controller
 from gateway.control.driver import Driver
 from gateway.control.events import CommandRecord
 from gateway.drivers import Family
+from gateway.drivers.plain import SPEED_STEP, PlainDriver
+from schemas import messages
 from schemas.authority import Sender
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.topics import TOPICS
@@ -63,9 +65,10 @@ _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
 
 class Bench:
-    """A gateway's control with a driver, and a car that never says anything."""
+    """A gateway's control with a driver, and a car that says nothing, or one of its own `samples` now and then."""
 
-    def __init__(self, family: Family, platform: str) -> None:
+    def __init__(self, family: Family, platform: str, samples: Sequence[bytes] = ()) -> None:
+        self._samples = samples
         self.control: Controller[Driver] = Controller("red", family.driver_of(platform, {}))
         self.now = 100.0
         self.sent: list[tuple[float, bytes, FrameOrigin]] = []
@@ -82,6 +85,9 @@ class Bench:
             if self.now >= self._tick_at:
                 self._tick_at = self.now + TICK_S
                 self.control.tick(self.now)
+                said = [event for each in self._samples for event in self.control.driver.feed(each, self.now)]
+                for event in said:
+                    self.control.on_event(event, self.now)
             for event in self.control.driver.flush(self.now):
                 self.control.on_event(event, self.now)
             self.write()
@@ -92,6 +98,8 @@ class Bench:
             write = self.control.poll(self.now)
             if write is None:
                 break
+            if not write.data:
+                self.faults.append(f"an empty frame ({write.why})")
             if count == MAX_FRAMES_AT_ONCE:
                 self.faults.append(f"more than {MAX_FRAMES_AT_ONCE} frames at one moment: {write.data!r}")
                 break
@@ -115,8 +123,8 @@ class Bench:
         return next((each for each in reversed(self.records) if each.command.id == command_id), None)
 
 
-def _connected(family: Family, platform: str) -> Bench:
-    bench = Bench(family, platform)
+def _connected(family: Family, platform: str, samples: Sequence[bytes] = ()) -> Bench:
+    bench = Bench(family, platform, samples)
     bench.control.link_up(bench.now)
     bench.run(30.0)
     return bench
@@ -144,7 +152,7 @@ def check_bytes(family: Family, platform: str) -> Iterator[str]:
     """Check that any bytes are taken, and that what they are does not depend on their pieces."""
     moments = random.Random(1)  # noqa: S311 - no secret
     bench = _connected(family, platform)
-    sent = b"".join(data for _, data, _ in bench.sent)
+    sent = b"".join(data for _, data, _ in bench.sent) or b"\0"
     for _ in range(300):
         data = moments.choice((moments.randbytes(moments.randrange(200)), sent[moments.randrange(len(sent)) :], b"\n"))
         whole, pieces = (family.driver_of(platform, {}) for _ in range(2))
@@ -169,6 +177,44 @@ def check_connect(family: Family, platform: str) -> Iterator[str]:
         yield "nothing was written within 30 s after the link was opened: the car may drive"
     if bench.control.driver.model.basis is Basis.SHOWN:
         yield "a car that said nothing counts as one that has shown its stop"
+    yield from dict.fromkeys(bench.faults)
+
+
+def check_motions(family: Family, platform: str) -> Iterator[str]:
+    """Check that there is a frame for each motion at each speed, and that a stop is none of them."""
+    driver = _connected(family, platform).control.driver
+    if not isinstance(driver, PlainDriver):
+        return  # its frames are its own; `check_drive` sees what it writes
+    stops = {driver.stop_frame(index) for index in range(driver.STOP_FRAMES)} | {driver.motion_frame(Motion.STOP)}
+    for speed in (SPEED_STEP, 0.5, 1.0):
+        driver.model.speed = speed
+        for motion in Motion:
+            try:
+                frame = driver.motion_frame(motion)
+            except (KeyError, ValueError, TypeError) as error:
+                yield f"motion_frame({motion}) raises {type(error).__name__}: {error}"
+                continue
+            if not frame or b"" in stops:
+                yield f"the frame of {motion}, or of a stop, is empty"
+            if motion is not Motion.STOP and frame in stops:
+                yield f"the frame of {motion} at {speed:.0%} is one of the stop"
+
+
+def check_samples(family: Family, platform: str) -> Iterator[str]:
+    """Check that what is measured has a topic and a field. `SAMPLES` of the module: bytes of a real car."""
+    driver = _connected(family, platform).control.driver
+    for sample in getattr(family, "SAMPLES", ()):
+        events = [*driver.feed(sample, 200.0), *driver.flush(210.0)]
+        found = [each for event in events for each in driver.measured(event).items()]
+        if not found:
+            yield f"nothing is measured in {sample!r}"
+        for topic, fields in found:
+            if topic not in TOPICS:
+                yield f"{topic} is no topic"
+                continue
+            known = messages.message_class(TOPICS[topic].message).DESCRIPTOR.fields_by_name
+            for name in fields.keys() - known.keys():
+                yield f"{topic} has no field {name}: it has {', '.join(sorted(known))}"
 
 
 def check_stop(family: Family, platform: str) -> Iterator[str]:
@@ -192,10 +238,12 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
 
 def check_drive(family: Family, platform: str) -> Iterator[str]:
     """Check that a drive goes out or fails, ends with a stop, and is repeated for a dead-man."""
-    bench = _connected(family, platform)
+    bench = _connected(family, platform, getattr(family, "SAMPLES", ()))
     began, before = bench.now, len(bench.sent)
-    drive = bench.ask(Drive(Motion.FORWARD, 4.0))
-    bench.run(MAX_QUEUE_TIME_S + 10.0)
+    dead_man_s = family.profile_of(platform).dead_man_s
+    lasts_s = min(10.0, max(4.0, 2 * (dead_man_s or 0.0)))
+    drive = bench.ask(Drive(Motion.FORWARD, lasts_s))
+    bench.run(MAX_QUEUE_TIME_S + lasts_s + 6.0)
     last = bench.last(drive)
     if last is None or last.phase in (Phase.ASKED, Phase.QUEUED):
         yield "a drive waits for ever"
@@ -203,9 +251,10 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
     if not moved:
         return
     frames = bench.sent[before:]
-    dead_man_s = family.profile_of(platform).dead_man_s
-    during = [at for at, _, _ in frames if at <= began + 4.0]
-    gaps = [b - a for a, b in pairwise(during)]
+    driven = (FrameOrigin.COMMAND, FrameOrigin.REPEAT)
+    during = [at for at, _, why in frames if at <= began + lasts_s and why in driven]
+    ended = next((at for at, _, why in frames if why not in driven), began + lasts_s)
+    gaps = [b - a for a, b in pairwise((*during, min(ended, began + lasts_s)))]
     if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
         yield f"a held motion is not repeated within half of its dead-man of {dead_man_s:g} s"
     stops = (FrameOrigin.STOP, FrameOrigin.RECOVERY)
@@ -213,6 +262,7 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
         yield "the end of a drive sends no stop"
     if bench.control.driver.model.motors is Motors.ON:
         yield "the motors count as on after the drive"
+    yield from dict.fromkeys(bench.faults)
 
 
 def check_actions(family: Family, platform: str) -> Iterator[str]:
@@ -267,6 +317,8 @@ CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
     check_profile,
     check_bytes,
     check_connect,
+    check_motions,
+    check_samples,
     check_stop,
     check_drive,
     check_actions,

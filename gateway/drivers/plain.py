@@ -63,14 +63,20 @@ class PlainProfile:
 
     name: str
     capabilities: frozenset[str]
+    """Words of `schemas.words.CAPABILITIES`."""
     measures: frozenset[str]
     """The sensor topics that it publishes, without `sensor/`."""
     lights: frozenset[Light] = frozenset()
     servos: frozenset[ServoAction] = frozenset()
     cells: int = 2
+    """Number of cells of its battery, by which its level is judged."""
     baud: int = 115200
+    """Rate of its serial port."""
     dead_man_s: float | None = None
+    """The time after which it stops because no *motion* came. Then stops that nothing shows are not repeated. A car
+    that only watches its link (a heartbeat, a closed connection) drives on while the link lives: None."""
     not_observed: tuple[str, ...] = ()
+    """What was read or assumed and not seen on a car, for a person."""
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})
     silent_modes: frozenset[Mode] = frozenset()
 
@@ -251,10 +257,10 @@ class PlainDriver(Driver):
 
     @abstractmethod
     def motion_frame(self, motion: Motion) -> bytes:
-        """Return the frame of a motion, at `self.model.speed`."""
+        """Return the frame of each of the seven motions, at `self.model.speed`. `left` is a curve, `spin_left` none."""
 
     def stop_frame(self, index: int) -> bytes:
-        """Return one frame of a stop, by its place."""
+        """Return one frame of a stop, by its place. The last one is also sent alone, as a repetition of the stop."""
         del index
         return self.motion_frame(Motion.STOP)
 
@@ -273,7 +279,7 @@ class PlainDriver(Driver):
         return ""
 
     def setup_frame(self, now: float) -> bytes | None:
-        """Return the next frame that prepares the car, if one is due."""
+        """Return the next frame that prepares the car, asks it, or keeps its link alive, if one is due."""
         del now
         return None
 
@@ -282,7 +288,7 @@ class PlainDriver(Driver):
         return float("inf")
 
     def on_reading(self, event: Event, now: float) -> None:
-        """Take an event that is a reading."""
+        """Take an event that is a reading: any but `Rejected`, `TextLine` and `Echo`. It counts as a sign of life."""
 
     def on_stop_written(self, data: bytes, now: float) -> None:
         """Note that a frame of a stop was written."""

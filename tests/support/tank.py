@@ -15,6 +15,7 @@ from gateway.drivers.plain import PlainDriver, PlainProfile
 from schemas.words import Cause, Motion
 
 PLATFORMS = ("tank",)
+SAMPLES = (b'{"v":7.9,"dist_cm":42}\n',)
 
 PROFILE = PlainProfile("tank", frozenset({"drive", "speed"}), frozenset({"battery", "range"}))
 SIDES = {

@@ -1,14 +1,16 @@
 """Each family passes the checks that a gateway relies on, and a careless driver does not."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from gateway.control.driver import Event
+from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check
 from gateway.drivers.waveshare import family as waveshare
 from gateway.drivers.yahboom import family as yahboom
+from schemas.words import Motion
 from tests.support import tank
 
 FAMILIES = {"yahboom": yahboom, "waveshare": waveshare, "tank": tank}
@@ -53,18 +55,54 @@ class Splits(tank.TankDriver):
         return [self._event(data, now)] if data else []
 
 
+class Empty(tank.TankDriver):
+    """Stops with nothing."""
+
+    def stop_frame(self, index: int) -> bytes:
+        del index
+        return b""
+
+
+class Lacks(tank.TankDriver):
+    """Knows no way to the right."""
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        known: dict[Motion, Motion] = {each: each for each in Motion if each is not Motion.RIGHT}
+        return super().motion_frame(known[motion])
+
+
+class Misnames(tank.TankDriver):
+    """Publishes a field that does not exist."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {topic: {"range": 1.0} for topic in super().measured(event)}
+
+
+class OnlySays(tank.TankDriver):
+    """Says that the car has a dead-man, and does not feed it."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__(desk)
+        self.model.profile = replace(tank.PROFILE, dead_man_s=5.0)
+
+
 @pytest.mark.parametrize(
     ("driver", "fails"),
     [
         (Talks, {"check_connect", "check_stop", "check_end"}),
         (Mute, {"check_connect", "check_stop", "check_loss", "check_end", "check_bytes", "check_drive"}),
-        (Splits, {"check_bytes"}),
+        (Splits, {"check_bytes", "check_samples"}),
+        (Empty, {"check_connect", "check_motions", "check_drive"}),
+        (Lacks, {"check_motions"}),
+        (Misnames, {"check_samples"}),
+        (OnlySays, {"check_drive"}),
     ],
 )
 def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
     family = SimpleNamespace(
         PLATFORMS=("tank",),
-        profile_of=tank.profile_of,
+        SAMPLES=tank.SAMPLES,
+        profile_of=lambda name: replace(tank.profile_of(name), dead_man_s=5.0 if driver is OnlySays else None),
         profiles=tank.profiles,
         driver_of=lambda name, kept: driver,
     )
