@@ -41,7 +41,7 @@ from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.running_cars import RunningMark
-from schemas.words import FrameVerdict, Level, LinkState, Motors
+from schemas.words import FrameVerdict, Level, LinkState, Motors, Shows
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
@@ -233,8 +233,9 @@ class CarGateway:
         self._ending = True
         self._control.shut_down(self._loop.time())
         if not self._driver.finished:
-            words = "%s: stopping. It takes up to %g s until the car confirms it. A second Ctrl-C ends at once."
-            log.info(words, self._settings.car, SHUTDOWN_S)
+            confirms = self._driver.model.shows is not Shows.NO
+            wait = f" It takes up to {SHUTDOWN_S:g} s until the car confirms it." if confirms else ""
+            log.info("%s: stopping.%s A second Ctrl-C ends at once.", self._settings.car, wait)
         self._wake.set()
 
     async def _check_rival(self) -> None:
