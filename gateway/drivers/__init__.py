@@ -52,7 +52,7 @@ def check_platform(text: str) -> str:
         else:
             profile_of(name)
     except ValueError as error:
-        raise ValueError(f"{error} Leave it out to detect it.") from None
+        raise ValueError(f"{error} Leave it out to find out {', '.join(AUTO_PLATFORMS)}.") from None
     return name
 
 

@@ -273,6 +273,11 @@ class PlainDriver(Driver):
         """Return True if the readings of this car would show a stop now."""
         return False
 
+    @property
+    def hears(self) -> bool:
+        """Return False while the car cannot take frames, as in a boot: then no stop ends as `sent`."""
+        return True
+
     def wait_words(self, now: float) -> str:
         """Return what must happen before the car may be driven, for a person; empty if it may."""
         del now
@@ -385,6 +390,11 @@ class PlainDriver(Driver):
         if self._stop is None or self._stop.is_soft:
             self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
         else:  # the frames of the running one may be lost
+            self.repeat_stop(now)
+
+    def repeat_stop(self, now: float) -> None:
+        """Send the running stop again at once, if there is one."""
+        if self._stop is not None:
             self._stop.index, self._stop.next_at, self._stop.last_at = 0, now, float("-inf")
 
     def recover(self, words: str, now: float) -> None:
@@ -422,7 +432,7 @@ class PlainDriver(Driver):
             return write
         model = self._model
         answers = model.is_heard and (model.heard_at is not None or not model.profile.has_readings)
-        if not self.can_show and answers:
+        if not self.can_show and answers and self.hears:
             if now >= stop.last_at + self.STOPS_WITHIN_S:
                 self._finish(stop, Basis.SENT, model.shows_words, now)
                 return None

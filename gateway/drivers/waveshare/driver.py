@@ -39,6 +39,7 @@ from collections.abc import Mapping
 from enum import Enum, auto
 from typing import Any, ClassVar, Final
 
+from gateway.control.command_log import Pending
 from gateway.control.commands import Action, Drive, Find, SetLight
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
 from gateway.control.events import OutgoingFrame
@@ -62,10 +63,12 @@ ALLOWED: Final = frozenset({DRIVE, PWM, POLL, STREAM, OUTPUTS, DEAD_MAN, STREAM_
 
 DEAD_MAN_MS: Final = 1000
 """The dead-man that a gateway sets: four times `RESEND_S`."""
-STREAM_MS: Final = 100
-"""Interval of the feedback: that of the firmwares' own speed loop."""
+STREAM_MS: Final = 200
+"""Interval of the feedback: 150 bytes so often fit a bridge of 9600 baud, too."""
 LISTEN_S: Final = 0.5
 """Silence after the opening of a link before the first byte of ours. A car that resets then begins to print sooner."""
+LISTEN_MAX_S: Final = 30.0
+"""Maximum time for which a boot is waited for: that of the two Wi-Fi time-outs of 15 s."""
 BOOT_QUIET_S: Final = 2.5
 """Silence that ends a boot. Its longest pause is that of a search for the IMU, 2.2 s."""
 PROBE_S: Final = 1.0
@@ -78,6 +81,8 @@ SILENT_TRIES: Final = 3
 BLIND_TRIES: Final = 10
 """Number of times that the settings go to a car that repeats no line: if its feedback comes at the interval that we
 set, so that our lines arrive, and if not even that is shown."""
+ECHO_TRIES: Final = 3
+"""Number of tries of a stop without an echo, after which its echo counts as switched off."""
 STANDS_S: Final = 0.25
 STANDS_REPORTS: Final = 3
 """Minimum time and number of feedbacks with standing wheels that show a stop: two turns of the speed loop."""
@@ -131,6 +136,7 @@ class WaveshareDriver(PlainDriver):
     """One car of this family."""
 
     STOP_FRAMES: ClassVar[int] = 3
+    STOP_GAP_S: ClassVar[float] = 0.2
     STOPS_WITHIN_S: ClassVar[float] = 0.7
     """Twice the longest turn of the firmware's loop (two searches for a servo, 0.2 s), and a brake from 0.5 m/s."""
     RETRY_S: ClassVar[float] = 1.0
@@ -156,6 +162,16 @@ class WaveshareDriver(PlainDriver):
         """Forget everything that a reset of the car changes."""
         self._setup = Setup.LISTEN
         self._setup_at = listen_until
+        self._listen_until = listen_until + LISTEN_MAX_S
+        self._booting = False
+        """True if it prints the text of a boot."""
+        self._sent.clear()
+        self._unechoed = 0
+        """Number of frames of stops since the last echo."""
+        self._nameless = 0
+        """Number of feedbacks of no known firmware."""
+        self._rest_odometer_m: tuple[float, float] | None = None
+        """The way of the wheels when they were first seen to stand."""
         self._frames: deque[bytes] = deque()
         self._unsure: list[bytes] = []
         """The settings that the car has not repeated yet."""
@@ -168,8 +184,8 @@ class WaveshareDriver(PlainDriver):
         self._turned = [False, False]
         """Whether each wheel was seen to turn in a drive of ours since the set-up."""
         self._echoes = False
-        self._wanted = b""
-        """The last line of the last stop, until it was repeated."""
+        self._wanted: set[bytes] = set()
+        """The last lines of the tries of this stop, until one was repeated."""
         self._stands_since: float | None = None
         self._stands = 0
         self._unasked = 0
@@ -182,7 +198,12 @@ class WaveshareDriver(PlainDriver):
 
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events in the bytes."""
+        if self._booting and self._setup is Setup.LISTEN and b"{" not in data:  # dots, without the end of a line
+            self._listen_on(now)
         return [event for each in self._lines.feed(data) for event in self._events(each, now)]
+
+    def _listen_on(self, now: float) -> None:
+        self._setup_at = min(self._listen_until, max(self._setup_at, now + BOOT_QUIET_S))
 
     def _events(self, text: bytes, now: float) -> list[Event]:
         while self._sent and now > self._sent[0][1] + ECHO_S:
@@ -216,6 +237,10 @@ class WaveshareDriver(PlainDriver):
         topics: dict[str, Fields] = {}
         if self._is_measured:
             topics["sensor/wheels"] = {"left_m_s": event.left_m_s, "right_m_s": event.right_m_s}
+        if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
+            topics["sensor/battery"] = {"voltage_v": event.voltage_v}
+        if self._setup is not Setup.READY or self._here is None:
+            return topics  # an arm may stand in the place of an angle, another chassis in that of the way
         if event.odometer_m is not None:
             topics["sensor/odometer"] = dict(zip(("left_m", "right_m"), event.odometer_m, strict=True))
         if event.attitude_rad is not None:
@@ -223,8 +248,6 @@ class WaveshareDriver(PlainDriver):
         if event.imu_raw is not None:
             names = [f"{part}_{axis}_raw" for part in ("gyro", "accel") for axis in "xyz"]
             topics["sensor/imu"] = dict(zip(names, event.imu_raw, strict=True))
-        if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
-            topics["sensor/battery"] = {"voltage_v": event.voltage_v}
         return topics
 
     def _is_new_voltage(self, volts: float, at: float) -> bool:
@@ -256,19 +279,20 @@ class WaveshareDriver(PlainDriver):
         super().on_event(event, now)
 
     def _on_echo(self, event: Echo) -> None:
-        self._echoes = True
+        self._echoes, self._unechoed = True, 0
         self._unsure = [each for each in self._unsure if each.strip() != event.raw]
-        if self._wanted and event.raw == self._wanted:
-            self._wanted = b""
+        if event.raw in self._wanted and self._stands_since is None:
+            self._wanted.clear()
             self._stands, self._stands_since = 0, event.at
 
     def _on_text(self, event: TextLine, now: float) -> None:
-        if _BOOT.search(event.raw):
-            if self._setup is not Setup.LISTEN:
-                self._on_restart("it prints the text of a boot", now)
-            self._setup_at = max(self._setup_at, now + BOOT_QUIET_S)
-        elif self._setup is Setup.LISTEN:  # a boot goes on
-            self._setup_at = max(self._setup_at, now + BOOT_QUIET_S if self._setup_at > now + LISTEN_S else now)
+        if event.raw.startswith(b"{"):
+            return  # an answer to somebody else, or an error of a servo
+        if _BOOT.search(event.raw) and self._setup is not Setup.LISTEN:
+            self._on_restart("it prints the text of a boot", now)
+        if self._setup is Setup.LISTEN:
+            self._booting = True
+            self._listen_on(now)
 
     def _on_restart(self, why: str, now: float) -> None:
         """Take the permission to drive back: a reset has forgotten the chassis, the dead-man and the stream."""
@@ -285,6 +309,10 @@ class WaveshareDriver(PlainDriver):
             return
         if event.firmware is not None and event.firmware is not self._firmware:
             self._on_firmware(event.firmware, now)
+        if self._firmware is None:
+            self._on_nameless(event, now)
+        if self._booting and self._setup is Setup.LISTEN:  # its loop runs
+            self._booting, self._setup_at = False, now
         self._say_what_it_shows()
         self._was_heard = True
         gap_s, self._feedback_at = event.at - self._feedback_at, event.at
@@ -297,8 +325,18 @@ class WaveshareDriver(PlainDriver):
         if self._is_measured:
             self._on_wheels(event, now)
 
+    def _on_nameless(self, event: Feedback, now: float) -> None:
+        """Say once why a car is not driven whose feedback tells no firmware."""
+        self._nameless += 1
+        if self._nameless != STANDS_REPORTS:
+            return
+        words = f"{self._model.name} is not driven: its feedback is of no known firmware: {event.raw[:120]!r}"
+        self._log.log(Level.WARNING, "platform_contradicted", words, now)
+
     def _say_what_it_shows(self) -> None:
         car = self._model.name
+        if self._model.shows is Shows.YES and not all(self._turned):
+            self._model.shows = Shows.UNKNOWN
         if self._here is None or not self._here.has_encoders:
             words = f"the wheel speeds of {car} are not measured; its dead-man stops it if nothing drives it"
         elif not all(self._turned):
@@ -314,8 +352,11 @@ class WaveshareDriver(PlainDriver):
         return before is not None and max(map(abs, before)) > 0.5 and event.odometer_m == (0.0, 0.0)
 
     def _on_firmware(self, firmware: UgvFirmware, now: float) -> None:
-        model = self._model
+        model, before = self._model, self._firmware
         self._firmware = firmware
+        if before is not None:
+            self._on_restart(f"its feedback is that of {firmware} now", now)
+            self._firmware = firmware
         name, here = model.profile.name, self._here
         evidence = (f"its feedback is that of {firmware}",)
         contradictions = () if here is not None else (f"{name} cars do not have {firmware}",)
@@ -338,8 +379,12 @@ class WaveshareDriver(PlainDriver):
             self._turned = [seen or turns for seen, turns in zip(self._turned, turning, strict=True)]
         self._check_stuck(turning, now)
         stands = event.left_m_s == 0.0 and event.right_m_s == 0.0
-        if stands and self._stands_since is not None and not self._wanted and event.at > self._stands_since:
+        if stands and self._stands_since is not None and event.at > self._stands_since:
             self._stands += 1
+            if self._stands == 1:
+                self._rest_odometer_m = event.odometer_m
+            if event.odometer_m != self._rest_odometer_m:  # it rolls too slowly for a speed
+                self._stands, self._stands_since = 0, event.at
             if self._stands >= STANDS_REPORTS and event.at >= self._stands_since + STANDS_S and all(self._turned):
                 model.shows = Shows.YES
                 self.show_rest(f"{self._stands} feedbacks of standing wheels since it repeated the stop", now)
@@ -411,7 +456,12 @@ class WaveshareDriver(PlainDriver):
         del now
         if self._setup is Setup.READY:
             return ""
-        return "its answer" if self._setup is Setup.PROBE else "its set-up"
+        return "a feedback that tells its firmware" if self._setup is Setup.PROBE else "its set-up"
+
+    @property
+    def hears(self) -> bool:
+        """Return False while it may boot: what is written then is lost, or waits."""
+        return self._setup is not Setup.LISTEN
 
     def setup_at(self) -> float:
         """Return when the next frame of the set-up is due."""
@@ -423,6 +473,9 @@ class WaveshareDriver(PlainDriver):
             return None
         if self._setup is Setup.LISTEN:
             self._setup = Setup.PROBE
+            if self._stop is not None and self._stop.last_at < self._setup_at - SETUP_GAP_S:
+                self.repeat_stop(now)  # what was written in a boot may be lost
+                return None
         if self._setup is Setup.PROBE:
             here = self._here
             if here is None:
@@ -438,8 +491,9 @@ class WaveshareDriver(PlainDriver):
             return self._frames.popleft()
         self._tries += self._was_heard
         self._was_heard = False
-        is_enough = self._tries >= (SILENT_TRIES if self._in_rhythm >= STANDS_REPORTS else BLIND_TRIES)
-        if self._unsure and (self._echoes or not is_enough):
+        shows_it = self._in_rhythm >= STANDS_REPORTS and not self._echoes
+        is_enough = self._tries >= (SILENT_TRIES if shows_it else BLIND_TRIES)
+        if self._unsure and not is_enough:
             self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
             self._frames.extend(self._unsure)
             return None
@@ -468,22 +522,36 @@ class WaveshareDriver(PlainDriver):
         if self._model.motors is Motors.ON:
             self._moved_at = now
 
+    def _begin(self, why: FrameOrigin, now: float, commands: list[Pending], *, is_soft: bool) -> None:
+        """Begin a stop: what was seen before it shows nothing of it."""
+        self._wanted.clear()
+        self._stands_since, self._stands = None, 0
+        super()._begin(why, now, commands, is_soft=is_soft)
+
     def stop_frame(self, index: int) -> bytes:
-        """Return a line of a stop: the duty to zero at once, then the speed, twice. The number marks its echo."""
+        """Return a line of a stop: the duty to zero, twice, then the speed. The number marks its echo.
+
+        The speed loop keeps its integral while the duty is set, and would go on with it. It drops it when the wheels
+        stand. So the speed comes last, and not at once.
+        """
         self._number += 1
-        if index == 0:
-            return b"\n" + line(PWM, L=0, R=0, n=self._number)  # ends a line that a lost link has cut
-        return line(DRIVE, L=0, R=0, n=self._number)
+        if index == self.STOP_FRAMES - 1:
+            return line(DRIVE, L=0, R=0, n=self._number)
+        # The line end ends a line that a lost link has cut.
+        return (b"\n" if index == 0 else b"") + line(PWM, L=0, R=0, n=self._number)
 
     def on_stop_written(self, data: bytes, now: float) -> None:
         """Wait for the echo of the last line of a stop."""
         del now
-        self._wanted, self._stands_since, self._stands = data.strip(), None, 0
+        self._unechoed += 1
+        if self._stop is not None and self._stop.index >= self.STOP_FRAMES:
+            self._wanted.add(data.strip())
 
     @property
     def can_show(self) -> bool:
         """Return True if standing wheels would show a stop now."""
-        return self._is_measured and all(self._turned) and self._echoes
+        is_heard = self._echoes and self._unechoed < ECHO_TRIES * self.STOP_FRAMES
+        return self._is_measured and all(self._turned) and is_heard
 
     def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
         """Return the lines for the lights, which are the two switched outputs."""

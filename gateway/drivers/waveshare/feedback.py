@@ -88,8 +88,13 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
 
 
 def _firmware(found: dict[str, Any]) -> UgvFirmware | None:
-    """Return which firmware reports like this: one has a temperature, the other the way of its wheels."""
-    is_general, is_ros = "temp" in found, "odl" in found and "odr" in found
+    """Return which firmware reports like this: one has a temperature, the other the way of its wheels.
+
+    A relative may lack the one field. Then its angles and volts count, or its gyroscope and hundredths of a volt.
+    """
+    volts = _number(found, "v") or 0.0
+    is_general = "temp" in found or ({"r", "p", "y"} <= found.keys() and 0.0 < volts <= MAX_V)
+    is_ros = "odl" in found or "odr" in found or ("gx" in found and volts > 100.0)
     if is_general is is_ros:
         return None
     return UgvFirmware.GENERAL if is_general else UgvFirmware.ROS
