@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateway.control.commands import AimServo, Drive, Led, SetLight, SetMode, Stop, Whistle
+from gateway.control.commands import AimServo, Drive, EmergencyStop, Led, SetLight, SetMode, Stop, Whistle
 from gateway.drivers.waveshare import driver as waveshare
 from gateway.drivers.waveshare.chassis import FULL_SPEED
 from gateway.sim.model.ir_remote import Button
@@ -152,3 +152,85 @@ def test_no_command_outside_the_list_can_be_written() -> None:
             waveshare.line(kind, cmd=-1)
     with pytest.raises(AssertionError):
         waveshare.line(waveshare.PWM, L=1, R=0)
+
+
+# ---------------------------------------------------------------------- cars and links that differ
+
+
+def test_a_slow_link_shows_its_stops() -> None:
+    episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
+    episode.delay_s = 0.4
+    episode.connect()
+    episode.run(SETTLED_S)
+    episode.ask(Drive(Motion.FORWARD, 2.0))
+    episode.run(6.0)
+    assert episode.control.driver.model.basis is Basis.SHOWN
+
+
+def test_an_echo_that_is_switched_off_ends_stops_as_sent() -> None:
+    episode = ready("ugv_rover")
+    episode.ask(Drive(Motion.FORWARD, 1.0))
+    episode.run(4.0)
+    assert episode.control.driver.model.basis is Basis.SHOWN
+    episode.car.feed(b'{"T":143,"cmd":0}\n', episode.now)
+    for _ in range(2):
+        episode.ask(Stop())
+        episode.run(8.0)
+    assert (episode.control.driver.model.motors, episode.control.driver.model.basis) == (Motors.OFF, Basis.SENT)
+
+
+def test_a_chassis_whose_echo_never_comes_whole_locks_no_car_out() -> None:
+    episode = UgvEpisode(1, "ugv01", frozen_options=frozenset())
+    printed = episode.car._print
+    episode.car._print = lambda data: printed(data.replace(b'"T":900', b'"T": 900'))  # type: ignore[method-assign]  # its own spelling
+    episode.connect()
+    episode.run(SETTLED_S)
+    assert episode.ask(Drive(Motion.FORWARD, 1.0)) is not Phase.REJECTED
+    episode.run(0.8)
+    assert episode.car.moving
+    assert len([each for each in commands(episode) if each["T"] == waveshare.CHASSIS]) <= waveshare.BLIND_TRIES
+
+
+@pytest.mark.parametrize("field", ["temp", "odl"])
+def test_a_relative_that_lacks_a_field_is_driven(field: str) -> None:
+    episode = UgvEpisode(1, "ugv01" if field == "temp" else "ugv_rover", frozen_options=frozenset())
+    printed = episode.car._print
+    episode.car._print = lambda data: printed(data.replace(f'"{field}"'.encode(), b'"other"'))  # type: ignore[method-assign]  # its own names
+    episode.connect()
+    episode.run(SETTLED_S)
+    episode.ask(Drive(Motion.FORWARD, 1.0))
+    episode.run(0.8)
+    assert episode.car.moving
+
+
+def test_a_firmware_that_changes_ends_the_drive() -> None:
+    episode = ready("ugv_rover")
+    episode.ask(Drive(Motion.FORWARD, 5.0))
+    episode.run(1.0)
+    line = b'{"T":1001,"L":0,"R":0,"r":0,"p":0,"y":0,"temp":40,"v":11.5}\r\n'
+    for event in episode.control.driver.feed(line, episode.now):
+        episode.control.on_event(event, episode.now)
+    episode.run(0.6)
+    assert not episode.car.truth.driving
+
+
+def test_errors_of_servos_keep_no_car_from_its_setup() -> None:
+    episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
+    episode.connect()
+    for _ in range(40):
+        episode.car._print(b'{"T":1005,"id":2,"status":0}\r\n')
+        episode.run(0.1)
+    assert episode.control.driver.wait_words(episode.now) == ""  # type: ignore[attr-defined]  # of this family
+
+
+def test_an_estop_in_a_boot_is_repeated_and_counts_for_nothing_until_then() -> None:
+    episode = ready("ugv01", options=frozenset({"mission"}))
+    episode.car.brown_out(episode.now)
+    episode.run(0.02)
+    episode.ask(EmergencyStop("x"))
+    while episode.now < SETTLED_S + 8.0:
+        episode.run(0.05)
+        claimed = episode.control.driver.model.motors is Motors.OFF
+        assert not (claimed and episode.car.truth.driving), episode.now
+    assert not episode.car.moving
+    assert episode.control.driver.model.motors is Motors.OFF
