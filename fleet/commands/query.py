@@ -39,7 +39,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
     """
-    from fleet.recording.catalog import BadQuery, Catalog
+    from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
 
     if (sql is None) is not tables or (as_csv and as_json):
@@ -63,6 +63,8 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
         answer = catalog.query(text)
     except BadQuery as error:
         raise click.UsageError(str(error)) from None
+    except QueryFailed as error:
+        raise click.ClickException(str(error)) from None
     _write(tuple(answer.column_names), _rows(answer), as_csv=as_csv, as_json=as_json)
 
 
