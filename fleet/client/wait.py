@@ -1,13 +1,16 @@
 """Waits until a condition holds of a reading, or has held for some time. Pure: readings and time are arguments."""
 
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
+from fleet.conditions import value_in
+from fleet.conditions.holding import Holding
 from schemas import topics
 
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 CLOCK_STEP_S: Final = 60.0
 """Minimum difference between stamps and arrivals that is a step of a clock, and no delay of a network."""
 
@@ -25,10 +28,12 @@ class _LastMatch:
     """The newest reading of one key."""
 
     at: datetime
-    arrived_s: float | None = None
+    arrived_s: float | None
     """When it was published, s, monotonic; None if a query returned it."""
-    since: datetime | None = None
-    """Time of the first reading since which the condition has held without a gap."""
+    message: str
+    """Its type. Another one has other fields."""
+    holding: Holding | None
+    """Since when the condition holds. None if this type lacks its fields."""
 
 
 class ConditionWait:
@@ -53,19 +58,26 @@ class ConditionWait:
             before = None
         if before is not None and reading.time < before.at:
             return False
-        holds = self._condition.holds(reading)
+        message = reading.value.DESCRIPTOR.full_name
+        expression = self._condition.by_message.get(message)
+        if before is not None and before.message == message:
+            holding = before.holding
+        else:
+            key = reading.key
+            holding = None if expression is None else Holding(expression, lambda _: key, _stale_after_ns)
+        self._seen[reading.key] = _LastMatch(reading.time, arrived_s, message, holding)
+        holds = None
+        if holding is not None:
+            holds = holding.add(reading.key, value_in(reading.value), _ns(reading.time)).value
         if holds is None:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
-        seen = self._seen[reading.key] = _LastMatch(reading.time, arrived_s)
         # What was published just now is not old, even if the clock of its sender is ahead.
-        if not holds or (reading.stale(now) and (arrived_s is None or reading.time < now)):
-            return False
-        unbroken = before is not None and before.since is not None and not _gap(reading, before.at)
-        seen.since = before.since if before is not None and unbroken else reading.time
-        assert seen.since is not None
-        return (reading.time - seen.since).total_seconds() >= self._for_s
+        if holding is not None and reading.stale(now) and (arrived_s is None or reading.time < now):
+            holding.end()
+        span = holding.span if holding is not None else None
+        return span is not None and span.length_s >= self._for_s
 
     def timeout_error(self, written: str, after_s: float, now: datetime) -> NotInTime:
         """Return the error for a timeout."""
@@ -89,8 +101,11 @@ def _is_other_clock(reading: Reading, before: _LastMatch, arrived_s: float | Non
     return abs(stamps_s - (arrived_s - before.arrived_s)) > CLOCK_STEP_S
 
 
-def _gap(reading: Reading, before: datetime) -> bool:
-    """Return True if the time between two readings of a key exceeds the topic's `stale_after_s`."""
-    topic = topics.of_key(reading.key)
+def _stale_after_ns(key: str) -> int | None:
+    topic = topics.of_key(key)
     limit_s = topic.stale_after_s if topic is not None else None
-    return limit_s is not None and (reading.time - before).total_seconds() > limit_s
+    return None if limit_s is None else round(limit_s * 1e9)
+
+
+def _ns(time: datetime) -> int:
+    return (time - _EPOCH) // timedelta(microseconds=1) * 1000

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from fleet.client.client import default_sender
+from fleet.commands.group import chosen_person
 from fleet.commands.options import cli_errors, json_option
-from fleet.commands.output import aligned, echo_safely
+from fleet.commands.output import aligned, echo_csv, echo_safely
 from fleet.commands.params import Duration, car_option
 from fleet.recording import time_spec
+from fleet.recording.session_dir import MAX_MARK_CHARACTERS, NoMark, add_mark
 from fleet.recording.session_lookup import sessions_in, sessions_place
+from schemas import keys
 from schemas.local_time import date_and_clock, with_offset
 
 if TYPE_CHECKING:
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
 
 MAX_FOR_S: Final = 86_400.0
 """Maximum of --for: recordings of lessons and demos are no longer than a day."""
+FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open")
+"""Fields of a hit as JSON and CSV."""
 _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
 
 
@@ -30,6 +36,7 @@ _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last comma
 examples:
   fleet find 'range_m < 0.3'
   fleet find 'not (line.left_inner or line.right_inner)' --car red --for 2s --since monday
+  fleet find 'range_m < 0.1' --mark --csv > near.csv
   fleet find "mode.verdict == 'contradicted'" /media/disk/sessions --json"""
 )
 @click.argument("condition", metavar="CONDITION")
@@ -39,6 +46,8 @@ examples:
 @click.option(
     "--since", metavar="TIME", help="Only since then: monday, yesterday 14:05, 14:05, a date, or 1h (one hour ago)."
 )
+@click.option("--mark", is_flag=True, help="Mark each closed session with a hit, at its first hit.")
+@click.option("--csv", "as_csv", is_flag=True, help="Write CSV, with times in UTC.")
 @json_option
 def find(
     condition: str,
@@ -47,15 +56,20 @@ def find(
     for_s: float | None,
     since: str | None,
     *,
+    mark: bool,
+    as_csv: bool,
     as_json: bool,
 ) -> None:
     """Find when CONDITION held, in every session in DIR (default: sessions).
 
     CONDITION is as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is unknown.
-    A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none.
+    A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none, or if
+    a session with a hit could not be marked. The quota does not remove marked sessions.
     """
     from fleet.recording.tools.find import parse_condition
 
+    if as_csv and as_json:
+        raise click.UsageError("give --csv or --json, not both")
     with cli_errors():
         expression = parse_condition(condition)
     try:
@@ -69,11 +83,15 @@ def find(
     if as_json:
         for path, hit in found:
             click.echo(json.dumps(_to_dict(path, hit)))
+    elif as_csv:
+        echo_csv(FIELDS, [list(_to_dict(path, hit).values()) for path, hit in found])
     elif found:
         header, *lines = aligned([_COLUMNS, *(_row(path, hit) for path, hit in found)])
         echo_safely(header)
         for line, (path, hit) in zip(lines, found, strict=True):
             echo_safely(f"{line}\n  {_open_command(path, hit)}")
+    if mark and not _marked(found, expression):
+        raise click.exceptions.Exit(1)
     if not found:
         raise click.ClickException(f"{expression} was never true in the sessions of {place}.")
 
@@ -109,23 +127,34 @@ def _hits(
         raise click.UsageError(f"--car: no session has {', '.join(missing)}: there are {', '.join(sorted(there))}")
 
 
+def _marked(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
+    """Mark the first hit of each session. Return False if a session cannot be marked; it is named on stderr."""
+    hits: dict[Path, list[Hit]] = {}
+    for path, hit in found:
+        hits.setdefault(path, []).append(hit)
+    are_marked = True
+    for path, some in hits.items():
+        count = "1 hit" if len(some) == 1 else f"{len(some)} hits"
+        text = f"{expression}: {some[0].car}, {count}"[:MAX_MARK_CHARACTERS]
+        try:
+            # The same question tomorrow finds its mark: so the author is the person, without the process.
+            add_mark(path, some[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
+        except (NoMark, OSError) as error:
+            words = error.strerror if isinstance(error, OSError) else error
+            echo_safely(f"{path.name}: not marked: {words}", err=True)
+            are_marked = False
+    return are_marked
+
+
 def _row(path: Path, hit: "Hit") -> tuple[str, ...]:
     times = (date_and_clock(hit.begin_ns / 1e9), date_and_clock(hit.end_ns / 1e9))
     return path.name, hit.car, *times, time_spec.words(hit.length_s), hit.mode or "-", hit.command or "-"
 
 
 def _to_dict(path: Path, hit: "Hit") -> dict[str, object]:
-    return {
-        "session": path.name,
-        "path": str(path),
-        "car": hit.car,
-        "from": time_spec.iso(hit.begin_ns),
-        "to": time_spec.iso(hit.end_ns),
-        "length_s": round(hit.length_s, 3),
-        "mode": hit.mode or None,
-        "command": hit.command or None,
-        "open": _open_command(path, hit),
-    }
+    times = (time_spec.iso(hit.begin_ns), time_spec.iso(hit.end_ns), round(hit.length_s, 3))
+    values = (path.name, str(path), hit.car, *times, hit.mode or None, hit.command or None, _open_command(path, hit))
+    return dict(zip(FIELDS, values, strict=True))
 
 
 def _open_command(path: Path, hit: "Hit") -> str:

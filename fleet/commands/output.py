@@ -1,5 +1,7 @@
 """Output of readings: as a line, a JSON object or a table."""
 
+import csv
+import io
 import json
 import os
 import shutil
@@ -7,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain, islice
 from typing import Any, Final, TypeVar
 
 import click
@@ -21,6 +24,7 @@ from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
+_CSV_ROWS_AT_ONCE: Final = 1024
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -78,6 +82,20 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 def echo_safely(text: str, *, err: bool = False) -> None:
     """Print text that may have names and words of strangers in it, with control characters as escapes."""
     click.echo(printable_lines(text), err=err)
+
+
+def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print a CSV table (RFC 4180), a block of rows at a time. None is an empty cell.
+
+    A terminal gets control characters as escapes. Files and pipes get the cells as they are.
+    """
+    on_terminal = sys.stdout.isatty()
+    left = chain((header,), rows)
+    while block := [["" if cell is None else cell for cell in row] for row in islice(left, _CSV_ROWS_AT_ONCE)]:
+        lines = io.StringIO(newline="")
+        csv.writer(lines, lineterminator="\n" if on_terminal else "\r\n").writerows(block)
+        text = lines.getvalue()
+        click.echo(printable_lines(text) if on_terminal else text, nl=False)
 
 
 def _dot(color: str) -> str:

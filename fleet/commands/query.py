@@ -1,20 +1,24 @@
 """`fleet query`: SQL over the tables of all sessions."""
 
-import csv
-import io
 import json
+import math
 import sys
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import click
 
 from fleet.commands.options import json_option
-from fleet.commands.output import aligned, echo_safely, progress_bar
+from fleet.commands.output import aligned, echo_csv, echo_safely, progress_bar
 from fleet.recording.session_lookup import sessions_in, sessions_place
+from schemas.printable import printable
 
 MAX_CELL: Final = 60
 """Maximum characters of a cell on a terminal. --csv and --json have all of it."""
+ROWS_AT_ONCE: Final = 1024
+"""Rows that are Python's objects at the same time. Each block of a table has its own widths of columns."""
 
 
 @click.command(
@@ -35,7 +39,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
     """
-    from fleet.recording.catalog import BadQuery, Catalog
+    from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
 
     if (sql is None) is not tables or (as_csv and as_json):
@@ -59,39 +63,54 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
         answer = catalog.query(text)
     except BadQuery as error:
         raise click.UsageError(str(error)) from None
+    except QueryFailed as error:
+        raise click.ClickException(str(error)) from None
     _write(tuple(answer.column_names), _rows(answer), as_csv=as_csv, as_json=as_json)
 
 
-def _rows(answer: Any) -> list[tuple[Any, ...]]:
-    columns = [column.to_pylist() for column in answer.columns]
-    return list(zip(*columns, strict=True))
+def _rows(answer: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows, a batch at a time: a million rows are small in Arrow, and large as Python's objects."""
+    for batch in answer.to_batches(max_chunksize=ROWS_AT_ONCE):
+        yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
 
-def _write(header: tuple[str, ...], rows: list[tuple[Any, ...]], *, as_csv: bool, as_json: bool) -> None:
+def _write(header: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, as_csv: bool, as_json: bool) -> None:
     if as_json:
         for row in rows:
-            click.echo(json.dumps(dict(zip(header, row, strict=True)), default=_plain))
+            click.echo(json.dumps({name: _plain(cell) for name, cell in zip(header, row, strict=True)}))
     elif as_csv:
-        out = io.StringIO()
-        writer = csv.writer(out)
-        writer.writerow(header)
-        writer.writerows([["" if cell is None else _plain(cell) for cell in row] for row in rows])
-        click.echo(out.getvalue(), nl=False)
-    elif rows:
-        shown = [tuple(_short(cell) for cell in row) for row in rows]
-        for line in aligned([header, *shown]):
-            echo_safely(line)
+        echo_csv(header, ([_cell(cell) for cell in row] for row in rows))
     else:
-        click.echo("No rows.", err=True)
+        titles, left = tuple(printable(name, MAX_CELL) for name in header), iter(rows)
+        shown = [tuple(_short(cell) for cell in row) for row in islice(left, ROWS_AT_ONCE)]
+        if not shown:
+            click.echo("No rows.", err=True)
+        for line in aligned([titles, *shown]) if shown else ():
+            echo_safely(line)
+        while shown := [tuple(_short(cell) for cell in row) for row in islice(left, ROWS_AT_ONCE)]:
+            for line in aligned(shown):
+                echo_safely(line)
 
 
 def _short(cell: Any) -> str:
-    text = "-" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(_plain(cell))
-    return text if len(text) <= MAX_CELL else f"{text[: MAX_CELL - 1]}…"
+    text = "-" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(_cell(cell))
+    return printable(text, MAX_CELL)
+
+
+def _cell(value: Any) -> Any:
+    """Return a value as one cell. Lists and structs are JSON."""
+    plain = _plain(value)
+    return json.dumps(plain) if isinstance(plain, dict | list) else plain
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as text where JSON has no word for it. Times are UTC."""
+    """Return a value as JSON has it, else as text. Times are UTC. A number that is none (NaN, infinite) is None."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return None
+    if isinstance(value, dict):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
     if hasattr(value, "isoformat"):
         return value.isoformat().replace("+00:00", "Z")
     if isinstance(value, bytes):

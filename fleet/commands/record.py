@@ -291,7 +291,7 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
     """Add a note to the running recording. The quota does not remove a marked session."""
-    from fleet.recording.writing.recorder import MAX_MARK_CHARACTERS
+    from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")

@@ -2,7 +2,8 @@
 
 The caller defines the names and looks up their values; no text is executed. A comparison with a value that was not
 measured is unknown (Kleene's logic). Read `expression` (the tree) first, then `parser`, `fields` (names from messages),
-`functions` (of fields, a row for each) and `satisfiability` (conditions that can never be true).
+`functions` (of fields, a row for each), `holding` (since when one holds) and `satisfiability` (conditions that can
+never be true).
 """
 
 from fleet.conditions.expression import Expression, Lookup

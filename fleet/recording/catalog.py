@@ -3,8 +3,14 @@
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
 as commanded and as seen, the motion, who drove, and the phase of the plan. Topics without a message have views, too.
+
+A view is defined when a question names it: DuckDB then opens files, and a thousand sessions have twenty each.
 """
 
+import re
+import shutil
+import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -12,10 +18,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_lookup import sessions_in, sessions_place
-from fleet.recording.tools.table_cache import CachedTables, tables_of
+from fleet.recording.tools.table_cache import CachedTables, drop_orphans, tables_of
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
 from schemas import messages
+from schemas.printable import printable_lines
 from schemas.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
@@ -32,8 +39,17 @@ CONTEXT: Final[tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = (
 """What `..._context` adds: topic, and for each column its expression. `{c}` is the row of the topic."""
 
 
+MAX_QUERY_ATTEMPTS: Final = 4
+"""Each attempt looks for the sessions anew: the quota deletes them, and those that grow have other tables then."""
+_ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
+
+
 class BadQuery(ValueError):
-    """A question that cannot be answered. The text is that of DuckDB, on one line."""
+    """A question that has no meaning. The text is that of DuckDB, on one line."""
+
+
+class QueryFailed(RuntimeError):
+    """A question that could not be answered here: of memory, disk or files. The text is that of DuckDB, on one line."""
 
 
 class Catalog:
@@ -56,33 +72,62 @@ class Catalog:
         """By name of a session, what of it could not be read."""
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
+        self._views: set[str] = set()
+        scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
+        # DuckDB would write to `.tmp` here, and here may be read-only.
+        weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self._config: dict[str, Any] = {"memory_limit": MEMORY_LIMIT, "temp_directory": scratch}
+        self._database: Any = None
         self._find()
 
     def _find(self) -> None:
-        """Look for the sessions, and define the views anew."""
+        """Look for the sessions, and begin without views."""
         self.damage.clear()
         self.sessions.clear()
+        drop_orphans(self.directory)
         for path in sorted(sessions_in(self.directory)):
             if self._on_session is not None:
                 self._on_session(path)
             try:
                 cached = tables_of(path)
-            except (NoSession, OSError) as error:
+            except NoSession as error:
                 self.damage[path.name] = str(error)
+                continue
+            except OSError as error:
+                self.damage[path.name] = f"its tables cannot be made: {error.strerror or error}"
                 continue
             self.sessions.append(cached)
             if cached.words:
                 self.damage[path.name] = cached.words
-        self._database = self._duckdb.connect(config={"memory_limit": MEMORY_LIMIT})
+        if self._database is not None:
+            self._database.close()
+        self._database = self._duckdb.connect(config=self._config)
         self._database.execute("SET TimeZone = 'UTC'")
-        for topic in TOPICS.values():
-            self._add_view(topic)
-        for topic in TOPICS.values():
-            if topic.family == "sensor":
-                self._add_context(topic)
+        self._views.clear()
+
+    def _define(self, words: str | None) -> None:
+        """Define the views whose names are in a text, and those that they need. None: all views."""
+        text = None if words is None or _ASKS_FOR_VIEWS.search(words.lower()) else words.lower()
+        named = {topic.name for topic in TOPICS.values() if text is None or view_name(topic.name) in text}
+        contexts = {
+            name
+            for name in named
+            if TOPICS[name].family == "sensor" and (text is None or f"{view_name(name)}_context" in text)
+        }
+        if contexts:
+            named |= {other for other, _ in CONTEXT}
+        for name in sorted(named):
+            if name not in self._views:
+                self._add_view(TOPICS[name])
+                self._views.add(name)
+        for name in sorted(contexts):
+            if (view := f"{view_name(name)}_context") not in self._views:
+                self._add_context(TOPICS[name])
+                self._views.add(view)
 
     def tables(self) -> dict[str, list[str]]:
         """Return the columns of each view, by its name."""
+        self._define(None)
         found = self._database.execute(
             "SELECT table_name, column_name FROM information_schema.columns "
             "WHERE table_name NOT LIKE 'empty_%' ORDER BY table_name, ordinal_position"
@@ -93,19 +138,20 @@ class Catalog:
         return columns
 
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> "pa.Table":
-        """Return the answer to a question as a pyarrow.Table. Raises BadQuery."""
-        try:
-            return self._answer(sql, parameters)
-        except self._duckdb.Error as error:
-            if not _is_gone(error):
-                raise BadQuery(_one_line(str(error))) from None
-        self._find()  # the quota has deleted a session meanwhile, or its tables
-        try:
-            return self._answer(sql, parameters)
-        except self._duckdb.Error as error:
-            raise BadQuery(_one_line(str(error))) from None
+        """Return the answer to a question as a pyarrow.Table. Raises BadQuery, QueryFailed."""
+        attempts = MAX_QUERY_ATTEMPTS
+        while True:
+            try:
+                return self._answer(sql, parameters)
+            except self._duckdb.Error as error:
+                attempts -= 1
+                if not attempts or not _is_gone(error):
+                    kind = QueryFailed if isinstance(error, self._duckdb.OperationalError) else BadQuery
+                    raise kind(_one_line(str(error))) from None
+            self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
+        self._define(sql)
         answer: Any = self._database.sql(sql, params=list(parameters) or None)
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
@@ -115,20 +161,38 @@ class Catalog:
 
     def _add_view(self, topic: Topic) -> None:
         name = view_name(topic.name)
-        files = [str(each) for cached in self.sessions for each in cached.files(topic.message)]
-        if not files:
-            empty = f"empty_{name}"
-            self._database.register(empty, _empty(topic))
-            source = f'SELECT NULL::VARCHAR AS session, * FROM "{empty}"'  # noqa: S608 - a name of ours
-        else:
-            listed = ", ".join(_text(each) for each in files)
-            # The session is the directory above that of its tables.
-            session = "regexp_extract(filename, '([^/\\\\]+)[/\\\\][^/\\\\]+[/\\\\][^/\\\\]+$', 1)"
-            read = f"read_parquet([{listed}], union_by_name=true, filename=true)"
-            source = f"SELECT {session} AS session, * EXCLUDE (filename) FROM {read}"  # noqa: S608 - quoted above
+        empty = f"empty_{name}"
+        self._database.register(empty, _empty(topic))
+        ours = self._columns(f'"{empty}"')
+        # By columns: those of this version, then the others. A column that has another type in a file is null where it
+        # has no value of ours. One that only other versions have is text.
+        groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
+        for cached in self.sessions:
+            for file in cached.files(topic.message):
+                same = not cached.is_foreign(file)
+                columns = ours if same else self._columns(f"read_parquet([{_text(str(file))}])")
+                groups.setdefault(tuple(columns.items()), []).append(str(file))
+        parts = [f'SELECT NULL::VARCHAR AS session, * FROM "{empty}"']  # noqa: S608 - a name of ours
+        for group, files in groups.items():
+            there = dict(group)
+            chosen = [_column(column, kind, there.get(column)) for column, kind in ours.items()]
+            chosen += [
+                f"CAST({_quoted(column)} AS VARCHAR) AS {_quoted(column)}" for column in there.keys() - ours.keys()
+            ]
+            listed = ", ".join(map(_text, files))
+            parts.append(
+                f"SELECT {_SESSION} AS session, {', '.join(chosen)} "  # noqa: S608 - all is quoted
+                f"FROM read_parquet([{listed}], filename=true)"
+            )
+        source = " UNION ALL BY NAME ".join(parts[1:] or parts)
         # Several topics may share a message.
         own = f"SELECT * FROM ({source}) WHERE key LIKE {_text('%/' + topic.name)}"  # noqa: S608 - quoted
         self._database.execute(f'CREATE VIEW "{name}" AS {own}')
+
+    def _columns(self, source: str) -> dict[str, str]:
+        """Return the types of the columns."""
+        found = self._database.execute(f"DESCRIBE FROM {source}").fetchall()
+        return {name: kind for name, kind, *_ in found}
 
     def _add_context(self, topic: Topic) -> None:
         name = view_name(topic.name)
@@ -148,6 +212,11 @@ class Catalog:
         self._database.execute(f'CREATE VIEW "{name}_context" AS {joined}')
 
 
+_FOLDERS: Final = r"([^/\\]+)[/\\][^/\\]+[/\\][^/\\]+$"
+# The session is the directory above that of its tables. That of a single file is hidden, beside it.
+_SESSION: Final = f"regexp_replace(regexp_extract(filename, '{_FOLDERS}', 1), '^\\.(.*)$', '\\1')"
+
+
 def view_name(topic: str) -> str:
     """Return the name of a topic's view: `sensor_range`, `coordinator_plan`."""
     return topic.replace("@", "").replace("/", "_")
@@ -155,6 +224,18 @@ def view_name(topic: str) -> str:
 
 def _empty(topic: Topic) -> "pa.Table":
     return ArrowSink(Layout(messages.message_class(topic.message).DESCRIPTOR).columns, "us").table()
+
+
+def _column(name: str, kind: str, there: str | None) -> str:
+    """Return the expression of a column of ours. there: its type in the files; None if they lack it."""
+    quoted = _quoted(name)
+    if there is None:
+        return f"NULL::{kind} AS {quoted}"
+    return quoted if there == kind else f"TRY_CAST({quoted} AS {kind}) AS {quoted}"
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
 
 
 def _text(value: str) -> str:
@@ -168,4 +249,4 @@ def _is_gone(error: Exception) -> bool:
 def _one_line(text: str) -> str:
     """Return the message of DuckDB without the picture of the place."""
     lines: Iterable[str] = (line.strip() for line in text.splitlines())
-    return " ".join(line for line in lines if line and not line.startswith(("^", "LINE")))
+    return printable_lines(" ".join(line for line in lines if line and not line.startswith(("^", "LINE"))))

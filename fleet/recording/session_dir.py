@@ -23,7 +23,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
 
-from fleet.recording.time_spec import format_utc
+from fleet.recording.time_spec import format_utc, iso
 from schemas.atomic_file import write_atomically
 
 SESSION_FILE: Final = "session.json"
@@ -34,6 +34,8 @@ SPARE_BYTES: Final = 256 * 1024
 FLEET_FILE: Final = "fleet.yaml"
 PLAN_FILE: Final = "plan.yaml"
 SEGMENTS: Final = "[0-9][0-9][0-9][0-9].mcap"
+MAX_MARK_CHARACTERS: Final = 1000
+"""Maximum length of the text of a mark, and of its author."""
 FORMAT_VERSION: Final = 1
 """Version of the layout. Increase it if older readers could misread a session."""
 
@@ -106,6 +108,39 @@ class SessionInfo:
             spare.replace(directory / SESSION_FILE)
             with contextlib.suppress(OSError):  # from the space that the old description has freed
                 reserve(directory)
+
+
+class NoMark(Exception):
+    """A session cannot take a mark. The message gives the reason."""
+
+
+def add_mark(directory: Path, at_ns: int, text: str, by: str) -> None:
+    """Add a mark to `session.json` of a closed session, and exempt it from the quota. Raises NoMark, OSError.
+
+    at_ns: the moment that is marked, ns since the epoch. A mark that is there already is not added again. The recorded
+    messages stay as they are, so the mark has the key `added`: the time of its making. Only `@recorder/mark` in a file
+    has marks that were set during recording.
+    """
+    if not directory.is_dir():
+        raise NoMark(f"it is one file without {SESSION_FILE}, where marks of closed sessions are")
+    path = directory / SESSION_FILE
+    if not path.exists():
+        raise NoMark(
+            f"it has no {SESSION_FILE}, where marks of closed sessions are: `fleet sessions recover` makes one"
+        )
+    info = SessionInfo.read(directory)
+    if info is None or info.format > FORMAT_VERSION:
+        raise NoMark(f"its {SESSION_FILE} cannot be read by this version")
+    if not info.closed:
+        # A recorder would write its own description over this one.
+        raise NoMark("the recorder has not closed it: `fleet mark` marks now, `fleet sessions recover` closes it")
+    mark = {"time": iso(at_ns), "text": text, "by": by}
+    if any({name: each.get(name) for name in mark} == mark for each in info.marks):
+        return
+    # Fields of a newer version stay.
+    values = json.loads(path.read_text(encoding="utf-8"))
+    values["marks"] = [*info.marks, {**mark, "added": format_utc(datetime.now(UTC))}]
+    replace(path, {**values, "kept": True}, indent=2)
 
 
 def is_full(error: OSError) -> bool:

@@ -22,6 +22,7 @@ BENCHMARKS = {
     "record": "recording",
     "replay": "replaying",
     "sessions": "sessions",
+    "questions": "questions",
     "fleet": "fleet",
     "plan": "planning",
     "cli": "command_line",

@@ -1,16 +1,17 @@
 """Finds when a condition of a plan held in a session. `ConditionRun` is pure; `find_in` reads the messages.
 
-The meaning is that of plans and of `fleet wait --for`. Names are those of plans. A value that was not measured is
-unknown, and so is a stale one. A hit lasts from the first reading to the last one that shows it: what nobody measured
-between two readings counts, unless a value got stale there. So a gap is never true.
+The meaning is that of plans and of `fleet wait --for`: `Holding` evaluates both. Names are those of plans. A value that
+was not measured is unknown, and so is a stale one. A hit lasts from the first reading to the last one that shows it:
+what nobody measured between two readings counts, unless a value got stale there. So a gap is never true.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.conditions import BadExpression, Expression, parse, value_in
 from fleet.conditions.expression import KINDS
+from fleet.conditions.holding import HeldSpan, Holding
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.snapshot import ALIASES, NAMES, topic_of
 from fleet.recording.reading.message_decoder import MessageDecoder
@@ -64,11 +65,14 @@ class ConditionRun:
     for_s: float = 0.0
     """Minimum length of a hit, s."""
     hits: list[Hit] = field(default_factory=list)
-    _readings: dict[str, tuple[int, Mapping[str, object]]] = field(default_factory=dict)
-    """Time and values of the newest reading by topic."""
-    _current: Hit | None = None
+    _holding: Holding = field(init=False)
     _mode: str = ""
     _command: str = ""
+    _at_begin: tuple[str, str] = ("", "")
+    """Mode and command when the current hit began."""
+
+    def __post_init__(self) -> None:
+        self._holding = Holding(self.expression, topic_of, _STALE_NS.__getitem__)
 
     def command(self, words: str) -> None:
         """Note the last command."""
@@ -80,36 +84,25 @@ class ConditionRun:
 
     def add(self, topic: str, fields: Mapping[str, object], at_ns: int) -> None:
         """Take in the values of one reading. `topic`: one that the condition uses."""
-        for other, (seen_ns, _) in self._readings.items():
-            after_ns = _STALE_NS[other]
-            if after_ns is not None and seen_ns + after_ns < at_ns and not self._holds(seen_ns + after_ns + 1):
-                self._end()
-        self._readings[topic] = at_ns, fields
-        if not self._holds(at_ns):
-            self._end()
-        elif self._current is None:
-            self._current = Hit(self.car, at_ns, at_ns, self._mode, self._command)
-        else:
-            self._current = replace(self._current, end_ns=at_ns)
+        before = self._holding.span
+        self._keep(self._holding.add(topic, fields.get, at_ns).ended)
+        span = self._holding.span
+        if span is not None and (before is None or span.begin_ns != before.begin_ns):
+            self._at_begin = self._mode, self._command
 
     def close(self) -> list[Hit]:
         """Return all hits. The last one ends with the last reading."""
-        self._end()
+        self._keep(self._holding.end())
         return self.hits
 
-    def _holds(self, at_ns: int) -> bool:
-        def lookup(name: str) -> object | None:
-            topic = topic_of(name)
-            seen_ns, fields = self._readings.get(topic, (at_ns, {}))
-            after_ns = _STALE_NS[topic]
-            return None if after_ns is not None and at_ns - seen_ns > after_ns else fields.get(name)
+    @property
+    def lasting_s(self) -> float | None:
+        """Return how long it has held until the newest reading, s; None if it does not hold."""
+        return None if self._holding.span is None else self._holding.span.length_s
 
-        return self.expression.value(lookup) is True
-
-    def _end(self) -> None:
-        if self._current is not None and self._current.length_s >= self.for_s:
-            self.hits.append(self._current)
-        self._current = None
+    def _keep(self, span: HeldSpan | None) -> None:
+        if span is not None and span.length_s >= self.for_s:
+            self.hits.append(Hit(self.car, *span, *self._at_begin))
 
 
 def find_in(

@@ -187,10 +187,10 @@ def total(session: Session) -> int | None:
 
 
 def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]:
-    """Return the marks of a session from session.json, else from its messages."""
-    if about.marks:
+    """Return the marks of a session from session.json, else from its messages. Those added later are in both cases."""
+    if any("added" not in mark for mark in about.marks):
         return list(about.marks)
-    found: list[Mapping[str, Any]] = []
+    found: list[Mapping[str, Any]] = list(about.marks)
     for log_ns, message in _messages(session, about, MARK_TOPIC_NAME):
         text, by = getattr(message, "message", ""), getattr(message, "name", "")
         found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})

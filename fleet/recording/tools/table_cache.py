@@ -1,33 +1,43 @@
 """Keeps the tables of a session as Parquet beside it, for questions to many sessions.
 
 The tables of one state of a session are in the directory `.tables-<digest>`. The digest is of its files, their sizes
-and and times, and of the columns of our tables. So a session that grew has another directory, and the old one goes. A
+and times, and of the columns of our tables. So a session that grew has another directory, and the old one goes. A
 directory has its name only when it is whole: two questions at once make it twice, and one of the two is kept. Whoever
-deletes it loses nothing but time.
+deletes it loses nothing but time. A table whose columns are not those of this version is named `.foreign.parquet`.
 """
 
 import errno
 import hashlib
+import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import SEGMENTS
 from fleet.recording.tools.export import export
 from fleet.recording.tools.table_formats import ParquetSink
-from fleet.recording.tools.tables import Layout
+from fleet.recording.tools.tables import Column, Layout
 from schemas import messages
 from schemas.topics import TOPICS
 
 PREFIX: Final = ".tables-"
 _PART: Final = ".part"
+_NOTE: Final = "damage"
+"""Name of the file that says what of the session could not be read."""
+_FOREIGN: Final = ".foreign.parquet"
+_FORMAT: Final = "2"
+"""Increase it if what is in a directory changes, so that all are made anew."""
+STALE_PART_S: Final = 600.0
+"""Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
+every few seconds: a thousand messages each."""
 _READ_ONLY: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -40,10 +50,24 @@ class CachedTables:
     words: str = ""
     """What of the session could not be read; empty if all was."""
 
+    names: tuple[str, ...] = ()
+    """The files in the directory."""
+
+    @classmethod
+    def of(cls, session: Path, directory: Path) -> Self:
+        """Return what is in a directory. Raises OSError, also if another question deletes it now."""
+        names = tuple(sorted(os.listdir(directory)))  # noqa: PTH208 - a path for each name costs half of a question
+        note = directory / _NOTE
+        return cls(session, directory, note.read_text(encoding="utf-8") if _NOTE in names else "", names)
+
     def files(self, message: str) -> Iterator[Path]:
         """Yield the tables of a message type. There are several if its fields changed within the session."""
-        name = re.compile(rf"{re.escape(message)}(-\d+)?\.parquet")
-        yield from (each for each in sorted(self.directory.iterdir()) if name.fullmatch(each.name))
+        name = re.compile(rf"{re.escape(message)}(-\d+)?(\.foreign)?\.parquet")
+        yield from (self.directory / each for each in self.names if each.startswith(message) and name.fullmatch(each))
+
+    def is_foreign(self, file: Path) -> bool:
+        """Return True if the columns of a table are not those of this version."""
+        return file.name.endswith(_FOREIGN)
 
 
 def is_cached(session: Path) -> bool:
@@ -54,9 +78,10 @@ def is_cached(session: Path) -> bool:
 def tables_of(session: Path) -> CachedTables:
     """Return the tables of a session, made now if they are not there. Raises NoSession, OSError, FormatMissing."""
     for place in _places(session):
-        if place.is_dir():
-            note = place / "damage"
-            return CachedTables(session, place, note.read_text(encoding="utf-8") if note.exists() else "")
+        with suppress(FileNotFoundError):
+            return CachedTables.of(session, place)
+    if not session.exists():
+        raise NoSession(f"{session} is gone: it was deleted meanwhile.")
     errors: list[OSError] = []
     for place in _places(session):
         try:
@@ -69,24 +94,67 @@ def tables_of(session: Path) -> CachedTables:
 
 
 def _made(session: Path, place: Path) -> CachedTables:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
+    if place.parent != session:  # which must not appear again when the quota has deleted it
+        place.parent.mkdir(parents=True, exist_ok=True)
+    _drop_stale_parts(place.parent)
     try:
-        read = Session(session)
-        export(read.rows(), part, ParquetSink)
-        words = read.damage_words
-        if words:
-            (part / "damage").write_text(words, encoding="utf-8")
-        with suppress(OSError):  # another question has made it meanwhile
-            part.rename(place)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    shutil.rmtree(part, ignore_errors=True)
+        part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
+        try:
+            read = Session(session)
+            export(read.rows(), part, _Sink)
+            if words := read.damage_words:
+                (part / _NOTE).write_text(words, encoding="utf-8")
+            with suppress(OSError):  # another question has made it meanwhile
+                part.rename(place)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    except FileNotFoundError:
+        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
     _drop_others(place)
-    if not place.is_dir():
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.")
-    return CachedTables(session, place, words)
+    try:
+        return CachedTables.of(session, place)
+    except FileNotFoundError:
+        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
+
+
+class _Sink(ParquetSink):
+    """A table in the cache. Its name says whether its columns are those of this version."""
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None:
+        message = re.sub(r"-\d+$", "", path.stem)
+        ours = _layouts().get(message)
+        is_foreign = ours is not None and _facts(columns) != ours
+        super().__init__(path.with_name(f"{path.stem}{_FOREIGN}") if is_foreign else path, columns)
+
+
+@cache
+def _layouts() -> dict[str, list[tuple[str, str]]]:
+    """Return names and kinds of the columns of our tables, by message."""
+    names = {topic.message for topic in TOPICS.values()}
+    return {name: _facts(Layout(messages.message_class(name).DESCRIPTOR).columns) for name in names}
+
+
+def _facts(columns: Sequence[Column]) -> list[tuple[str, str]]:
+    return [(each.name, f"{each.kind} {each.item}") for each in columns]
+
+
+def drop_orphans(place: Path) -> None:
+    """Delete the tables of single files of a directory that are gone. Those of a directory went with it."""
+    for home in place.glob(".*.mcap"):
+        if home.is_dir() and not (place / home.name[1:]).exists():
+            for tables in home.glob(f"{PREFIX}*"):
+                shutil.rmtree(tables, ignore_errors=True)
+            with suppress(OSError):  # somebody else's directory
+                home.rmdir()
+
+
+def _drop_stale_parts(home: Path) -> None:
+    """Delete what a process left that was killed, or lost its power."""
+    for part in home.glob(f"{PREFIX}*{_PART}"):
+        with suppress(OSError):
+            newest = max(each.stat().st_mtime for each in (part, *part.iterdir()))
+            if time.time() - newest > STALE_PART_S:
+                shutil.rmtree(part, ignore_errors=True)
 
 
 def _drop_others(place: Path) -> None:
@@ -101,19 +169,20 @@ def _places(session: Path) -> tuple[Path, Path]:
     name = f"{PREFIX}{_digest(session)}"
     home = session if session.is_dir() else session.parent / f".{session.name}"
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
-    return home / name, Path(tempfile.gettempdir()) / "zenoh-car-fleet-tables" / owner / session.name / name
+    # Each user has a directory: another one's cannot be written.
+    user = f"zenoh-car-fleet-tables-{os.getuid() if hasattr(os, 'getuid') else 0}"
+    return home / name, Path(tempfile.gettempdir()) / user / owner / session.name / name
 
 
 @cache
-def _layout() -> str:
-    """Return the columns of all our tables. Where a version names one differently, all caches are made anew."""
-    columns = (Layout(messages.message_class(each.message).DESCRIPTOR).columns for each in TOPICS.values())
-    return repr([[(each.name, each.kind) for each in table] for table in columns])
+def _layouts_text() -> str:
+    return repr(sorted(_layouts().items()))
 
 
 def _digest(session: Path) -> str:
     files = sorted(session.glob(SEGMENTS)) if session.is_dir() else [session]
-    facts = [_layout()]
+    # Where a version names a column differently, all are made anew.
+    facts = [_FORMAT, _layouts_text()]
     for each in files:
         with suppress(FileNotFoundError):  # the quota deletes it meanwhile
             state = each.stat()

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import zenoh
 
+from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.receive_clock import ReceiveClock
 from fleet.recording.writing.retention import Quota
@@ -50,8 +51,6 @@ MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 STATUS_TIMEOUT_S: Final = 5.0
 """Timeout for the status of another recorder, which answers only between two writes to its disk."""
 MAX_PENDING_QUERIES: Final = 64
-MAX_MARK_CHARACTERS: Final = 1000
-"""Maximum length of the text of a mark, and of its author."""
 
 STATUS_TOPIC: Final = TOPICS["@recorder/status"]
 MARK_TOPIC: Final = TOPICS["@recorder/mark"]

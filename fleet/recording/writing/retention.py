@@ -1,6 +1,7 @@
 """The quota of a recorder: how large all sessions may be together, and which ones it removes."""
 
 import contextlib
+import errno
 import shutil
 import time
 from dataclasses import dataclass
@@ -55,7 +56,7 @@ class Quota:
                 break
             if session != keep and _may_go(session):
                 try:
-                    shutil.rmtree(session)
+                    _remove(session)
                 except OSError:
                     continue  # perhaps another user's; the warning reports the excess
                 removed.append(session)
@@ -67,6 +68,16 @@ class Quota:
     def removal(session: Path) -> str:
         """Return the news that this session was removed."""
         return f"{session} is removed, the oldest session without a mark: the quota is full"
+
+
+def _remove(session: Path) -> None:
+    """Delete a session. Raises OSError."""
+    try:
+        shutil.rmtree(session)
+    except OSError as error:
+        if error.errno != errno.ENOTEMPTY:
+            raise
+        shutil.rmtree(session)  # a question was making its tables in it, and fails now
 
 
 def _size(session: Path) -> int:

@@ -6,6 +6,8 @@ contents of the session for the layout.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
 from math import cos, sin
 from typing import Any, Final
 
@@ -15,6 +17,7 @@ import pyarrow.compute as pc  # type: ignore[import-untyped]  # likewise
 import rerun as rr
 import rerun.chunk as rrc
 
+from fleet.recording.tools.summary import MARK_TOPIC_NAME
 from fleet.replay import panels
 from fleet.replay.colors import OFF, rgb
 from fleet.replay.rerun.lenses import component, is_drawn, numbers, triples
@@ -36,6 +39,8 @@ _LAMP_COLOR: Final = (255, 225, 90)
 _THING_COLOR: Final = (170, 140, 110)
 _WALL_COLOR: Final = (150, 155, 165)
 _TAPE_COLOR: Final = (220, 220, 220)
+MAX_NS: Final = 2**63
+"""Times of Rerun are below."""
 _Times = dict[str, Any]
 _MAX_LEDS: Final = 256
 """Maximum LED colors that get their own color in tracks, and LED commands awaiting their outcome."""
@@ -128,6 +133,27 @@ class Drawing:
             )
             yield rrc.Chunk.from_columns(f"{panels.entity(key)}/way", indexes=[], columns=strip)
             yield rrc.Chunk.from_columns(panels.entity(key), indexes=[], columns=name)
+
+    def added_marks(
+        self, marks: Iterable[Mapping[str, Any]], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Any]:
+        """Yield the marks of session.json that no message has: they were added after the recording.
+
+        start_ns, end_ns (excluded): the times that are shown, ns since the epoch; None for all.
+        """
+        found: list[tuple[int, str]] = []
+        for mark in marks:
+            with suppress(ValueError, OverflowError):  # somebody wrote this time by hand
+                at_ns = round(datetime.fromisoformat(str(mark.get("time"))).timestamp() * 1000) * 1_000_000
+                if "added" in mark and (start_ns or 0) <= at_ns < (end_ns or MAX_NS):
+                    found.append((at_ns, str(mark.get("text"))))
+        if found:
+            key = keys.topic_key(self.contents().fleet, keys.RECORDER, MARK_TOPIC_NAME.partition("/")[2])
+            self.counts[key] += len(found)
+            at = np.array([ns for ns, _ in found], dtype="datetime64[ns]")
+            columns = rr.TextLog.columns(text=[text for _, text in found], level=["INFO"] * len(found))
+            indexes = _indexes(dict.fromkeys(TIMELINES, at))
+            yield rrc.Chunk.from_columns(panels.entity(key), indexes=indexes, columns=columns)
 
     def ground(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Return the lowest and highest x and y of walls and paths in meters; None without a simulated car."""

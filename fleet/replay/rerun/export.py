@@ -187,7 +187,9 @@ def _write(
     if not contents.cars and not contents.services:
         why = f": {'; '.join(replayed.left_out.words())}" if replayed.left_out.total else ""
         raise NoSession(f"{session.path} has no message of a fleet{part.words}{why}")
-    recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), drawing.static())))
+    description = session.description
+    marks = drawing.added_marks(description.marks if description is not None else (), part.start_ns, part.end_ns)
+    recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), marks, drawing.static())))
     recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
     recording.disconnect()
     try:

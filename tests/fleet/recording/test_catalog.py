@@ -1,24 +1,36 @@
 """Questions in SQL to all sessions, and the tables that are kept beside them."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
 from fleet import Catalog
-from fleet.recording.catalog import BadQuery, view_name
+from fleet.commands.query import MAX_CELL
+from fleet.recording.catalog import BadQuery, QueryFailed, view_name
 from fleet.recording.reading.session import NoSession
+from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools import table_cache
-from fleet.recording.tools.table_cache import PREFIX, is_cached, tables_of
+from fleet.recording.tools.table_cache import PREFIX, STALE_PART_S, is_cached, tables_of
+from fleet.recording.writing.retention import Quota
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
-from tests.fleet.replay.make_session import Made
+from tests.fleet.replay.make_session import START_NS, Made
 from tests.support import in_process
+from tests.support.disk import MAY_MOUNT, disk
+from tests.support.processes import wait_for
+from tests.support.terminal import Terminal
 
 
 def make(path: Path, car: str, distances: list[float]) -> None:
@@ -185,3 +197,242 @@ def test_no_sessions_are_no_traceback(tmp_path: Path) -> None:
     assert query("SELECT 1", tmp_path / "nowhere").returncode == 1
     (tmp_path / "empty").mkdir()
     assert query("SELECT count(*) FROM sensor_range", tmp_path / "empty").stdout.split()[-1] == "0"
+
+
+def no_tables(place: Path) -> bool:
+    """Return True if nothing is left of tables, whole or half made."""
+    return not [*place.rglob(f"{PREFIX}*")]
+
+
+def test_of_many_sessions_the_damaged_ones_are_named_and_their_intact_rest_counts(tmp_path: Path) -> None:
+    for number in range(300):
+        make(tmp_path / f"s{number:03d}", "red", [1.0])
+    for number in range(0, 300, 30):
+        file = tmp_path / f"s{number:03d}" / "0001.mcap"
+        file.write_bytes(file.read_bytes()[:-200] if number % 60 else b"noise")
+    catalog = Catalog(tmp_path)
+    assert sorted(catalog.damage) == [f"s{number:03d}" for number in range(0, 300, 30)]
+    found = catalog.query("SELECT session FROM sensor_range GROUP BY ALL").num_rows
+    assert found == 295, "five are noise"
+
+
+def old_schema(session: Path, kind: int) -> None:
+    """Make a session of an older version: another type of range_m, a field that we have not, and none that is newer."""
+    file = descriptor_pb2.FileDescriptorProto(name="old.proto", package="fleet.v1", syntax="proto3")
+    message = file.message_type.add(name="Range")
+    for number, (name, of) in enumerate((("range_m", kind), ("echo_us", message.field.add().TYPE_INT64))):
+        message.field.add(name=name, number=number + 1, type=of, label=1)
+    del message.field[0]
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    made: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName("fleet.v1.Range"))()
+    made.echo_us, made.range_m = 7, "0.75" if kind == message.field[0].TYPE_STRING else 3
+    session.mkdir()
+    with (session / "0001.mcap").open("wb") as out:
+        writer: Any = Writer(out)
+        writer.start()
+        files = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+        schema = writer.register_schema("fleet.v1.Range", "protobuf", files)
+        channel = writer.register_channel("fleet/old/sensor/range", "protobuf", schema)
+        writer.add_message(channel, START_NS, made.SerializeToString(), START_NS, 1)
+        writer.finish()
+
+
+@pytest.mark.parametrize("others", [True, False])
+def test_a_session_of_another_schema_has_the_columns_of_ours(sessions: Path, *, others: bool) -> None:
+    if not others:
+        shutil.rmtree(sessions / "one")
+        shutil.rmtree(sessions / "two")
+    old_schema(sessions / "words", 9)
+    old_schema(sessions / "whole numbers", 3)
+    rows = asked(
+        sessions, "SELECT session, range_m, no_echo, echo_us, mode FROM sensor_range_context WHERE car = 'old'"
+    )
+    assert sorted(rows, key=lambda row: str(row["session"])) == [
+        {"session": "whole numbers", "range_m": 3.0, "no_echo": None, "echo_us": "7", "mode": None},
+        {"session": "words", "range_m": 0.75, "no_echo": None, "echo_us": "7", "mode": None},
+    ]
+    assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE range_m < 0.6") == [{"n": 2 if others else 0}]
+
+
+@pytest.mark.parametrize("name", ["it's", 'a"b', "s[12]", "s*", "s?", "ü {x}", "-- x; DROP"])
+def test_any_name_is_a_name(sessions: Path, name: str) -> None:
+    make(sessions / name, "green", [7.0])
+    make(sessions / "s1", "white", [7.0])
+    rows = asked(sessions, "SELECT DISTINCT session FROM sensor_range WHERE car = 'green'")
+    assert rows == [{"session": name}]
+
+
+def test_one_file_is_a_session_and_has_its_name(sessions: Path) -> None:
+    (sessions / "two" / "0001.mcap").rename(sessions / "lone.mcap")
+    shutil.rmtree(sessions / "two")
+    assert asked(sessions, "SELECT DISTINCT session FROM sensor_range WHERE car = 'blue'") == [{"session": "lone.mcap"}]
+
+
+def test_an_interrupted_session_that_grows_while_it_is_asked(sessions: Path) -> None:
+    whole = (sessions / "one" / "0001.mcap").read_bytes()
+    live = sessions / "live"
+    live.mkdir()
+    file = live / "0001.mcap"
+    file.write_bytes(whole[:-50])
+    catalogs = [Catalog(sessions), Catalog(sessions)]
+    before = catalogs[0].query("FROM sensor_range").num_rows
+    shutil.copy(sessions / "one" / "0001.mcap", live / "0002.mcap")
+    after = Catalog(sessions).query("FROM sensor_range").num_rows
+    assert (before, after) == (11, 15)
+    # The first two find their tables gone, and ask again.
+    assert [catalog.query("FROM sensor_range").num_rows for catalog in catalogs] == [after, after]
+    assert len([*live.glob(f"{PREFIX}*")]) == 1
+
+
+def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
+    shutil.rmtree(sessions / "two")
+    with pytest.raises(NoSession):
+        tables_of(sessions / "two")
+    with pytest.raises(NoSession):  # it was there a moment ago
+        table_cache._made(sessions / "two", sessions / "two" / f"{PREFIX}x")
+    assert [each.name for each in sessions.iterdir()] == ["one"]
+
+
+def test_tables_of_a_file_that_is_gone_go_too(sessions: Path) -> None:
+    lone = shutil.copy(sessions / "two" / "0001.mcap", sessions / "lone.mcap")
+    Catalog(sessions)
+    assert [*(sessions / ".lone.mcap").glob(f"{PREFIX}*")]
+    lone.unlink()
+    Catalog(sessions)
+    assert not (sessions / ".lone.mcap").exists()
+
+
+def test_the_quota_deletes_a_session_in_which_a_question_makes_its_tables(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    SessionInfo("fleet", "2026-01-01T00:00:00Z", "h", {}, closed=True).write(sessions / "two")
+    rmtree, meanwhile = shutil.rmtree, [sessions / "two" / f"{PREFIX}x.part"]
+
+    def and_a_question(path: Path, **more: Any) -> None:
+        if not meanwhile:
+            rmtree(path, **more)
+            return
+        for each in path.iterdir():
+            each.unlink()
+        meanwhile.pop().mkdir()
+        path.rmdir()
+
+    monkeypatch.setattr(shutil, "rmtree", and_a_question)
+    removed, _ = Quota(total=1).enforce(sessions, sessions / "one")
+    assert removed == [sessions / "two"]
+    assert not (sessions / "two").exists()
+
+
+@pytest.mark.parametrize("age_s", [0.0, STALE_PART_S + 60])
+def test_what_a_killed_question_left_goes_when_it_is_old(sessions: Path, age_s: float) -> None:
+    part = sessions / "one" / f"{PREFIX}0123-abc.part"
+    part.mkdir()
+    (part / "fleet.v1.Range.parquet").write_bytes(b"half")
+    for each in (part / "fleet.v1.Range.parquet", part):
+        os.utime(each, (time.time() - age_s, time.time() - age_s))
+    tables_of(sessions / "one")
+    assert part.exists() == (not age_s)
+
+
+def test_ctrl_c_leaves_nothing_half_made(tmp_path: Path) -> None:
+    place = tmp_path / "all"
+    place.mkdir()
+    make(place / "long", "red", [1.0] * 60_000)
+    command = [sys.executable, "-m", "fleet", "query", "FROM sensor_range LIMIT 1", str(place)]
+    asking = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: [*place.rglob("*.parquet*")] or asking.poll() is not None, "the tables are being made")
+    asking.send_signal(signal.SIGINT)
+    out, err = asking.communicate(timeout=60)
+    assert (asking.returncode, out) == (130, ""), err
+    assert "Traceback" not in err
+    assert no_tables(place)
+
+
+@pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
+def test_a_disk_that_fills_during_a_question_costs_tables_only(tmp_path: Path) -> None:
+    with disk("really full", tmp_path) as full:
+        full.root.mkdir()
+        make(full.root / "one", "red", [1.0] * 3000)
+        make(full.root / "two", "blue", [1.0, 2.0])
+        recorded = (full.root / "one" / "0001.mcap").read_bytes()
+        tables_of(full.root / "two")
+        full.fill(but=16_384)
+        done = query("SELECT car, count(*) n FROM sensor_range GROUP BY ALL", full.root, "--csv")
+        assert (done.returncode, done.stdout.splitlines()) == (0, ["car,n", "blue,3"])
+        assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["one"]
+        assert no_tables(full.root / "one")
+        assert (full.root / "one" / "0001.mcap").read_bytes() == recorded
+        full.free()
+        assert asked(full.root, "SELECT count(*) n FROM sensor_range") == [{"n": 3004}]
+
+
+@pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
+def test_a_disk_that_is_read_only_is_asked(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = sessions.parent / "tmp"
+    elsewhere.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+    subprocess.run(["mount", "--bind", sessions, sessions], check=True)
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", sessions], check=True)
+        assert asked(sessions, "SELECT count(*) n FROM sensor_range") == [{"n": 7}]
+    finally:
+        subprocess.run(["umount", "-l", sessions], check=True)
+    assert no_tables(sessions)
+
+
+def test_a_million_rows_are_written_a_block_at_a_time(sessions: Path) -> None:
+    sql = "SELECT range AS n FROM range(1000000)"
+    for format_option in ("--csv", "--json"):
+        command = [sys.executable, "-c", LIMITED, "query", sql, str(sessions), format_option]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.count("\n") == 1_000_000 + (format_option == "--csv")
+
+
+LIMITED = (
+    "import resource; resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30));from fleet.cli import main; main()"
+)
+"""Runs `fleet` with a GB of memory."""
+
+
+def test_cells_of_strangers_never_reach_a_terminal_raw(sessions: Path) -> None:
+    sql = "SELECT 'a' || chr(27) || ']0;x' || chr(10) || chr(155) || repeat('y', 100000) AS \"c\x1b[2J\""
+    shown = query(sql, sessions).stdout
+    assert "\x1b" not in shown
+    assert "\x9b" not in shown
+    assert len(shown.splitlines()) == 2
+    assert max(map(len, shown.splitlines())) <= MAX_CELL
+    wrong = query("SELECT CAST(chr(27) || ']0;x' AS INTEGER)", sessions)
+    assert wrong.returncode == 2
+    assert "\x1b" not in wrong.stderr
+    on_terminal = Terminal("fleet", "query", sql, str(sessions), "--csv", environment={}, directory=sessions)
+    try:
+        assert "\\x1b]0;x" in on_terminal.until("yyy")
+        assert b"\x1b]" not in on_terminal._shown
+        assert b"\x1b[2J" not in on_terminal._shown
+    finally:
+        on_terminal.close()
+
+
+def test_numbers_that_are_none_are_null(sessions: Path) -> None:
+    sql = "SELECT 'nan'::DOUBLE a, 'inf'::DOUBLE b, NULL c, [1, NULL] d, {'t': TIMESTAMP '2026-01-01'} e"
+    assert json.loads(query(sql, sessions, "--json").stdout) == {
+        "a": None,
+        "b": None,
+        "c": None,
+        "d": [1, None],
+        "e": {"t": "2026-01-01T00:00:00"},
+    }
+    assert query(sql, sessions, "--csv").stdout.splitlines()[1].startswith(',,,"[1, null]"')
+
+
+def test_all_views_are_there_for_a_question_that_lists_them(sessions: Path) -> None:
+    for sql in ("SHOW TABLES", "SELECT * FROM information_schema.tables"):
+        assert "sensor_range_context" in str(asked(sessions, sql))
+
+
+def test_a_question_that_is_too_large_is_no_wrong_use(sessions: Path) -> None:
+    catalog = Catalog(sessions)
+    with pytest.raises(QueryFailed):
+        catalog.query("SELECT list(range) FROM range(2000000000)")

@@ -12,7 +12,7 @@ from fleet import Catalog, LeaseLost, NotCarriedOut, Outcome, Reading, Session, 
 from fleet.client import client, reading, wait
 from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
-from fleet.recording.catalog import BadQuery
+from fleet.recording.catalog import BadQuery, QueryFailed
 from fleet.recording.reading.session import NoSession
 from fleet.recording.tools.analysis import NoTable
 from fleet.recording.tools.table_formats import FormatMissing
@@ -52,6 +52,7 @@ _ERRORS = (
     NoSession,
     NoTable,
     BadQuery,
+    QueryFailed,
     FormatMissing,
 )
 _HIDDEN = {"do", "ask", "call", "begin", "expression"}

@@ -1,0 +1,82 @@
+"""Tells since when a condition holds without a gap. Pure.
+
+`fleet wait --for` feeds it live, `fleet find` from recordings.
+
+What a gap is decides what "for two seconds" means. Between two readings nobody measured: the time counts as long as the
+older value is not stale. When a value gets stale, the condition is asked again without it. If the others do not decide
+it alone, it has ended with the last reading that showed it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from fleet.conditions.expression import Expression, Lookup
+
+
+class HeldSpan(NamedTuple):
+    """A time during which a condition held. Times of the first and last reading that show it, ns since the epoch."""
+
+    begin_ns: int
+    end_ns: int
+
+    @property
+    def length_s(self) -> float:
+        """Return the time from the first reading to the last one, s."""
+        return (self.end_ns - self.begin_ns) / 1e9
+
+
+class HeldStep(NamedTuple):
+    """What one reading has changed."""
+
+    value: bool | None
+    """The condition now; None if it is not decided."""
+    ended: HeldSpan | None
+    """The span that has ended with this reading, or before it."""
+
+
+@dataclass(slots=True)
+class Holding:
+    """One condition over the readings of one car or key. They come in the order of their times.
+
+    source_of: the source of a name, such as its topic. stale_after_ns: how long a value of a source counts; None: ever.
+    """
+
+    expression: Expression
+    source_of: Callable[[str], str]
+    stale_after_ns: Callable[[str], int | None]
+    span: HeldSpan | None = None
+    """The span that has not ended. It ends with the newest reading that shows it."""
+    _readings: dict[str, tuple[int, Lookup]] = field(default_factory=dict)
+    """Time and values of the newest reading by source."""
+
+    def add(self, source: str, values: Lookup, at_ns: int) -> HeldStep:
+        """Take in a reading."""
+        ended = None
+        for other, (seen_ns, _) in self._readings.items():
+            after_ns = self.stale_after_ns(other)
+            if after_ns is not None and seen_ns + after_ns < at_ns and self._value(seen_ns + after_ns + 1) is not True:
+                ended = self.end() or ended
+        self._readings[source] = at_ns, values
+        value = self._value(at_ns)
+        if value is not True:
+            ended = self.end() or ended
+        else:
+            self.span = HeldSpan(at_ns if self.span is None else self.span.begin_ns, at_ns)
+        return HeldStep(value, ended)
+
+    def end(self) -> HeldSpan | None:
+        """End the span, and return it. The next reading that shows the condition begins another one."""
+        ended, self.span = self.span, None
+        return ended
+
+    def _value(self, at_ns: int) -> bool | None:
+        def lookup(name: str) -> object | None:
+            source = self.source_of(name)
+            if source not in self._readings:
+                return None
+            seen_ns, values = self._readings[source]
+            after_ns = self.stale_after_ns(source)
+            return None if after_ns is not None and at_ns - seen_ns > after_ns else values(name)
+
+        return self.expression.value(lookup)
