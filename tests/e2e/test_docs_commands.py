@@ -38,6 +38,7 @@ NOT_RUN: Final = {
     r".*192\.168\.1\.2:.*|ssh .*|zenohd .*": "needs a second computer",
     r"fleet replay|fleet replay (?!.*--save).*|fleet view( --web)?": "opens a window",
     r".*/media/disk.*": "needs a second disk",
+    r"(gateway|fleet) .* tank( .*)?": "needs a tank; tests/e2e/test_second_family.py drives one",
     r"eval .*": "is for a shell; tests/fleet/commands/test_shells.py runs it",
     r"fleet demo.*": "tests/fleet/test_demo.py runs it",
     r"fleet up.*": "stays or starts another fleet; tests/e2e/test_up.py and test_newcomer.py run it",
