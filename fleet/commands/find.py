@@ -13,10 +13,10 @@ from fleet.client.client import default_sender
 from fleet.commands.group import chosen_person
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import aligned, echo_csv, echo_safely
-from fleet.commands.params import Duration, car_option
+from fleet.commands.params import Duration, car_option, existing_sessions_place
 from fleet.recording import time_spec
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS, NoMark, add_mark
-from fleet.recording.session_lookup import sessions_in, sessions_place
+from fleet.recording.session_lookup import sessions_in
 from schemas import keys
 from schemas.local_time import date_and_clock, with_offset
 
@@ -76,9 +76,7 @@ def find(
         since_ns = 0 if since is None else time_spec.past_ns(since, time.time())
     except ValueError as error:
         raise click.UsageError(f"--since: {error}") from None
-    place = directory or sessions_place()
-    if not place.is_dir():
-        raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")
+    place = existing_sessions_place(directory)
     found = list(_hits(place, expression, cars, for_s or 0.0, since_ns))
     if as_json:
         for path, hit in found:

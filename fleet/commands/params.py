@@ -377,3 +377,11 @@ def warn_if_missing(written: str, cars: Sequence[str]) -> None:
     if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
         there = _likely_car(key.car, cars) if cars else "No car is."
         click.echo(f'fleet: No car "{key.car}" is connected yet. {there} Waiting.', err=True)
+
+
+def existing_sessions_place(directory: Path | None) -> Path:
+    """Return the directory of sessions that was named, or the usual one. Raises a ClickException if there is none."""
+    place = directory or sessions_place()
+    if not place.is_dir():
+        raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")
+    return place

@@ -12,7 +12,8 @@ import click
 
 from fleet.commands.options import json_option
 from fleet.commands.output import aligned, echo_csv, echo_safely, progress_bar
-from fleet.recording.session_lookup import sessions_in, sessions_place
+from fleet.commands.params import existing_sessions_place
+from fleet.recording.session_lookup import sessions_in
 from schemas.printable import printable
 
 MAX_CELL: Final = 60
@@ -44,9 +45,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
     if (sql is None) is not tables or (as_csv and as_json):
         raise click.UsageError("give one question, or --tables; and --csv or --json, not both")
-    place = directory or sessions_place()
-    if not place.is_dir():
-        raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")
+    place = existing_sessions_place(directory)
     text = sys.stdin.read() if sql == "-" else sql or ""
     with progress_bar("tables", sum(1 for _ in sessions_in(place))) as advance:
         try:
