@@ -83,7 +83,7 @@ def _empty(topic: str) -> Any:
 
 @dataclass(slots=True)
 class CarState:
-    """What the bus has said of one car. All times `at` and `now` are s, of one clock that the caller chooses."""
+    """The newest messages of one car on the bus. Times `at` and `now`: s, of one clock that the caller chooses."""
 
     car: str
     present: bool = True
@@ -201,12 +201,12 @@ class CarState:
 
     @property
     def authority(self) -> Authority:
-        """Who may do what with it, by the last word of a gateway."""
+        """The permissions of each client, by the last message of a gateway."""
         return Authority.of(self.last_word("state/safety"))
 
     @property
     def driver(self) -> str:
-        """Who drives it: the owner of its motion, or the holder of its lease. Empty: nobody, or only a plan."""
+        """The client that drives it: the owner of its motion, or the holder of its lease. Empty: none, or a plan."""
         lease = self.safety.lease
         return self.motion.owner or ("" if lease.kind == Rank.COORDINATOR else lease.holder)
 

@@ -27,7 +27,7 @@ class HeldSpan(NamedTuple):
 
 
 class HeldStep(NamedTuple):
-    """What one reading has changed."""
+    """Changes by one reading."""
 
     value: bool | None
     """The condition now; None if it is not decided."""

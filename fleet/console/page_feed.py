@@ -1,4 +1,4 @@
-"""What a page shows beside the state of the cars: a feed registers the messages of its page, and answers them."""
+"""Feeds of a console page beside the state of the cars. A feed registers the messages of its page, and answers them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""What comes over the bus for the coordinator: samples and queries in order, and the gateways that come and go.
+"""Input of the coordinator from the bus: samples and queries in order, and gateways that arrive or leave.
 
 Zenoh's threads fill the inbox, the coordinator's own thread empties it. It is bounded: what is too much is dropped and
 counted.

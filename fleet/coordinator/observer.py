@@ -32,7 +32,7 @@ class FleetObserver:
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     cars: dict[str, CarSnapshot] = field(default_factory=dict)
     states: dict[str, CarState] = field(default_factory=dict)
-    """What was heard of each car."""
+    """State of each car by name, as heard on the bus."""
     _absent_since: dict[str, float] = field(default_factory=dict)
     """Unlisted cars without a gateway on the bus; the first to leave stands first."""
     _confirmed: set[str] = field(default_factory=set)

@@ -1,4 +1,4 @@
-"""What the coordinator publishes: its plan, the roles and the decisions, and a log. The last ones answer queries."""
+"""Output of the coordinator to the bus: plan, roles, decisions and a log. The last messages answer queries."""
 
 import contextlib
 import time
