@@ -22,10 +22,12 @@ from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue
 from gateway.control.commands import Action
 from gateway.control.events import OutgoingFrame
-from gateway.control.trust import TrustState
+from gateway.control.trust import TrustEvent, TrustState
 from schemas.car_profile import CarProfile
 from schemas.words import (
     Basis,
+    BatteryAction,
+    BatteryLevel,
     Cause,
     FrameOrigin,
     Level,
@@ -43,6 +45,8 @@ STALL_S: Final = 0.5
 (docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
 """Report that a drive has waited if its frame goes out later than this."""
+MOVED_CM: Final = 5.0
+"""Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
 
 
 # ---------------------------------------------------------------------- bytes of a car
@@ -233,6 +237,27 @@ class DriverClaims(Protocol):
         """Return in words what shows that a drive moved the car; empty if nothing does."""
 
 
+def describe_way(before_cm: float | None, now_cm: float | None) -> str:
+    """Return in words how the distance has changed in a drive; empty if it shows no movement."""
+    if before_cm is None or now_cm is None or abs(now_cm - before_cm) < MOVED_CM:
+        return ""
+    return f"its distance changed from {before_cm / 100:.2f} m to {now_cm / 100:.2f} m"
+
+
+def learn_trust(model: DriverClaims, log: CommandLog, event: TrustEvent, now: float, evidence: str = "") -> None:
+    """Update the trust state of a car, and log each change."""
+    trust = model.trust
+    if trust.apply(event, now, evidence):
+        basis = f" ({trust.basis})" if trust.basis is not None else ""
+        words = f"{model.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
+        log.log(Level.DEBUG, "trust", words, now)
+
+
+def log_unstopped(log: CommandLog, car: str, why: str, now: float) -> None:
+    """Log that the gateway ends without a stop of its car."""
+    log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
+
+
 # ---------------------------------------------------------------------- the driver
 
 
@@ -256,6 +281,7 @@ class Driver(ABC):
         self.queue = desk.queue
         self.safety = desk.queue.safety
         self.senders = desk.queue.senders
+        self._log = desk.log
 
     @property
     @abstractmethod
@@ -273,21 +299,22 @@ class Driver(ABC):
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events in the bytes."""
 
-    @abstractmethod
     def flush(self, now: float) -> list[Event]:
-        """Return the events that a silence has ended."""
+        """Return the events that a silence has ended: none where only bytes end a frame."""
+        del now
+        return []
 
-    @abstractmethod
     def flush_at(self) -> float:
         """Return when `flush` has something to do if no byte comes before; inf if never."""
+        return float("inf")
 
     @abstractmethod
     def drop_bytes(self) -> list[Event]:
         """Forget the unfinished frame, and return what it was: the link is lost, or bytes were discarded."""
 
-    @abstractmethod
     def sends(self, data: bytes, now: float) -> None:
-        """Remember the bytes of a frame that is written now: the link may echo them."""
+        """Remember the bytes of a frame that is written now, if the link or the car may echo them."""
+        del data, now
 
     @abstractmethod
     def measured(self, event: Event) -> Mapping[str, Fields]:
@@ -319,7 +346,7 @@ class Driver(ABC):
         """Stop a driven car after a gap of the loop."""
         if gap_s > STALL_S and self.queue.held is not None:
             words = f"{self.desk.car} is stopped: its gateway stalled for {gap_s:.1f} s during a drive"
-            self.desk.log.log(Level.ERROR, "stalled", words, now)
+            self._log.log(Level.ERROR, "stalled", words, now)
             self.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
     def on_sleep(self, slept_s: float, now: float) -> None:
@@ -328,7 +355,7 @@ class Driver(ABC):
         stands = model.at_rest and model.trust.shown and not self.is_stopping
         then = f"{car} stood before, and stands" if stands else f"{car} is stopped first"
         words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
-        self.desk.log.log(Level.WARNING, "slept", words, now)
+        self._log.log(Level.WARNING, "slept", words, now)
         self.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
         self.senders.halt(now)  # a joystick that is still pushed restarts no car
         if model.link_open and not stands:
@@ -444,6 +471,18 @@ class Driver(ABC):
         return ""
 
     # ------------------------------------------------------------------ the same for every family
+
+    def on_voltage(self, voltage_v: float, now: float) -> None:
+        """Update the battery, and stop the car if the policy requires it. A driver calls it with each voltage."""
+        model = self.model
+        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
+            return
+        level, words = model.battery.level, f"{model.name}: {model.battery.words}"
+        severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
+        self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
+        if model.battery.action is BatteryAction.STOP and not model.at_rest:
+            self.halt(words, now)
+            self.stop_if_open(now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
         """Drop all queued commands. Ignore a continuous drive stream until its sender pauses."""

@@ -16,13 +16,25 @@ few seconds: its frames may have been lost.
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 from gateway.control.battery import Battery
 from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import Action, ChangeSpeed, Find, PartAction, SetMode
-from gateway.control.driver import Desk, Driver, Echo, Event, Findings, Outputs, Rejected, TextLine
+from gateway.control.driver import (
+    Desk,
+    Driver,
+    Echo,
+    Event,
+    Findings,
+    Outputs,
+    Rejected,
+    TextLine,
+    describe_way,
+    learn_trust,
+    log_unstopped,
+)
 from gateway.control.events import OutgoingFrame
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from schemas.car_profile import CarProfile
@@ -30,8 +42,6 @@ from schemas.limits import SHUTDOWN_S
 from schemas.words import (
     CAPABILITIES,
     Basis,
-    BatteryAction,
-    BatteryLevel,
     CarTrust,
     FrameOrigin,
     FrameVerdict,
@@ -52,6 +62,7 @@ RENEWAL_S: Final = 6.0
 """Interval of the repeats of a stop that nothing shows, on a car without a dead-man: as on the first family's cars."""
 SPEED_STEP: Final = 0.1
 """One step of the speed, a share of full speed."""
+_STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
 
 
 # ---------------------------------------------------------------------- what a car can do, and what is claimed
@@ -191,9 +202,7 @@ class PlainModel:
         """Return in words what shows that a drive moved the car since it began; empty if no reading does."""
         if self.turned_at > since:
             return "its wheels turned"
-        if range_cm is None or self.range_cm is None or self.range_at < since or abs(self.range_cm - range_cm) < 5.0:
-            return ""
-        return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
+        return "" if self.range_at < since else describe_way(range_cm, self.range_cm)
 
 
 # ---------------------------------------------------------------------- the driver
@@ -241,7 +250,6 @@ class PlainDriver(Driver):
         super().__init__(desk)
         battery = Battery(desk.battery_policy.of_cells(profile.cells), profile.cells)
         self._model = PlainModel(desk.car, profile, battery, self.SILENCE_S)
-        self._log = desk.log
         self._stop: PlainStop | None = None
         self._source: PlainStop | HeldMotion | Pending | None = None
         self._part_at = float("-inf")
@@ -328,18 +336,6 @@ class PlainDriver(Driver):
             self._log.log(Level.INFO, "answers_again", words, now)
             self._begin_again(words, TrustEvent.HEARD, now)
         self.on_reading(event, now)
-
-    def on_voltage(self, voltage_v: float, now: float) -> None:
-        """Update the battery, and stop the car if the policy requires it."""
-        model = self._model
-        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
-            return
-        level, words = model.battery.level, f"{model.name}: {model.battery.words}"
-        severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
-        self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
-        if model.battery.action is BatteryAction.STOP and not model.at_rest:
-            self.halt(words, now)
-            self.stop_if_open(now)
 
     # ------------------------------------------------------------------ the link, and time
 
@@ -548,7 +544,7 @@ class PlainDriver(Driver):
             case SetMode(mode) if mode not in model.profile.modes:
                 return f"{car} ({model.profile.name}) has no mode {mode}. It has: manual."
             case ChangeSpeed(step):
-                share = model.speed + (SPEED_STEP if step is SpeedStep.UP else -SPEED_STEP)
+                share = model.speed + _STEPS[step]
                 if share > self.desk.speed_max + 1e-9 and step is SpeedStep.UP:
                     maximum = self.desk.speed_max
                     return f"{car} would drive at {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
@@ -701,17 +697,8 @@ class PlainDriver(Driver):
             self.stop(FrameOrigin.SHUTDOWN, now)
 
     def _end_unstopped(self, why: str, now: float) -> None:
-        car = self._model.name
         self._not_stopped = why
-        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
+        log_unstopped(self._log, self._model.name, why, now)
 
     def _learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
-        """Update the trust state, and log each change."""
-        if self._model.trust.apply(event, now, evidence):
-            trust = self._model.trust
-            basis = f" ({trust.basis})" if trust.basis is not None else ""
-            words = f"{self._model.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
-            self._log.log(Level.DEBUG, "trust", words, now)
-
-
-_STEPS: Final[Mapping[Any, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
+        learn_trust(self._model, self._log, event, now, evidence)

@@ -65,22 +65,10 @@ class TankDriver(PlainDriver):
         except (ValueError, TypeError, KeyError, RecursionError):
             return Rejected(line, now, Cause.TRUNCATED)
 
-    def flush(self, now: float) -> list[Event]:
-        """Return nothing: only a line end ends a line."""
-        del now
-        return []
-
-    def flush_at(self) -> float:
-        """Return inf."""
-        return float("inf")
-
     def drop_bytes(self) -> list[Event]:
         """Forget the unfinished line."""
         self._lines.take_rest()
         return []
-
-    def sends(self, data: bytes, now: float) -> None:
-        """Do nothing: a tank repeats no line."""
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
         """Return the measured values by topic."""

@@ -212,15 +212,6 @@ class WaveshareDriver(PlainDriver):
             return [Echo(text, now)]
         return read_line(text, now)
 
-    def flush(self, now: float) -> list[Event]:
-        """Return nothing: only a line end ends a line."""
-        del now
-        return []
-
-    def flush_at(self) -> float:
-        """Return inf: no silence ends a line."""
-        return float("inf")
-
     def drop_bytes(self) -> list[Event]:
         """Forget the unfinished line."""
         rest = self._lines.take_rest()
@@ -356,7 +347,6 @@ class WaveshareDriver(PlainDriver):
         self._firmware = firmware
         if before is not None:
             self._on_restart(f"its feedback is that of {firmware} now", now)
-            self._firmware = firmware
         name, here = model.profile.name, self._here
         evidence = (f"its feedback is that of {firmware}",)
         contradictions = () if here is not None else (f"{name} cars do not have {firmware}",)
@@ -423,7 +413,6 @@ class WaveshareDriver(PlainDriver):
     def link_up(self, now: float) -> None:
         """Listen first: the link is open."""
         self._lines = LineSplitter()
-        self._sent.clear()
         self._firmware = None
         self._forget_car(now + LISTEN_S)
         super().link_up(now)
@@ -483,8 +472,7 @@ class WaveshareDriver(PlainDriver):
                 return b"\n" + line(POLL)
             self._setup, self._tries = Setup.CONFIGURE, 0
             self._unsure = [line(CHASSIS, main=here.main, module=0), line(DEAD_MAN, cmd=DEAD_MAN_MS)]
-            self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
-            self._frames.extend(self._unsure)
+            self._queue_settings()
         if self._frames:
             # After the last one, time for its echo.
             self._setup_at = now + (SETUP_GAP_S if len(self._frames) > 1 else CONFIRM_S)
@@ -494,12 +482,16 @@ class WaveshareDriver(PlainDriver):
         shows_it = self._in_rhythm >= STANDS_REPORTS and not self._echoes
         is_enough = self._tries >= (SILENT_TRIES if shows_it else BLIND_TRIES)
         if self._unsure and not is_enough:
-            self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
-            self._frames.extend(self._unsure)
+            self._queue_settings()
             return None
         self._setup = Setup.READY
         self._model.heard_at = max(now, self._model.heard_at or now)  # the stream begins now
         return None
+
+    def _queue_settings(self) -> None:
+        """Queue the settings that the car has not repeated, behind those that let it repeat and report."""
+        self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
+        self._frames.extend(self._unsure)
 
     # ------------------------------------------------------------------ frames out
 

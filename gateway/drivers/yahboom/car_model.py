@@ -4,11 +4,11 @@
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any
 
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog
-from gateway.control.driver import Findings, Outputs
+from gateway.control.driver import Findings, Outputs, describe_way, learn_trust
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
@@ -20,10 +20,7 @@ from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
 from gateway.drivers.yahboom.stops import stopping
 from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase, StopEvidence
-from schemas.words import Basis, Blocking, CarTrust, Level, Mode, Motion, Motors, Platform, Shows, Verdict
-
-MOVED_CM: Final = 5.0
-"""Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
+from schemas.words import Basis, Blocking, CarTrust, Mode, Motion, Motors, Platform, Shows, Verdict
 
 
 @dataclass(slots=True)
@@ -75,11 +72,7 @@ class CarModel:
 
     def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
         """Update the trust state, and log each change. Only this function changes it."""
-        if self.trust.apply(event, now, evidence):
-            trust = self.trust
-            basis = f" ({trust.basis})" if trust.basis is not None else ""
-            words = f"{self.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
-            self.log.log(Level.DEBUG, "trust", words, now)
+        learn_trust(self, self.log, event, now, evidence)
 
     @property
     def outputs(self) -> Outputs:
@@ -217,11 +210,7 @@ class CarModel:
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
         """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
-        if range_cm is None or self.range_cm is None or self.range_at < since + FLIGHT_S:
-            return ""
-        if abs(self.range_cm - range_cm) < MOVED_CM:
-            return ""
-        return f"its distance changed from {range_cm / 100:.2f} m to {self.range_cm / 100:.2f} m"
+        return "" if self.range_at < since + FLIGHT_S else describe_way(range_cm, self.range_cm)
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:

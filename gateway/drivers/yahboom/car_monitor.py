@@ -16,15 +16,12 @@ from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.stops.evidence import EVIDENCE, Finding, StopCase
 from schemas.words import (
-    BatteryAction,
-    BatteryLevel,
     Blocking,
     CarTrust,
     Cause,
     FrameOrigin,
     Level,
     Mode,
-    Motors,
     Phase,
     Platform,
     Reason,
@@ -119,7 +116,7 @@ class CarMonitor:
             model.pacing.on_report(event.at)
             model.range_cm, model.range_at = event.range_cm or None, event.at
         if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
-            self._update_battery(event.voltage_v, now)
+            self._executor.on_voltage(event.voltage_v, now)
         if now > model.believed.fan_at + FAN_SETTLED_S:
             model.believed.fan_toggled = False
             if model.shows_fan:  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
@@ -194,18 +191,6 @@ class CarMonitor:
         queue = self._executor.queue
         waits = queue.held is not None or queue.mode_change is not None or bool(queue.one_shots)
         return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
-
-    def _update_battery(self, voltage_v: float, now: float) -> None:
-        """Log a change of the battery level, and stop the car if the policy requires it."""
-        model = self.model
-        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
-            return
-        level, words = model.battery.level, f"{model.name}: {model.battery.words}"
-        severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
-        self._log.log(severity.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
-        if model.battery.action is BatteryAction.STOP and not model.at_rest:
-            self._executor.halt(words, now)
-            self._stops.begin_full(now)
 
     def tick(self, now: float) -> None:
         """Check for silence. Call it a few times a second."""

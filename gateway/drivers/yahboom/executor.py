@@ -36,7 +36,6 @@ class Executor(Driver):
         self.stops = StopExecutor(model, desk.log)
         self.mode_sent: tuple[Pending, float] | None = None
         """A mode command whose effect was not seen yet, and when its frame was written."""
-        self._log = desk.log
         self._source: StopInProgress | HeldMotion | Pending | None = None
         """The stop, motion or command of the last frame of `poll`; None for a repetition."""
 

@@ -7,6 +7,7 @@ from typing import Final
 
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.commands import SetMode
+from gateway.control.driver import log_unstopped
 from gateway.control.trust import STOP_GOES_ON, TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.pacing import FLIGHT_S
@@ -71,11 +72,6 @@ class StopExecutor:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
-
-    def begin_full(self, now: float) -> None:
-        """Begin a full stop, unless the link is down or the gateway shuts down."""
-        if self.model.link_open and not self.shutting_down:
-            self.begin(self.full(now), FrameOrigin.STOP, now)
 
     def stop_again(self, now: float) -> None:
         """Send general stops to a car that had shown that it stands, and is silent now."""
@@ -186,9 +182,8 @@ class StopExecutor:
             self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self.not_stopped)
 
     def _end_unstopped(self, why: str, now: float) -> None:
-        car = self.model.name
         self.not_stopped = why
-        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
+        log_unstopped(self._log, self.model.name, why, now)
 
     # ------------------------------------------------------------------ tries
 
