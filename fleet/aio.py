@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
-from fleet.client import lease as leases
 from fleet.client.commands import (
     CarCommands,
     CommandRequest,
@@ -190,7 +189,7 @@ class Lease:
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet
         self._name = name
-        self._lease = leases.Lease(fleet.sync, name, take=take)
+        self._lease = fleet.sync.car(name).lease(take=take)
 
     async def __aenter__(self) -> Car:
         entering = asyncio.ensure_future(self._fleet.call(self._lease.__enter__))

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final, Self
 
 from fleet.client import history
@@ -395,7 +396,7 @@ class Car(CarCommands[Outcome]):
         """Return the latest readings of this car."""
         return self._fleet.get(f"{self.name}/{topic}")
 
-    def lease(self, *, take: bool = False) -> Lease:
+    def lease(self, *, take: bool = False) -> "Lease[LeasedCar]":
         """Reserve the car for a block: `with fleet.car("red").lease() as car: car.drive("forward", 1.5)`.
 
         At the end of the block, the car is stopped and released. Within the block, nobody of the same rank can drive
@@ -403,7 +404,7 @@ class Car(CarCommands[Outcome]):
         car, every command raises LeaseLost. Entering the block raises both, too.
         take: as a person (`Fleet(kind="person")`), take the car over from another person.
         """
-        return Lease(self._fleet, self.name, take=take)
+        return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)
 
     def do(self, request: CommandRequest) -> Outcome:
         """Send one command and return its outcome."""
@@ -413,7 +414,7 @@ class Car(CarCommands[Outcome]):
 class LeasedCar(Car):
     """A car within `with fleet.car("red").lease() as car`: commands raise unless they are carried out."""
 
-    def __init__(self, fleet: Fleet, name: str, lease: Lease) -> None:
+    def __init__(self, fleet: Fleet, name: str, lease: "Lease[LeasedCar]") -> None:
         super().__init__(fleet, name)
         self._lease = lease
 

@@ -5,17 +5,18 @@
 
 import threading
 import time
+from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
-from fleet.client.commands import drive_request, lease_request
+from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import OUTCOME_MARGIN_S, LeaseLost, NotCarriedOut, Outcome
+from fleet.client.reading import Reading
 from schemas import keys, messages
-from schemas.bus import BusError, Sample
+from schemas.bus import Bus, BusError, Sample
 from schemas.words import Motion, Phase, Reason
 
-if TYPE_CHECKING:
-    from fleet.client.client import Fleet, LeasedCar
+C_co = TypeVar("C_co", covariant=True)
 
 LEASE_RENEWAL_INTERVAL_S: Final = 0.8
 """Interval of renewals. A lease expires after 2 s, so one renewal may be lost."""
@@ -73,12 +74,30 @@ def _other(sender: str, ours: str) -> str:
     return f"another program of {name}" if name == keys.name_of(ours) else name
 
 
-class Lease:
+class LeasingFleet(Protocol):
+    """What a lease needs of a `Fleet`."""
+
+    name: str
+    sender: str
+    bus: Bus
+
+    def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
+        """Send one command to these cars, and return their outcomes."""
+        ...
+
+    def get(self, expression: str) -> list[Reading]:
+        """Return the latest readings."""
+        ...
+
+
+class Lease(Generic[C_co]):
     """A lease, made by `Car.lease`. Use it with `with`, which raises LeaseLost if another sender has the car."""
 
-    def __init__(self, fleet: "Fleet", name: str, *, take: bool) -> None:
+    def __init__(self, fleet: LeasingFleet, name: str, leased: "Callable[[Lease[C_co]], C_co]", *, take: bool) -> None:
+        """`leased`: makes the car that the block gets."""
         self._fleet = fleet
         self._name = name
+        self._leased = leased
         self._take = take
         self._monitor = LeaseMonitor(name, fleet.sender)
         self._monitor_lock = threading.Lock()
@@ -86,9 +105,7 @@ class Lease:
         self._undeclare: Any = lambda: None
         self._renewer = threading.Thread(target=self._renew, name=f"fleet-lease-{name}", daemon=True)
 
-    def __enter__(self) -> "LeasedCar":
-        from fleet.client.client import LeasedCar
-
+    def __enter__(self) -> C_co:
         key = keys.topic_key(self._fleet.name, self._name, "state/safety")
         self._undeclare = self._fleet.bus.subscribe(key, self._on_sample).undeclare
         try:
@@ -98,7 +115,7 @@ class Lease:
             self._undeclare()
             raise
         self._renewer.start()
-        return LeasedCar(self._fleet, self._name, self)
+        return self._leased(self)
 
     def __exit__(
         self, _type: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None

@@ -19,8 +19,8 @@ from fleet.fleetfile.fleet_file import FleetFile, read_fleet
 from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import FileEntry
 from fleet.links import LINK_SIM, parse_fleet_link
-from fleet.policy.plan.lint import Severity
-from fleet.policy.plan.lint import check as find_findings
+from fleet.policy.lint.lint import Severity
+from fleet.policy.lint.lint import check as find_findings
 from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot

@@ -14,7 +14,7 @@ from fleet.coordinator.observer import listed_cars, listed_people
 from fleet.coordinator.other_coordinators import SENDER, AnotherCoordinator
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
-from fleet.policy.plan.lint import find_faults
+from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid

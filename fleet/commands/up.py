@@ -22,7 +22,7 @@ from fleet.commands.options import cli_errors
 from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
-from fleet.policy.plan.lint import find_faults
+from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.recording.writing.disk_space import Reserve
 from fleet.supervisor.service import AnotherSupervisor

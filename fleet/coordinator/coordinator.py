@@ -21,7 +21,7 @@ from fleet.coordinator.requests import PLAN_VERB, bad_value, plan_command, rejec
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.decide import step
 from fleet.policy.decision import Decision
-from fleet.policy.plan.lint import find_faults
+from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
 from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request

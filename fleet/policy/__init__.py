@@ -2,5 +2,5 @@
 
 Read `plan.plan` (the values) first, then `rules` (which are in force), `allocation` (which car takes which role),
 `decide` (one step) and `explain` (the step in words). `snapshot` is the knowledge of the cars, `state` lasts between
-steps.
+steps. `lint` checks a plan before anything moves.
 """

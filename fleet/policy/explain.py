@@ -10,8 +10,8 @@ from typing import Final
 from fleet.policy.allocation import Barrier, Candidates, RoleAllocation
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import LEFT_ALONE, Decision, DecisionKind
+from fleet.policy.lint.reachability import describe_unmeasured
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Role, Rule
-from fleet.policy.plan.reachability import describe_unmeasured
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole

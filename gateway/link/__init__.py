@@ -1,9 +1,9 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
-`base` has the interfaces and their errors. `serial`, `tcp` and `ble` implement them, two of them with the buffer of
-`buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a USB device,
-`serial_ports` and `ble_devices` list what is there, `url` accepts a link from the command line. `baud` doubts the baud
-rate of bytes without a frame.
+`base` has the interfaces, `errors` what goes wrong. `serial`, `tcp` and `ble` implement them, two of them with the
+buffer of `buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a
+USB device, `serial_ports` and `ble_devices` list what is there, `url` accepts a link from the command line. `baud`
+doubts the baud rate of bytes without a frame.
 
 A kind of link is a URL in `schemas.links`, and a module with its `KIND` here. The two meet by the scheme.
 """
@@ -11,8 +11,9 @@ A kind of link is a URL in `schemas.links`, and a module with its `KIND` here. T
 from importlib import import_module
 from typing import Any, Final
 
-from gateway.link.base import BadUrl, Busy, CannotList, CannotOpen, Device, Link, LinkError, LinkKind, LinkLost
+from gateway.link.base import Device, Link, LinkKind
 from gateway.link.baud import BaudWatch
+from gateway.link.errors import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
 from gateway.link.url import parse_url
 from schemas.links import LinkUrl
 

@@ -1,42 +1,16 @@
-"""The interfaces of every link (read, write, close) and of every kind of link (open, list), and their errors."""
+"""The interfaces of every link (read, write, close) and of every kind of link (open, list)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
+from gateway.link.serial_ports import SerialPort
 from schemas.links import LinkUrl
-
-if TYPE_CHECKING:
-    from gateway.link.serial_ports import SerialPort
 
 Url = TypeVar("Url", bound=LinkUrl)
 
 CLOSE_S: Final = 1.0
 """Timeout for closing a port or a connection (Bluetooth: 4 s). After it, `close` abandons or cuts the link."""
-
-
-class LinkError(Exception):
-    """A link cannot be opened, or is lost. The message is one line for a person: what, where, what to do."""
-
-
-class BadUrl(LinkError):
-    """A URL that is no link: wrong use."""
-
-
-class CannotOpen(LinkError):
-    """The link was not opened. Nothing was sent."""
-
-
-class Busy(CannotOpen):
-    """Another program has the port."""
-
-
-class LinkLost(LinkError):
-    """The link is lost. A write that raises this may have sent all, some or none of its bytes."""
-
-
-class CannotList(Exception):
-    """The devices of a kind cannot be listed. The message is one line: why, what to do."""
 
 
 class Link(ABC):
@@ -96,7 +70,7 @@ class LinkKind(ABC, Generic[Url]):
     async def open(self, url: Url, timeout_s: float, *, first: bool) -> Link:
         """Open the link within this time; raise CannotOpen. `first`: before the cars that wait for the same adapter."""
 
-    def ports(self) -> "Sequence[SerialPort]":
+    def ports(self) -> Sequence[SerialPort]:
         """Return the ports that can be listened to without harm; raise CannotOpen if the system does not list them."""
         return ()
 

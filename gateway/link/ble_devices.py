@@ -12,7 +12,8 @@ from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 
 from gateway.link import ble_adapters
-from gateway.link.base import CannotList, Device
+from gateway.link.base import Device
+from gateway.link.errors import CannotList
 from schemas.links import BleUrl
 from schemas.process.stdio import printable
 

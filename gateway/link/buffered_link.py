@@ -4,7 +4,8 @@
 import asyncio
 from typing import Final
 
-from gateway.link.base import Link, LinkLost
+from gateway.link.base import Link
+from gateway.link.errors import LinkLost
 
 # Over a minute of a car's 960 bytes/s.
 MAX_BUFFERED_BYTES: Final = 64 * 1024

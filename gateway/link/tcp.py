@@ -9,8 +9,9 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkKind, LinkLost
+from gateway.link.base import CLOSE_S, Link, LinkKind
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
+from gateway.link.errors import CannotOpen, LinkLost
 from schemas.links import TcpUrl
 
 # A vanished peer is noticed within about five seconds, where the system has these options.

@@ -1,1 +1,1 @@
-"""A plan: its values, its file format, the parser, and the lint that checks it before it runs. Pure."""
+"""A plan: its values, its file format, and the parser. Pure."""

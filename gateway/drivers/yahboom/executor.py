@@ -13,12 +13,13 @@ from gateway.control.events import OutgoingFrame
 from gateway.control.trust import TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.estimate.learned import blocking_kind
-from gateway.drivers.yahboom.pacing import AWAKE_WAIT_S, FLIGHT_S
+from gateway.drivers.yahboom.pacing import AWAKE_WAIT_S, FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import StopStyle
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
-from gateway.drivers.yahboom.stops.sequences import REPEAT_INTERVAL_S, SOFT, STOP_FRAME, Gate, StopSequence
+from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 

@@ -3,12 +3,13 @@
 It knows frames and times, no commands. `Executor` decides which frame is written.
 """
 
+from enum import IntEnum
 from typing import Final
 
 from gateway.drivers.yahboom.estimate.learned import Learned, blocking_kind
 from gateway.drivers.yahboom.protocol.frames import ArmSet, Frame, General, Reset
 from gateway.drivers.yahboom.protocol.platforms import Profile
-from gateway.drivers.yahboom.stops.sequences import NAMED_GAP_S, REPEAT_INTERVAL_S, Gate
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from schemas.words import Platform, ServoAction
 
 FLIGHT_S: Final = 0.06
@@ -20,6 +21,23 @@ LINK_DELAY_S: Final = 0.3
 """Maximum delay of a report by the link, which shortens that time."""
 AWAKE_WAIT_S: Final = 1.25
 """Maximum wait for a report before a mode is opened: the ranging that the car may be in, and a margin."""
+
+
+# On the STM32 a named frame that arrives while a report is sent lies over a general frame that was not read yet, and
+# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one
+# report of 48 ms.
+NAMED_GAP_S: Final = 0.13
+"""Minimum time from any frame to a named one."""
+
+
+class Gate(IntEnum):
+    """The condition for writing a frame."""
+
+    NOTHING = 0
+    FLIGHT = 1
+    """No frame of ours is in flight."""
+    ALONE = 2
+    """No frame of ours is in flight or in the car's buffer."""
 
 
 class Pacing:

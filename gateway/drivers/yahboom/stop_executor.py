@@ -10,14 +10,14 @@ from gateway.control.commands import SetMode
 from gateway.control.driver import log_unstopped
 from gateway.control.trust import STOP_GOES_ON, TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
-from gateway.drivers.yahboom.pacing import FLIGHT_S
+from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ModeClose
 from gateway.drivers.yahboom.protocol.platforms import StopStyle
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
 from gateway.drivers.yahboom.stops import sequences, stopping
 from gateway.drivers.yahboom.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
-from gateway.drivers.yahboom.stops.sequences import Gate, StopSequence
+from gateway.drivers.yahboom.stops.sequences import StopSequence
 from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Platform, Reason, Shows

@@ -3,10 +3,11 @@
 from typing import Final
 
 from gateway.drivers.yahboom.car_model import CarModel
+from gateway.drivers.yahboom.pacing import Gate
 from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose
-from gateway.drivers.yahboom.stops import sequences
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops.evidence import StopCase
-from gateway.drivers.yahboom.stops.sequences import STOP_FRAME, Gate
+from gateway.drivers.yahboom.stops.sequences import STOP_FRAME
 
 RENEWAL_INTERVALS_S: Final = (2.2, 4.0, 6.0)
 """Intervals between renewals. The last one repeats."""
@@ -49,7 +50,7 @@ class StopRenewal:
     def due_at(self) -> float:
         """Return when the next frame of a renewal is due; inf if never."""
         if self._general_stop_follows:
-            return self._model.pacing.written_at + sequences.REPEAT_INTERVAL_S
+            return self._model.pacing.written_at + REPEAT_INTERVAL_S
         # In one string behind a servo frame `MODE00` would open a mode: its digits are read out of that frame.
         return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
 

@@ -11,8 +11,8 @@ from fleet.conditions import parse as parse_condition
 from fleet.conditions.functions import FUNCTIONS, KEPT_READINGS, ROWS, ConditionFunction, rate
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.coordinator.observer import FleetObserver
+from fleet.policy.lint.reachability import list_unmeasured
 from fleet.policy.plan.parser import parse
-from fleet.policy.plan.reachability import list_unmeasured
 from fleet.policy.snapshot import ALIASES, NAMES
 from gateway import drivers
 from schemas import topics

@@ -36,7 +36,7 @@ RUN = ("run", "--car", "red", "--link", "tcp://127.0.0.1:9", "--connect", "tcp/1
         ("gateway", "gateway.tools.monitor", ("monitor",)),
         ("fleet", "click", ("list",)),
         ("fleet", "fleet.commands.observe", ("list",)),
-        ("fleet", "fleet.policy.plan.lint", ("check", "pyproject.toml")),
+        ("fleet", "fleet.policy.lint.lint", ("check", "pyproject.toml")),
     ],
 )
 def test_an_interrupt_during_an_import_is_no_traceback(package: str, imported: str, arguments: tuple[str, ...]) -> None:

@@ -6,7 +6,8 @@ from typing import Any
 
 from fleet.fleetfile import fleet_file
 from fleet.fleetfile.models import FileEntry
-from fleet.policy.plan import lint, parser
+from fleet.policy.lint import lint
+from fleet.policy.plan import parser
 from fleet.policy.plan.models import PlanEntry
 from schemas.world import WorldEntry
 from schemas.world_check import check_world

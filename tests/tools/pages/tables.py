@@ -14,9 +14,9 @@ from gateway.control.senders import SENDER_GONE_S
 from gateway.control.trust import TRANSITIONS, TrustEvent, TrustState
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.drivers.yahboom.stops.evidence import EVIDENCE
-from gateway.drivers.yahboom.stops.sequences import REPEAT_INTERVAL_S
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_PAUSE_S

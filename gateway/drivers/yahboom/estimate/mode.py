@@ -12,8 +12,7 @@ from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.protocol.modes import SILENT_MODES, candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.sensors import Sensors
-from gateway.drivers.yahboom.protocol.timing import FRAME_S, MODE_CLOSE_S
-from gateway.drivers.yahboom.stops.sequences import REPEAT_INTERVAL_S
+from gateway.drivers.yahboom.protocol.timing import FRAME_S, MODE_CLOSE_S, REPEAT_INTERVAL_S
 from schemas.words import Mode, Verdict
 
 CONTRADICTING_FRAMES: Final = 3

@@ -27,6 +27,8 @@ LONGEST_BLOCK_S: Final = max(row.open_s for row in MODES.values())
 # Derived, so that a mode which opens more slowly makes the recovery wait longer.
 RECOVERY_SILENCE_S: Final = round(LONGEST_BLOCK_S + 0.2, 3)
 """Time from the first frame of a recovery to its last `MODE00`."""
+REPEAT_INTERVAL_S: Final = 1.1
+"""Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
 
 
 def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:

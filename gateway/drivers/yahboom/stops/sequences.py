@@ -1,36 +1,19 @@
 """The stop sequences as tables of frames and times, by docs/reference/protocol.md#stops. No state."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
+from gateway.drivers.yahboom.pacing import NAMED_GAP_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Reset
-from gateway.drivers.yahboom.protocol.timing import COLOR_S, FRAME_S, RECOVERY_SILENCE_S
+from gateway.drivers.yahboom.protocol.timing import COLOR_S, FRAME_S, RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
 from schemas.words import Motion
 
-REPEAT_INTERVAL_S: Final = 1.1
-"""Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
 STOP_REPORT_TIMEOUT_S: Final = 4.5
 """Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
-# On the STM32 a named frame that arrives while a report is sent lies over a general frame that was not read yet, and
-# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one
-# report of 48 ms.
-NAMED_GAP_S: Final = 0.13
-"""Minimum time from any frame to a named one."""
 # While the car may still show that it left its mode, a general stop would follow the evidence unjudged. A `MODE00`
 # that lost its digits blocks for 2.0 s or more, so an earlier general stop would not be read earlier.
 JUDGED_S: Final = 2.3
 """Time from `MODE00` to the general stop if the car was in another mode than 0."""
-
-
-class Gate(IntEnum):
-    """The condition for writing a frame."""
-
-    NOTHING = 0
-    FLIGHT = 1
-    """No frame of ours is in flight."""
-    ALONE = 2
-    """No frame of ours is in flight or in the car's buffer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,14 @@ from typing import Final
 
 from gateway.control.command_log import Pending
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
+from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate, Pacing
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
-from gateway.drivers.yahboom.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
+from gateway.drivers.yahboom.protocol.timing import FRAME_S, RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops import sequences
 from gateway.drivers.yahboom.stops.evidence import StopCase
-from gateway.drivers.yahboom.stops.sequences import Gate, StopSequence
+from gateway.drivers.yahboom.stops.sequences import StopSequence
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import FrameOrigin, Mode, Platform
 
@@ -282,7 +282,7 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     flight_s = max(pacing.ready_at(Gate.FLIGHT) - now, 0.0)
     block_s = max(pacing.block_until - now, 0.0)
     ranging_s = FRAME_S if context.blocked else context.profile.mode_turn_s(Mode.MANUAL)
-    lost_s = 0.0 if context.clear else sequences.REPEAT_INTERVAL_S
+    lost_s = 0.0 if context.clear else REPEAT_INTERVAL_S
     if sequence in (sequences.FULL, sequences.FULL_MODE):
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not context.manual and now + alone_s + IN_TIME_S < pacing.block_from:
@@ -299,7 +299,7 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
         # it.
         return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
     if sequence is sequences.GENERAL and not context.known and context.profile.kind is not Platform.RASPBERRY_PI:
-        lost_s = sequences.REPEAT_INTERVAL_S  # behind half a frame the first two are lost
+        lost_s = REPEAT_INTERVAL_S  # behind half a frame the first two are lost
         return flight_s + FRAME_S + lost_s + ranging_s + WIRE_S
     one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
     twice_s = 0.0 if one else FRAME_S  # the car may read only the second

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fleet.examples import EXAMPLES
-from fleet.policy.plan.lint import check
+from fleet.policy.lint.lint import check
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Quantifier
 from schemas.words import Mode

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fleet.conditions.parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from fleet.policy.decide import step
-from fleet.policy.plan.lint import find_faults
+from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import NAMES, CarSnapshot, FleetSnapshot

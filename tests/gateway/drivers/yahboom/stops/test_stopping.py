@@ -12,8 +12,9 @@ import pytest
 
 from gateway.control.commands import Drive, Led, SetMode, Stop
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.pacing import Pacing
+from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops import sequences, stopping
 from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
 from gateway.sim.model.raspberry_pi import Transport
@@ -236,7 +237,7 @@ def test_every_recipe_ends_alone_in_the_buffer() -> None:
     for situation in situations():
         for recipe in (stopping.full(situation), stopping.soft(situation)):
             last = recipe.steps[-1]
-            assert last.after_s >= sequences.REPEAT_INTERVAL_S - 1e-9 or last.gate is sequences.Gate.ALONE, recipe
+            assert last.after_s >= REPEAT_INTERVAL_S - 1e-9 or last.gate is Gate.ALONE, recipe
 
 
 def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:

@@ -11,9 +11,9 @@ from typing import Final
 
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.debounce import HYSTERESIS_S
-from fleet.policy.plan.lint_conflicts import find_conflicts, implies
+from fleet.policy.lint.conflicts import find_conflicts, implies
+from fleet.policy.lint.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanPhase, Role, Rule
-from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from schemas.suggestion import misspelled
 from schemas.words import Mode

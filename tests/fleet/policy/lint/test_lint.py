@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.policy.plan.lint import Severity, check, find_faults
+from fleet.policy.lint.lint import Severity, check, find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
