@@ -1,8 +1,8 @@
 """The gateway of one car: joins link, decoder, control and bus in one asyncio loop. Read this file first.
 
-Up: `_read` takes bytes from the link. The decoder makes events of them. `CarPublisher` publishes the measurements, and
-control updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler` passes the command
-to control, and answers after control could write. Only `_write_due` writes to the car, one frame at a time.
+Up: `LinkLoop` takes bytes from the link. The decoder makes events of them. `CarPublisher` publishes the measurements,
+and control updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler` passes the
+command to control, and answers after control could write. Only `Writer` writes to the car, one frame at a time.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ import logging
 import random
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -21,32 +21,29 @@ import zenoh
 from gateway import drivers
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
-from gateway.bus.publisher import BUS_LOSS_GAP_S, RAW_PER_S, CarPublisher
+from gateway.bus.publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
 from gateway.bus.service import CarService
-from gateway.control.backoff import Attempts
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
-from gateway.control.driver import Echo, Event, Rejected, TextLine
-from gateway.control.events import OutgoingFrame
-from gateway.control.link_health import LinkHealth
 from gateway.control.safety import PersistedSafety
 from gateway.learned_file import LearnedFile
-from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link import LinkUrl
+from gateway.link_loop import LinkLoop, at_rate
 from gateway.state_file import SafetyStateFile
+from gateway.wake import Wake
+from gateway.writer import Writer
 from schemas import bus
 from schemas.authority import People
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
-from schemas.links import BAUD, SerialUrl, UsbUrl, car_link
+from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.running_cars import RunningMark
-from schemas.words import FrameVerdict, Level, LinkState, Motors, Shows
+from schemas.words import Level, Shows
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
-MAX_SLEEP_S: Final = 3600.0
-"""Maximum sleep of the writer: asyncio takes no infinite timer."""
 HUB_RESTART_DELAY_S: Final = 0.5
 """Delay before the restart of a lost hub; jitter doubles it at most."""
 RIVAL_CHECK_DELAY_S: Final = 0.5
@@ -58,22 +55,10 @@ close the port."""
 HEALTH_INTERVAL_S: Final = 1.0
 LEARNED_INTERVAL_S: Final = 10.0
 """Minimum interval at which what was learned of the car is kept."""
-SLICE_BYTES: Final = 1024
-"""Maximum bytes that are decoded before other tasks run, a stop above all. A car sends 960 a second."""
 ANSWER_PAUSE_S: Final = 0.005
 """Pause between the slices of a long answer, in which Zenoh sends a slice. It drops answers beyond its buffer."""
 CANCEL_RETRY_S: Final = 0.5
 """Interval after which a task that still runs is cancelled again."""
-MAX_BYTES_AGE_S: Final = 0.25
-"""Discard bytes older than this; newer data matters more."""
-MIN_DAMAGED: Final = 3
-LOOK_INTERVAL_S: Final = 10.0
-"""Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
-FLOOD_LOG_PAUSE_S: Final = 10.0
-"""Minimum pause after a flood before the next one is logged."""
-
-BITS_PER_BYTE: Final = 10
-"""Bits of a byte on a UART: 8N1."""
 
 log = logging.getLogger("gateway")
 
@@ -132,19 +117,9 @@ class CarGateway:
         self._mark = RunningMark(settings.state_dir, settings.fleet, settings.car)
         self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
-        self._health = LinkHealth(since=now, bytes_per_s=self._driver.model.profile.baud / BITS_PER_BYTE)
-        self._url = _at_rate(settings.url, self._driver.model.profile.baud)
-        self._baud = BaudWatch(self._url)
-        self._flood_until = now
-        self._link: Link | None = None
-        self._attempts = Attempts()
-        self._trouble = ""
-        """The trouble of an open link that was logged last."""
-        self._damaged = 0
-        """Frames that were rejected since the last search for the trouble of the link."""
-        self._look_at = now
-        self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(self._url))
-        self._wake = asyncio.Event()
+        url = at_rate(settings.url, self._driver.model.profile.baud)
+        self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(url))
+        self._wake = Wake(self._control)
         self._commands = CommandHandler(
             settings.fleet,
             settings.car,
@@ -156,12 +131,26 @@ class CarGateway:
             clock=self._loop.time,
             wake=self._wake.set,
         )
-        self._wake_at = now
-        """When the writer wakes by itself."""
+        self._link = LinkLoop(
+            url,
+            self._control,
+            self._publisher,
+            self._commands,
+            self._wake,
+            on_gap=self._on_gap,
+            on_open=self._on_open,
+        )
+        self._writer = Writer(
+            self._driver,
+            self._link,
+            self._publisher,
+            self._wake,
+            on_gap=self._on_gap,
+            on_opened=partial(self._save_learned, at_once=True),
+        )
         self._hub_lost = asyncio.Event()
         self._values_due, self._histories_due = asyncio.Event(), asyncio.Event()
         self._ending = False
-        self._stopped = asyncio.Event()
         self._began_at = self._alive_at = now
         self._learned_due_at = now
         self._worst_lag_s = 0.0
@@ -188,8 +177,8 @@ class CarGateway:
             cars=self._estop_sync.on_tokens,
         )
         work = (
-            self._connect(),
-            self._write_frames(),
+            self._link.keep_open(may_fail=self._settings.retry, is_in_use=self._is_port_in_use),
+            self._writer.run(self._flush),
             self._tick(),
             self._keep_hub(),
             self._check_rival(),
@@ -198,7 +187,7 @@ class CarGateway:
             self._answer(self._service.histories),
         )
         tasks = [asyncio.ensure_future(each) for each in work]
-        stopped = asyncio.ensure_future(self._stopped.wait())
+        stopped = asyncio.ensure_future(self._writer.finished.wait())
         try:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             failed = [task for task in done if task is not stopped and task.exception() is not None]
@@ -210,14 +199,14 @@ class CarGateway:
                 failed[0].result()
         finally:
             running = {stopped, *tasks}
-            # wait_for of Python 3.11 may swallow a cancellation. `_connect` would then reopen the link for ever.
+            # wait_for of Python 3.11 may swallow a cancellation. `keep_open` would then reopen the link for ever.
             while running:
                 for task in running:
                     task.cancel()
                 _, running = await asyncio.wait(running, timeout=CANCEL_RETRY_S)
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
-            if self._link is not None:
-                await self._link.close()
+            if self._link.link is not None:
+                await self._link.link.close()
             self._save_learned(self._loop.time(), at_once=True)
             self._mark.end()
             self._flush()
@@ -229,9 +218,9 @@ class CarGateway:
         """Stop the car, then end. A second call ends at once."""
         if self._ending:
             log.error("%s may still be moving: its gateway was ended twice", self._settings.car)
-            self._control.link_down("the gateway was ended twice", self._loop.time())
+            self._driver.link_down("the gateway was ended twice", self._loop.time())
         self._ending = True
-        self._control.shut_down(self._loop.time())
+        self._driver.shut_down(self._loop.time())
         if not self._driver.finished:
             confirms = self._driver.model.shows is not Shows.NO
             wait = f" It takes up to {SHUTDOWN_S:g} s until the car confirms it." if confirms else ""
@@ -242,7 +231,7 @@ class CarGateway:
         """Check once more for another gateway. Of two that started together the one with the higher id ends."""
         await asyncio.sleep(RIVAL_CHECK_DELAY_S)
         await self._has_rival()
-        await self._stopped.wait()
+        await self._writer.finished.wait()
 
     async def _has_rival(self) -> bool:
         """Return True if another gateway of the car has to end. Raise AlreadyServed if this one has to."""
@@ -252,199 +241,12 @@ class CarGateway:
         """Return True if another gateway, which has to end, may still have the port open."""
         return self._loop.time() < self._began_at + RIVAL_SHUTDOWN_S and await self._has_rival()
 
-    # ------------------------------------------------------------------ the link
-
-    async def _connect(self) -> None:
-        """Keep the link open, and read from it."""
-        may_fail = self._settings.retry
-        looked_again = False
-        while True:
-            try:
-                link = await open_link(self._url, first=self._may_move)
-            except LinkError as error:
-                if not may_fail and not await self._is_port_in_use():
-                    if looked_again or not isinstance(error, Busy):
-                        raise
-                    looked_again = True  # the other gateway, which had the port, may have ended since
-                else:
-                    self._on_link_lost(str(error))
-                await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
-                continue
-            may_fail = True
-            now = self._loop.time()
-            self._link = link
-            self._baud = BaudWatch(self._url)
-            self._health.on_open(now)
-            self._control.link_up(now)
-            if self._attempts.on_open(now):
-                self._log_open()
-            self._wake.set()
-            try:
-                await self._read(link)
-            except LinkLost as error:
-                self._on_events(self._driver.drop_bytes())
-                if self._link is link:
-                    self._on_link_lost(str(error))
-            await link.close()
-            await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
-
-    @property
-    def _may_move(self) -> bool:
-        """True if the car may be moving while its link is down."""
-        return self._control.was_open and self._driver.model.motors is not Motors.OFF
-
-    def _check_link(self) -> None:
-        """Let the link search for the cause if bytes are damaged or missing, and log what it found, once."""
-        if self._link is None:
-            return
-        now, is_stale = self._loop.time(), self._health.state is LinkState.STALE
-        if now >= self._look_at and (is_stale or self._damaged >= MIN_DAMAGED):
-            self._damaged, self._look_at = 0, now + LOOK_INTERVAL_S
-            self._link.look_for_trouble()
-        trouble = self._link.trouble
-        if trouble and trouble != self._trouble:
-            self._trouble = trouble
-            self._health.on_rejected("port_shared")
-            self._commands.log(Level.WARNING, "port_shared", trouble)
-
-    def _log_open(self) -> None:
+    def _on_open(self) -> None:
+        """Log that the link is open, once it is proven."""
         if self._learned_file.trouble:
             self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
             self._learned_file.trouble = ""
-        self._commands.log(Level.INFO, "link_open", f"{self._url} is open. The gateway stops the car first.")
-
-    async def _read(self, link: Link) -> None:
-        """Decode bytes until the link is lost."""
-        while True:
-            data = await link.read()
-            read_at = now = self._loop.time()
-            self._health.on_bytes(len(data), now)
-            self._on_gap(now)  # before the bytes: reports that are read late may look like a pause
-            before = self._shown_state
-            for start in range(0, len(data), SLICE_BYTES):
-                if start:
-                    await asyncio.sleep(0)
-                    now = self._loop.time()
-                if now > read_at + MAX_BYTES_AGE_S:
-                    self._on_events(self._driver.drop_bytes())
-                    self._on_flood("flood_bytes", len(data) - start, now)
-                    break
-                self._on_events(self._driver.feed(data[start : start + SLICE_BYTES], now))
-            if (doubt := self._baud.on_bytes(data)) is not None:
-                self._health.on_rejected(doubt.cause, 1)
-                self._commands.log(Level.WARNING, "no_frames", doubt.words)
-            if self._shown_state != before:
-                self._wake.set()
-            self._wake_if_due(now)
-
-    def _on_flood(self, counted_as: str, count: int, now: float) -> None:
-        """Count discarded data, and log each flood once."""
-        self._health.on_rejected(counted_as, count)
-        if now >= self._flood_until:
-            words = (
-                f"{self._settings.car} sends more bytes than any car: another device, or a wrong baud rate? "
-                f"The gateway publishes {RAW_PER_S:g} raw frames a second and counts the rest in state/link."
-            )
-            self._commands.log(Level.WARNING, "flood", words)
-        self._flood_until = now + FLOOD_LOG_PAUSE_S
-
-    def _on_events(self, events: list[Event]) -> None:
-        """Publish the measurements of the events, then update the state of the car with them."""
-        for event in events:
-            if not self._publisher.publish_event(event):
-                self._on_flood("raw_not_published", 1, event.at)
-            self._control.on_event(event, self._loop.time())
-            if isinstance(event, TextLine):
-                self._health.on_rejected(FrameVerdict.TEXT)  # it shows a program, but not that of a car
-                continue
-            self._health.rx_frames += 1
-            if isinstance(event, Rejected):
-                self._health.on_rejected(event.cause)
-                self._damaged += 1
-                continue
-            self._baud.on_frame()
-            if not isinstance(event, Echo):
-                self._health.on_reading(event.at)
-            if self._attempts.check_proven(event.at, has_reading=True):
-                self._log_open()
-
-    def _on_link_lost(self, reason: str) -> None:
-        now = self._loop.time()
-        self._link = None
-        self._health.on_lost(reason, now)
-        self._control.link_down(reason, now)
-        if self._attempts.on_failed(reason):
-            self._commands.log(Level.WARNING, "link_lost", reason)
-        self._wake.set()
-
-    # ------------------------------------------------------------------ frames to the car
-
-    async def _write_frames(self) -> None:
-        """Write frames when control needs it, answer queries, publish records."""
-        while True:
-            self._wake.clear()
-            await self._write_due()
-            self._flush()
-            if self._driver.finished:
-                self._stopped.set()
-            now = self._loop.time()
-            self._wake_at = self._due_at(now)
-            timer = self._loop.call_at(min(self._wake_at, now + MAX_SLEEP_S), self._wake.set)
-            await self._wake.wait()
-            timer.cancel()
-
-    @property
-    def _shown_state(self) -> tuple[object, ...]:
-        """Return the part of the published states that readings or silence may change."""
-        model = self._driver.model
-        return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *self._findings
-
-    @property
-    def _findings(self) -> tuple[object, ...]:
-        """Return what was found out about the car itself."""
-        model = self._driver.model
-        return model.profile.name, model.shows, model.doubted
-
-    def _wake_if_due(self, now: float) -> None:
-        """Wake the writer only if it has work. Waking it for every reading costs a third more CPU."""
-        if self._control.has_records or self._due_at(now) < self._wake_at:
-            self._wake.set()
-
-    def _due_at(self, now: float) -> float:
-        """Return when control or the decoder needs the loop next, if nothing else happens."""
-        return min(self._control.next_at(now), self._driver.flush_at())
-
-    async def _write_due(self) -> None:
-        """Write the frames that are due."""
-        now = self._loop.time()
-        self._on_gap(now)  # before the decoder: reports that are read late may look like a pause
-        self._on_events(self._driver.flush(now))
-        while (link := self._link) is not None and (write := self._next_frame()) is not None:
-            self._driver.sends(write.data, self._loop.time())  # an echo may arrive before the write returns
-            try:
-                await link.write(write.data)
-            except LinkLost as error:
-                reason = f"a write failed: {error}"
-                now = self._loop.time()
-                self._publisher.publish_frame(write, now, whole=False)
-                self._control.on_write_failed(reason, now)
-                if self._link is link:  # else `_connect` has noticed the loss already
-                    self._on_link_lost(reason)
-                await link.close()  # `_connect` wakes and reopens it
-                return
-            now = self._loop.time()
-            opened_as = self._driver.opened_as
-            self._control.on_written(write, now)
-            if self._driver.opened_as != opened_as:  # the next gateway needs it to stop the car
-                self._save_learned(now, at_once=True)
-            self._health.on_written(len(write.data), now)
-            self._publisher.publish_frame(write, now, whole=True)
-
-    def _next_frame(self) -> OutgoingFrame | None:
-        """Return the frame to write now, if any. The computer may have slept since the last one."""
-        now = self._loop.time()
-        self._on_gap(now)
-        return self._control.poll(now)
+        self._commands.log(Level.INFO, "link_open", f"{self._link.url} is open. The gateway stops the car first.")
 
     # ------------------------------------------------------------------ commands
 
@@ -498,8 +300,6 @@ class CarGateway:
             self._worst_lag_s = max(self._worst_lag_s, now - due)
             self._on_gap(now)
             self._alive_at = now
-            if self._attempts.check_proven(now, has_reading=False):
-                self._log_open()
             if has_ended(self._settings.parent) and not self._ending:
                 self._commands.log(
                     Level.WARNING,
@@ -512,19 +312,19 @@ class CarGateway:
             else:
                 self._publisher.on_bus_lost(now)
                 self._hub_lost.set()
-            self._check_link()
-            before = self._shown_state
+            self._link.check(now)
+            before = shown_state(self._driver.model)
             self._control.tick(now)
-            self._wake_if_due(now)
+            self._wake.set_if_due(now)
             model = self._driver.model
-            changed = self._health.update(
+            changed = self._link.health.update(
                 now=now,
                 limit_s=model.silence_limit_s,
                 unheard_s=model.unheard_s(now),
                 why_quiet=model.why_quiet,
                 is_heard=model.is_heard,
             )
-            if changed or self._shown_state != before or now >= next_health:
+            if changed or shown_state(model) != before or now >= next_health:
                 self._publish_states(now)
             if now >= next_health:
                 self._save_learned(now)
@@ -544,7 +344,7 @@ class CarGateway:
         gap_s = now - self._alive_at - CHECK_INTERVAL_S
         if gap_s > BUS_LOSS_GAP_S:
             self._publisher.on_bus_lost(now)
-        self._control.on_stall(gap_s, now)
+        self._driver.on_stall(gap_s, now)
 
     def _save_learned(self, now: float, *, at_once: bool = False) -> None:
         """Keep what was learned of the car for the next gateway."""
@@ -558,12 +358,12 @@ class CarGateway:
 
     def _publish_states(self, now: float, *, force: bool = False) -> None:
         """Publish changed states. A finding about the car goes before the claims that rest on it."""
-        if self._findings != self._published_findings:
+        if findings_of(self._driver.model) != self._published_findings:
             self._publish_health(now)
-        self._publisher.publish_states(self._control, self._health, now, force=force)
+        self._publisher.publish_states(self._control, self._link.health, now, force=force)
 
     def _publish_health(self, now: float) -> None:
-        self._published_findings = self._findings
+        self._published_findings = findings_of(self._driver.model)
         drops = self._service.dropped + self._publisher.dropped
         self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops)
 
@@ -579,11 +379,6 @@ class CarGateway:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
             except bus.BusError as error:
                 self._commands.log(Level.ERROR, "no_hub", str(error))
-
-
-def _at_rate(url: LinkUrl, baud: int) -> LinkUrl:
-    """Return a link at the rate of its car, unless it names a rate of its own."""
-    return replace(url, baud=baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url
 
 
 async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> bool:

@@ -328,6 +328,16 @@ def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> Non
     message.candidates.extend(mode.candidates)
 
 
+def findings_of(model: DriverClaims) -> tuple[object, ...]:
+    """Return what was found out about the car itself."""
+    return model.profile.name, model.shows, model.doubted
+
+
+def shown_state(model: DriverClaims) -> tuple[object, ...]:
+    """Return the part of the published states that readings or silence may change."""
+    return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *findings_of(model)
+
+
 def _fill_motion(message: pb.Motion, control: Controller[Driver], now: float) -> None:
     model = control.driver.model
     message.motion = model.motion or UNKNOWN

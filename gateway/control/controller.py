@@ -1,8 +1,7 @@
-"""Controls one car: takes commands, readings and link events, returns frames to write and records.
+"""Controls one car: takes the commands, decides who may command the car, and keeps the records.
 
-No I/O, no threads, no clock: time is an argument, in seconds of one monotonic clock. The loop around it calls `poll`,
-writes the returned frame, and calls `on_written` or `on_write_failed` before the next `poll`. So there is never more
-than one frame in flight.
+No I/O, no threads, no clock: time is an argument, in seconds of one monotonic clock. What concerns bytes and frames the
+loop asks of the `driver` (gateway/control/driver.py says how).
 """
 
 from collections.abc import Callable, Iterable
@@ -31,8 +30,8 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.driver import LATE_DRIVE_S, Desk, Driver, Event
-from gateway.control.events import OutgoingFrame, Record
+from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
+from gateway.control.events import Record
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from gateway.control.senders import Senders
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
@@ -114,14 +113,6 @@ class Controller(Generic[D_co]):
         self.was_open = True
         self.driver.link_up(now)
 
-    def link_down(self, reason: str, now: float) -> None:
-        """Fail all commands: the link is down."""
-        self.driver.link_down(reason, now, cause=Reason.LINK_DOWN)
-
-    def on_write_failed(self, reason: str, now: float) -> None:
-        """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
-        self.driver.link_down(reason, now, cause=Reason.WRITE_FAILED)
-
     def waits_for(self, now: float) -> str:
         """Return what a command would wait for now, in words; empty if the car is ready."""
         model = self.driver.model
@@ -142,31 +133,11 @@ class Controller(Generic[D_co]):
         busy_s = self._busy_s(now)
         return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
-    def poll(self, now: float) -> OutgoingFrame | None:
-        """Return the frame to write now, if any."""
-        return self.driver.poll(now)
-
-    def on_written(self, write: OutgoingFrame, now: float) -> None:
-        """Update the state: the link has taken the frame that `poll` returned."""
-        self.driver.on_written(write, now)
-
-    def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens before; inf if never."""
-        return self.driver.next_at(now)
-
-    def on_event(self, event: Event, now: float) -> None:
-        """Update the state with an event of the decoder."""
-        self.driver.on_event(event, now)
-
     def tick(self, now: float) -> None:
         """Check for silence. Call it a few times a second."""
         if self.safety.loan is not None and self.safety.loan_at(now) is None:
             self._end_loan(f"the loan of {self.car} to {self.safety.loan.to} is over", now)
         self.driver.tick(now)
-
-    def on_stall(self, gap_s: float, now: float) -> None:
-        """Stop a driven car after a gap of the loop."""
-        self.driver.on_stall(gap_s, now)
 
     def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
         """Stop the car first after a sleep of the computer, and end the lease. `counted`: `now` went on meanwhile."""
@@ -177,10 +148,6 @@ class Controller(Generic[D_co]):
         else:
             self.safety.loan_until -= slept_s
         self.driver.on_sleep(slept_s, now)
-
-    def shut_down(self, now: float) -> None:
-        """Stop the car and reject all later commands: the gateway ends."""
-        self.driver.shut_down(now)
 
     # ------------------------------------------------------------------ commands
 

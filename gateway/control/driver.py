@@ -335,7 +335,7 @@ class Driver(ABC):
         """Bring the car to a known state: the link is open."""
 
     @abstractmethod
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands: the link is down. After WRITE_FAILED the car may have a part of a frame."""
 
     @abstractmethod

@@ -87,15 +87,15 @@ class Bench:
                 self.control.tick(self.now)
                 said = [event for each in self._samples for event in self.control.driver.feed(each, self.now)]
                 for event in said:
-                    self.control.on_event(event, self.now)
+                    self.control.driver.on_event(event, self.now)
             for event in self.control.driver.flush(self.now):
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
             self.write()
 
     def write(self) -> None:
         """Write what is due."""
         for count in range(MAX_FRAMES_AT_ONCE + 1):
-            write = self.control.poll(self.now)
+            write = self.control.driver.poll(self.now)
             if write is None:
                 break
             if not write.data:
@@ -104,9 +104,9 @@ class Bench:
                 self.faults.append(f"more than {MAX_FRAMES_AT_ONCE} frames at one moment: {write.data!r}")
                 break
             self.control.driver.sends(write.data, self.now)
-            self.control.on_written(write, self.now)
+            self.control.driver.on_written(write, self.now)
             self.sent.append((self.now, write.data, write.why))
-        if self.control.next_at(self.now) < self.now:
+        if self.control.driver.next_at(self.now) < self.now:
             self.faults.append("next_at lies before now")
         self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
 
@@ -166,7 +166,7 @@ def check_bytes(family: Family, platform: str) -> Iterator[str]:
         for event in bench.control.driver.feed(data, bench.now):
             bench.control.driver.measured(event)
             bench.control.driver.verdict(event)
-            bench.control.on_event(event, bench.now)
+            bench.control.driver.on_event(event, bench.now)
         bench.run(0.1)
 
 
@@ -284,7 +284,7 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
     bench = _connected(family, platform)
     stop = bench.ask(Stop())
     bench.run(0.1)
-    bench.control.link_down("unplugged", bench.now)
+    bench.control.driver.link_down("unplugged", bench.now)
     bench.write()
     before = len(bench.sent)
     bench.run(5.0)
@@ -305,7 +305,7 @@ def check_end(family: Family, platform: str) -> Iterator[str]:
     """Check that a gateway which ends stops its car, and ends in time."""
     bench = _connected(family, platform)
     before = len(bench.sent)
-    bench.control.shut_down(bench.now)
+    bench.control.driver.shut_down(bench.now)
     bench.run(SHUTDOWN_S + 1.0)
     if not bench.control.driver.finished:
         yield f"it has not ended {SHUTDOWN_S:g} s after it was told to"

@@ -347,7 +347,7 @@ class PlainDriver(Driver):
         self._learn(TrustEvent.LINK_OPENED, now)
         self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
 
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands: the link is down."""
         model = self._model
         model.link_open, model.link_reason, self._renew_at = False, reason, float("inf")

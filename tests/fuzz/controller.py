@@ -164,7 +164,7 @@ class Wild:
             name = moments.choice(SENDERS).name if moments.random() < 0.9 else f"n{moments.random()}"
             self.control.on_sender_token(name, alive=moments.random() < 0.5, now=self.now)
         elif chance < 0.98:
-            self.control.on_stall(moments.random(), self.now)
+            self.control.driver.on_stall(moments.random(), self.now)
         elif chance < 0.99:
             estops = [Estop(f"id{moments.randrange(40)}", "ann", "", 1, moments.random() < 0.9)]
             shown = estops if moments.random() < 0.1 else []
@@ -177,7 +177,7 @@ class Wild:
         elif chance < 0.9998:
             self._pass(moments.choice(JUMPS_S))
         else:
-            self.control.shut_down(self.now)
+            self.control.driver.shut_down(self.now)
             self.ending = True
         self._pump()
         if self.ending and (self.control.driver.stops.finished or moments.random() < 0.01):
@@ -233,17 +233,17 @@ class Wild:
     def _pass(self, gap_s: float) -> None:
         self.now += gap_s
         for event in self.decoder.tick(self.now):
-            self.control.on_event(event, self.now)
+            self.control.driver.on_event(event, self.now)
         self.control.tick(self.now)
 
     def _hear(self, data: bytes) -> None:
         if self.linked:
             for event in self.decoder.feed(data, self.now):
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
 
     def _turn_link(self) -> None:
         if self.linked:
-            self.control.link_down("unplugged", self.now)
+            self.control.driver.link_down("unplugged", self.now)
         else:
             self.decoder = Decoder()
             self.control.link_up(self.now)
@@ -254,23 +254,23 @@ class Wild:
         """Turn as the gateway's loop does when it wakes: at most three times before it sleeps."""
         for _ in range(3):
             self._turn()
-            if self.control.next_at(self.now) > self.now:
+            if self.control.driver.next_at(self.now) > self.now:
                 return
         raise AssertionError("a loop that never sleeps")
 
     def _turn(self) -> None:
-        write = self.control.poll(self.now)
+        write = self.control.driver.poll(self.now)
         if write is not None:
             self._check_write(write)
             self.writes += 1
             if self.moments.random() < 0.02:
-                self.control.on_write_failed("cut", self.now)
+                self.control.driver.link_down("cut", self.now, cause=Reason.WRITE_FAILED)
                 self.linked = False
             else:
-                self.control.on_written(write, self.now)
+                self.control.driver.on_written(write, self.now)
                 self.decoder.sent(write.data, self.now)
                 self.free_at = self.now + self.control.driver.model.profile.block_s(write.frame)
-            assert self.control.poll(self.now) is None, "one frame in flight"
+            assert self.control.driver.poll(self.now) is None, "one frame in flight"
         self.control.take_records()
 
     # ------------------------------------------------------------------ rules
@@ -368,22 +368,22 @@ def until_off(control: Control, now: float) -> CommandRecord | None:
     end, report_at, last = now + STOP_WITHIN_S, now + 1.0, None
     pi = control.driver.model.profile.kind is Platform.RASPBERRY_PI
     while now < end and (last is None or control.driver.model.motors != "off"):
-        while (write := control.poll(now)) is not None:
+        while (write := control.driver.poll(now)) is not None:
             frame = write.frame
             # The color clears a string that begins with `4WD,`. It is the one that the car has.
             clears = frame == control.driver.model.believed.led
             assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP) or clears, frame
-            control.on_written(write, now)
+            control.driver.on_written(write, now)
             report_at += 1.0 if isinstance(frame, ModeClose) and not pi else 0.0
         for record in control.take_records():
             if isinstance(record, CommandRecord) and record.command.id == "the-stop" and is_end(record):
                 assert last is None, "it ends once"
                 last = record
-        now = min(control.next_at(now), report_at)
+        now = min(control.driver.next_at(now), report_at)
         if now >= report_at:
             report_at = now + 1.0
             for event in Decoder().feed(PI if pi else MANUAL, now):
-                control.on_event(event, now)
+                control.driver.on_event(event, now)
             control.tick(now)
     return last
 

@@ -80,7 +80,7 @@ class Driven:
             pair.control.on_sender_token(moments.choice(SENDERS).name, alive=moments.random() < 0.5, now=pair.now)
         elif chance < 0.98:
             for event in pair.decoder.feed(moments.randbytes(moments.randrange(40)).replace(b"$", b""), pair.now):
-                pair.control.on_event(event, pair.now)
+                pair.control.driver.on_event(event, pair.now)
         elif chance < 0.985:
             pair.car.brown_out(pair.now)
         self._see_cut()
@@ -93,7 +93,7 @@ class Driven:
     def _stall(self, gap_s: float) -> None:
         """Stall the loop while the car goes on."""
         self.pair.now += gap_s
-        self.pair.control.on_stall(gap_s, self.pair.now)
+        self.pair.control.driver.on_stall(gap_s, self.pair.now)
 
     def _ask(self) -> None:
         what = anything(self.moments)

@@ -8,8 +8,9 @@ from gateway.drivers.yahboom.protocol import decoder
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
-from gateway.drivers.yahboom.stops import evidence
-from gateway.drivers.yahboom.stops.evidence import StopCase, StopEvidence
+from gateway.drivers.yahboom.stops import cases, evidence
+from gateway.drivers.yahboom.stops.cases import StopCase
+from gateway.drivers.yahboom.stops.evidence import StopEvidence
 from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.words import Basis
 
@@ -92,7 +93,7 @@ def _shutdown_waits_for_time(patch: Patch) -> None:
 
 def _sent_without_a_report(patch: Patch) -> None:
     def ends(self: StopExecutor, running: StopInProgress, now: float) -> StopCase | None:
-        return StopCase.NO_ECHO if running.frames_sent and now >= running.obeys_by else None
+        return cases.NO_ECHO if running.frames_sent and now >= running.obeys_by else None
 
     patch(StopExecutor, "_ends_as_sent", ends)
 

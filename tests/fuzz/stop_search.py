@@ -611,7 +611,7 @@ class Episode:
                 self._run(1.2)
             case Ending.RECONNECT:
                 self.car.drop_link(now)
-                control.link_down("unplugged", now)
+                control.driver.link_down("unplugged", now)
                 self._linked = False
                 self._run(2 * self._moments.random())
                 self._connect()
@@ -623,7 +623,7 @@ class Episode:
     def _shut_down(self) -> None:
         """Shut the gateway down. If its car is not stopped, start another gateway, as `fleet up` does."""
         for _ in range(6):
-            self.control.shut_down(self.now)
+            self.control.driver.shut_down(self.now)
             self._until(lambda: self.control.driver.stops.finished, 18.0)
             ended, self._claim_since = self.control, None
             self._note(f"ended: not stopped {ended.driver.stops.not_stopped!r}, {ended.driver.model.basis}")
@@ -684,13 +684,16 @@ class Episode:
         if self._linked:
             deadline = self.decoder.deadline()
             wake = min(
-                wake, self.control.next_at(self.now), self._next_tick, float("inf") if deadline is None else deadline
+                wake,
+                self.control.driver.next_at(self.now),
+                self._next_tick,
+                float("inf") if deadline is None else deadline,
             )
         self.now = max(self.now + 1e-4, min(wake, end))
         self._carry(zero)
         if self._linked:
             for event in self.decoder.tick(self.now):
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
             if self.now >= self._next_tick:
                 self._next_tick = self.now + TICK_S
                 self.control.tick(self.now)
@@ -720,7 +723,7 @@ class Episode:
     def _hear(self, data: bytes, at: float) -> None:
         if self._linked:
             for event in self.decoder.feed(data, max(at, 0.0)):
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
                 self.decoder.use_head(self.control.driver.model.profile.dialect.head)
 
     def _pump(self) -> None:
@@ -728,7 +731,7 @@ class Episode:
             return
         control, now = self.control, self.now
         for _ in range(4):
-            write = control.poll(now)
+            write = control.driver.poll(now)
             if write is None:
                 break
             self._note(f"write {write.data!r} {write.why}")
@@ -741,7 +744,7 @@ class Episode:
                 self._down.put(write.data, now - zero, now + took_s - zero)
             else:
                 self.car.feed(write.data, max(now, self.car.now))
-            control.on_written(write, now)
+            control.driver.on_written(write, now)
             self.decoder.sent(write.data, now)
         else:
             raise AssertionError("control writes without end")
@@ -834,7 +837,7 @@ class Episode:
     def _judge_sent(self, *, driving: bool) -> None:
         control = self.control
         case = (
-            control.driver.model.rest_case.value
+            control.driver.model.rest_case.name
             if self._linked and control.driver.model.motors == "off" and control.driver.model.basis == "sent"
             else ""
         )

@@ -90,13 +90,13 @@ class UgvEpisode:
         while self.to_host and self.to_host[0][0] <= self.now:
             for event in driver.feed(self.to_host.pop(0)[1], self.now):
                 driver.measured(event)
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
         if self.now >= self._tick_at:
             self._tick_at = self.now + TICK_S
             self.control.tick(self.now)
-        while self.linked and (write := self.control.poll(self.now)) is not None:
+        while self.linked and (write := self.control.driver.poll(self.now)) is not None:
             driver.sends(write.data, self.now)
-            self.control.on_written(write, self.now)
+            self.control.driver.on_written(write, self.now)
             self.sent.append((self.now, write.data))
             self._check_line(write.data)
             if not self._is_lost():
@@ -160,7 +160,7 @@ class UgvEpisode:
         self.car.drop_link(self.now)
         self.to_car.clear()
         self.to_host.clear()
-        self.control.link_down("unplugged", self.now)
+        self.control.driver.link_down("unplugged", self.now)
 
     def ask(self, what: Action) -> Phase:
         """Give a command as a person."""

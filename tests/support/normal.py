@@ -65,14 +65,14 @@ class NormalRun:
         self.health = LinkHealth()
         self.alarms: list[str] = []
         self.commands = 0
-        heard = self.pair.control.on_event
+        heard = self.pair.control.driver.on_event
 
         def counted(event: Event, now: float) -> None:
             if isinstance(event, Sensors):
                 self.health.on_reading(event.at)
             heard(event, now)
 
-        self.pair.control.on_event = counted  # type: ignore[method-assign]  # as car.py does
+        self.pair.control.driver.on_event = counted  # type: ignore[method-assign]  # as car.py does
         self.health.on_open(self.pair.now)
         self.pair.ready()
         self.pair.logs.clear()

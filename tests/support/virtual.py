@@ -13,7 +13,7 @@ from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from schemas.authority import Sender
-from schemas.words import Level, Phase
+from schemas.words import Level, Phase, Reason
 from tests.support.controls import control
 
 TICK_S = 0.05
@@ -73,7 +73,7 @@ class Pair:
     def lose(self, reason: str = "unplugged") -> None:
         """Cut the link. All bytes in transit are lost."""
         self.car.drop_link(self.now)
-        self.control.link_down(reason, self.now)
+        self.control.driver.link_down(reason, self.now)
         self._take()
 
     def ready(self) -> "Pair":
@@ -161,7 +161,7 @@ class Pair:
         # Most turns are the car's own, without news for control. Polling in each turn took a third of a run.
         if self._touched:
             self._touched = False
-            self._control_at = min(self._control_at, self.control.next_at(self.now))
+            self._control_at = min(self._control_at, self.control.driver.next_at(self.now))
         return self._control_at
 
     def _receive(self, *, linked: bool) -> None:
@@ -169,12 +169,12 @@ class Pair:
             if linked and at >= self.deaf_until:
                 for event in self.decoder.feed(data, at):
                     self._touched = True
-                    self.control.on_event(event, self.now)
+                    self.control.driver.on_event(event, self.now)
                     self.decoder.use_head(self.control.driver.model.profile.dialect.head)
         if linked:
             for event in self.decoder.tick(self.now):
                 self._touched = True
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
             self.tick()
 
     def tick(self) -> None:
@@ -186,15 +186,15 @@ class Pair:
 
     def _pump(self) -> None:
         self._touched, self._control_at = True, float("inf")
-        while (write := self.control.poll(self.now)) is not None:
+        while (write := self.control.driver.poll(self.now)) is not None:
             if self.cut is not None:
                 self.car.feed(write.data[: self.cut], self.now)
                 self.cut = None
-                self.control.on_write_failed("the write was cut", self.now)
+                self.control.driver.link_down("the write was cut", self.now, cause=Reason.WRITE_FAILED)
                 break
             self.sent.append((self.now, write.data))
             self.car.feed(write.data, self.now)
-            self.control.on_written(write, self.now)
+            self.control.driver.on_written(write, self.now)
             self.decoder.sent(write.data, self.now)
         self._take()
 

@@ -555,7 +555,7 @@ class WaveshareDriver(PlainDriver):
             case _:
                 return None
 
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands: the link is down."""
         super().link_down(reason, now, cause=cause)
         self._firmware = None

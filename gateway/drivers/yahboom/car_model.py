@@ -18,8 +18,9 @@ from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
 from gateway.drivers.yahboom.protocol.frames import ColorLed
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
-from gateway.drivers.yahboom.stops import stopping
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase, StopEvidence
+from gateway.drivers.yahboom.stops import cases, stopping
+from gateway.drivers.yahboom.stops.cases import StopCase
+from gateway.drivers.yahboom.stops.evidence import StopEvidence
 from schemas.words import Basis, Blocking, CarTrust, Mode, Motion, Motors, Platform, Shows, Verdict
 
 
@@ -40,7 +41,7 @@ class CarModel:
     believed: StateEstimate = field(init=False)
     evidence: StopEvidence = field(init=False)
     trust: TrustState = field(default_factory=TrustState)
-    rest_case: StopCase = StopCase.SOFT
+    rest_case: StopCase = cases.SOFT
     """The case of the stop, if the claim of rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
@@ -137,7 +138,7 @@ class CarModel:
     @property
     def rest_is_sure(self) -> bool:
         """Return True if the car has shown that it stands, or cannot show it."""
-        return self.at_rest and (self.trust.shown or self.rest_case is not StopCase.SOFT or not self.can_show)
+        return self.at_rest and (self.trust.shown or self.rest_case.is_sure or not self.can_show)
 
     @property
     def can_show(self) -> bool:
@@ -170,6 +171,17 @@ class CarModel:
     def stop_style(self) -> StopStyle:
         """Return the kind of stop for this car now."""
         return stopping.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
+
+    def stop_case(self, *, is_soft: bool) -> StopCase:
+        """Return what a stop rests on now if the car does not show it."""
+        profile = self.profile
+        return cases.case_of(
+            self.stop_style,
+            profile.kind,
+            has_readings=profile.has_readings,
+            is_soft=is_soft,
+            can_show=self.can_show,
+        )
 
     @property
     def silent_program(self) -> str:
@@ -216,20 +228,19 @@ class CarModel:
     def shows_stops(self) -> tuple[Shows, str]:
         """Return whether the reports of this car show that a stop arrived, and why, in words."""
         if not self.profile.has_readings:
-            return Shows.NO, EVIDENCE[StopCase.NO_READINGS].words.format(car=self.name)
+            return Shows.NO, cases.NO_READINGS.why(self.name)
         if self.stop_style is StopStyle.GENERAL and self.auto and not self.platform.is_settled:
-            return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
+            return Shows.UNKNOWN, cases.NOT_KNOWN.why(self.name)
         if self.stop_style is StopStyle.GENERAL:
-            case = StopCase.RASPBERRY_PI if self.profile.kind is Platform.RASPBERRY_PI else StopCase.UNKNOWN_PLATFORM
-            return Shows.NO, EVIDENCE[case].words.format(car=self.name)
+            return Shows.NO, self.stop_case(is_soft=False).why(self.name)
         if self.learned.doubted:
             return Shows.YES, f"{self.name} has shown its stops before, and did not show the last one"
         if self.learned.shows is Shows.YES:
             now = ", but not now: it has no sonar echo" if self.evidence.without_echo > 1 else ""
             return Shows.YES, f"the reports of {self.name} show that a stop arrived{now}"
         if not self.can_show and Blocking.MODE_CLOSE not in self.learned.blocks:
-            return Shows.NO, EVIDENCE[StopCase.NO_REACTION].words.format(car=self.name)
-        return Shows.UNKNOWN, EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.name)
+            return Shows.NO, cases.NO_REACTION.why(self.name)
+        return Shows.UNKNOWN, cases.NOT_KNOWN.why(self.name)
 
     def for_stop(self, now: float) -> stopping.StopContext:
         """Return the context for the choice of a stop."""

@@ -14,7 +14,8 @@ from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.modes import only_candidate
 from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, Finding, StopCase
+from gateway.drivers.yahboom.stops import cases
+from gateway.drivers.yahboom.stops.evidence import Finding
 from schemas.words import (
     Blocking,
     CarTrust,
@@ -139,7 +140,7 @@ class CarMonitor:
         """Handle what the readings have shown about the car itself."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
-            words = EVIDENCE[StopCase.NO_REACTION].words.format(car=name)
+            words = cases.NO_REACTION.why(name)
             self._log.log(Level.INFO, "cannot_show", f"{words}. It can be used like any other car.", now)
         else:
             words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
@@ -234,7 +235,7 @@ class CarMonitor:
         running = self._stops.running
         if model.at_rest and running is None:
             self._stops.stop_again(now)
-        elif running is None or running.case is StopCase.SOFT:
+        elif running is None or running.case is cases.SOFT:
             self._stops.recover(now, words)
         model.learn(TrustEvent.SILENT, now, words)
 

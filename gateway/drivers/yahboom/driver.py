@@ -96,7 +96,7 @@ class YahboomDriver(Executor):
         self._decoder = Decoder(head=self.model.profile.dialect.head)
         super().link_up(now)
 
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands: the link is down."""
         self.model.cut_write = self.model.cut_write or cause is Reason.WRITE_FAILED
         self._monitor.link_down()

@@ -18,7 +18,7 @@ from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, Mo
 from gateway.drivers.yahboom.protocol.platforms import StopStyle
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_executor import StopExecutor
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
@@ -59,7 +59,7 @@ class Executor(Driver):
         model.learn(TrustEvent.LINK_OPENED, now)
         self.stops.begin_recovery(FrameOrigin.RECOVERY, now, [])
 
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands: the link is down, and the state of the car is unknown."""
         model = self.model
         model.link_open = False
@@ -302,8 +302,8 @@ class Executor(Driver):
 
         See docs/reference/protocol.md#hazards.
         """
-        self.model.rest_case = StopCase.ACTED
-        words = EVIDENCE[StopCase.ACTED].words.format(car=self.model.name)
+        self.model.rest_case = cases.ACTED
+        words = cases.ACTED.why(self.model.name)
         self.model.learn(TrustEvent.STOP_SENT, now, words)
         self.stops.renewal.schedule(now)
 

@@ -12,19 +12,15 @@ from gateway.control.trust import STOP_GOES_ON, TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ModeClose
-from gateway.drivers.yahboom.protocol.platforms import StopStyle
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
-from gateway.drivers.yahboom.stops import sequences, stopping
-from gateway.drivers.yahboom.stops.evidence import EARLY_S, EVIDENCE, Finding, StopCase
+from gateway.drivers.yahboom.stops import cases, sequences, stopping
+from gateway.drivers.yahboom.stops.cases import StopCase, StopFacts
+from gateway.drivers.yahboom.stops.evidence import EARLY_S, Finding
 from gateway.drivers.yahboom.stops.sequences import StopSequence
 from gateway.drivers.yahboom.stops.stopping import StopInProgress
 from schemas.limits import SHUTDOWN_S
-from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Platform, Reason, Shows
-
-DOUBTED_PROBES: Final = 2
-"""Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
-
+from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 _PROBED: Final = (Finding.REPORT, Finding.PAUSE, Finding.CONTROL)
 """The reports after which a stop that the car may still show goes on with its next frame."""
@@ -121,20 +117,7 @@ class StopExecutor:
 
     def _case(self, sequence: StopSequence) -> StopCase:
         """Return what this stop rests on if the car does not show it."""
-        model = self.model
-        if not model.profile.has_readings:
-            return StopCase.NO_READINGS
-        match model.stop_style:
-            case StopStyle.GENERAL if model.profile.kind is Platform.RASPBERRY_PI:
-                return StopCase.RASPBERRY_PI
-            case StopStyle.GENERAL:
-                return StopCase.UNKNOWN_PLATFORM
-            case _ if sequence.rank == sequences.SOFT.rank:
-                return StopCase.SOFT
-            case StopStyle.BOTH:
-                return StopCase.WRONG_PLATFORM
-            case _:
-                return StopCase.MANUAL if model.can_show else StopCase.NO_REACTION
+        return self.model.stop_case(is_soft=sequence.rank == sequences.SOFT.rank)
 
     def change_case(self) -> None:
         """Judge the running stop by the profile that is in force now."""
@@ -143,7 +126,7 @@ class StopExecutor:
 
     # ------------------------------------------------------------------ link, shutdown
 
-    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail the commands of the running stop: the link is down."""
         self.renewal.suspend()
         running, self.running = self.running, None
@@ -201,44 +184,38 @@ class StopExecutor:
     def _await(self, running: StopInProgress, now: float) -> None:
         """End a stop that the car cannot show. If the car can show it, and did not in time, send the stop again."""
         case = self._ends_as_sent(running, now)
-        if case is StopCase.SOFT and self.model.is_deaf:
+        if case is cases.SOFT and self.model.is_deaf:
             self._doubt_soft(running, now)
             return
         if case is not None:
-            self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
+            self._finish(running, Basis.SENT, case.why(self.model.name), now, case)
             return
         if self.model.evidence.settles_at is None and now >= max(running.next_try_at, self.model.pacing.flight_until):
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
         """Return why the stop ends without evidence; None if the car may still show it."""
+        if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
+            return None
+        facts = self._facts(running, now)
+        if not facts.frames_sent or not (facts.is_time_up or facts.reported):
+            return None
+        return running.case.ends(facts)
+
+    def _facts(self, running: StopInProgress, now: float) -> StopFacts:
         model = self.model
-        if running.at_rest or model.trust.state is CarTrust.UNHEARD:
-            return None
-        reported = running.report_at > running.last_at
-        is_time_up = now >= running.obeys_by
-        if not running.frames_sent or not (is_time_up or reported):
-            return None
-        match running.case:
-            case StopCase.SOFT | StopCase.NO_READINGS:
-                return running.case if is_time_up else None
-            case StopCase.RASPBERRY_PI | StopCase.UNKNOWN_PLATFORM:
-                has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
-                if is_time_up and has_report:
-                    return running.case
-            case StopCase.WRONG_PLATFORM if reported and running.probes >= DOUBTED_PROBES:
-                return StopCase.WRONG_PLATFORM
-            case _:
-                pass
-        if is_time_up and model.believed.fan_may_run and model.profile.fan_silences:
-            return StopCase.FAN
-        if running.case in (StopCase.RASPBERRY_PI, StopCase.UNKNOWN_PLATFORM):
-            return None
-        if running.no_echo_at > running.closed_at:
-            return StopCase.NO_ECHO if model.can_show else StopCase.NO_REACTION
-        if running.case is StopCase.MANUAL or running.case is StopCase.NO_REACTION:
-            return StopCase.NO_REACTION if not model.can_show and running.report_at > running.try_at else None
-        return None
+        return StopFacts(
+            frames_sent=running.frames_sent,
+            sent_all=running.sent_all,
+            is_time_up=now >= running.obeys_by,
+            reported=running.report_at > running.last_at,
+            reported_in_try=running.report_at > running.try_at,
+            without_echo=running.no_echo_at > running.closed_at,
+            is_soft=running.is_soft,
+            probes=running.probes,
+            fan_silences=model.believed.fan_may_run and model.profile.fan_silences,
+            can_show=model.can_show,
+        )
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:
         """Go on with full stops after a soft one: the car has not reacted to the last full stop."""
@@ -295,8 +272,7 @@ class StopExecutor:
 
     def _finish_unknown(self, running: StopInProgress, now: float) -> None:
         """End a stop of a car that reports in mode 0, and that was never seen to react to a frame: as sent."""
-        words = EVIDENCE[StopCase.NOT_KNOWN].words.format(car=self.model.name)
-        self._finish(running, Basis.SENT, words, now, StopCase.NOT_KNOWN)
+        self._finish(running, Basis.SENT, cases.NOT_KNOWN.why(self.model.name), now, cases.NOT_KNOWN)
 
     def end_doubt(self, now: float) -> None:
         """End the doubt of a person about a car that has shown its stops before: a person says that it is fine."""
@@ -344,7 +320,12 @@ class StopExecutor:
             self._await(running, now)
         # A probe counts only on a car that is awake, so directly after a report. If it must wait, let it wait for one.
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
-        if self.running is running and finding in _PROBED and is_ready and self._may_probe(running):
+        if (
+            self.running is running
+            and finding in _PROBED
+            and is_ready
+            and running.case.probes(self._facts(running, now))
+        ):
             running.probes += 1
             is_control = finding is Finding.CONTROL
             interval_s = self.model.evidence.interval_s
@@ -367,18 +348,14 @@ class StopExecutor:
         elif running is not None or not self.shutting_down:
             self.begin(self.full(now), FrameOrigin.STOP, now)
 
-    def _may_probe(self, running: StopInProgress) -> bool:
-        """Return True if the car could react to a `MODE00` now, and show it."""
-        if running.case is StopCase.WRONG_PLATFORM:
-            return running.frames_sent and running.probes < DOUBTED_PROBES
-        # The first frames of a stop always go out, unless the car is in mode 0 and reads.
-        return running.case is StopCase.MANUAL and self.model.can_show and running.sent_all
-
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""
         running.probes += 1
-        doubted = running.case is StopCase.WRONG_PLATFORM
-        if not doubted and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
+        if (
+            running.case.repeats_lost
+            and running.tries == 1
+            and (running.frames_sent or running.sequence is sequences.PROBE)
+        ):
             self._try_again(running, now)
             if running.sequence.is_recovery:
                 # The reports of a car that blocks may come by a timer. Then the block of the last frame may run still,
@@ -386,7 +363,7 @@ class StopExecutor:
                 running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(
-        self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL
+        self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = cases.MANUAL
     ) -> None:
         """End the stop: the car showed it, or cannot show it."""
         model, shown = self.model, basis is Basis.SHOWN
@@ -440,6 +417,6 @@ class StopExecutor:
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""
         running, ready_at = self.running, self.model.ready_at
-        if running is None or running.sequence.rank == sequences.SOFT.rank:
+        if running is None or running.is_soft:
             return ready_at
         return max(running.over_at(self.model.pacing, now), ready_at)

@@ -6,7 +6,6 @@ from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.pacing import Gate
 from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from gateway.drivers.yahboom.stops.evidence import StopCase
 from gateway.drivers.yahboom.stops.sequences import STOP_FRAME
 
 RENEWAL_INTERVALS_S: Final = (2.2, 4.0, 6.0)
@@ -57,7 +56,7 @@ class StopRenewal:
     @property
     def is_full_stop(self) -> bool:
         """Return True if the whole stop is sent again: the car may still be in the mode that it should leave."""
-        return not self._general_stop_follows and self._model.rest_case is StopCase.FAN and self.left_mode
+        return not self._general_stop_follows and self._model.rest_case.renews_whole and self.left_mode
 
     def next_frame(self, now: float) -> Frame:
         """Return the frame that is due, and schedule the next one."""
@@ -78,4 +77,4 @@ class StopRenewal:
         model = self._model
         if model.profile.refusal(ModeClose()) is not None:
             return False  # some programs end at a named frame
-        return model.rest_case in (StopCase.NO_ECHO, StopCase.WRONG_PLATFORM) and self._count <= CLEARING_RENEWALS
+        return model.rest_case.clears and self._count <= CLEARING_RENEWALS

@@ -28,7 +28,7 @@ from gateway.control.commands import (
 from gateway.control.safety import PersistedSafety
 from gateway.drivers.yahboom.protocol.frames import ModeOpen, parse_sent
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.stopping import RETRY_S
 from gateway.sim.model.traits import CarTraits
 from schemas.authority import Hold, Sender
@@ -297,7 +297,7 @@ def test_a_drive_released_by_hand(desk: Workbench) -> None:
     assert desk.end("it") == (SENT, None)
     assert desk.life("off") == [ASKED, QUEUED, SENT, SENT]
     last = desk.records[-1]
-    assert (last.basis, last.words) == (Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
+    assert (last.basis, last.words) == (Basis.SENT, cases.SOFT.why("red"))
     assert desk.control.safety.hold is None, "a release is no stop"
 
 
@@ -344,16 +344,16 @@ def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
 def test_a_stalled_loop_stops_the_car_first(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(2.0)
-    desk.control.on_stall(0.4, desk.now)
+    desk.control.driver.on_stall(0.4, desk.now)
     desk.pump()
     assert desk.frames == [RUN, RUN]
-    desk.control.on_stall(0.6, desk.now)
+    desk.control.driver.on_stall(0.6, desk.now)
     desk.pump()
     assert desk.frames == [RUN, RUN, STOP]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
     assert [entry.code for entry in desk.logs] == ["stalled"]
     desk.run(2.0)
-    desk.control.on_stall(9.0, desk.now)
+    desk.control.driver.on_stall(9.0, desk.now)
     assert len(desk.logs) == 1, "nothing is held now"
 
 
@@ -456,7 +456,7 @@ def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Workbench
 def test_a_refused_command_does_not_end_the_hold(desk: Workbench) -> None:
     desk.ask(Stop(), PERSON)
     assert desk.ask(FORWARD, age_s=9.0).reason is Reason.STALE
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     assert desk.ask(FORWARD).reason is Reason.LINK_DOWN
     assert desk.control.safety.hold is not None
     assert desk.ask(Resume()).status is SENT, "resume needs no car"
@@ -559,7 +559,7 @@ def test_a_refused_stream_is_recorded_once_per_cause(desk: Workbench) -> None:
 def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="held")
     desk.ask(WHISTLE, identity="act")
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     desk.take()
     for identity in ("held", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.LINK_DOWN), identity
@@ -582,9 +582,9 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
 def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it", pump=False)
     desk.ask(WHISTLE, identity="act", pump=False)
-    write = desk.control.poll(desk.now)
+    write = desk.control.driver.poll(desk.now)
     assert write is not None
-    desk.control.on_write_failed("a write failed: gone", desk.now)
+    desk.control.driver.link_down("a write failed: gone", desk.now, cause=Reason.WRITE_FAILED)
     desk.take()
     for identity in ("it", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.WRITE_FAILED)
@@ -596,7 +596,7 @@ def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> Non
 
 def test_a_stop_under_way_fails_with_its_link(desk: Workbench) -> None:
     desk.ask(Stop(), identity="it")
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     desk.take()
     assert desk.end("it") == (Phase.FAILED, Reason.LINK_DOWN)
 
@@ -669,7 +669,7 @@ def stopping(desk: Workbench) -> None:
 
 
 def recovering(desk: Workbench) -> None:
-    desk.control.link_down("gone", desk.now)
+    desk.control.driver.link_down("gone", desk.now)
     desk.control.link_up(desk.now)
     desk.run(1.0, reports=False)
 
@@ -683,8 +683,8 @@ def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Ca
     desk = Workbench(platform).ready()
     state(desk)
     began, sent = desk.now, len(desk.sent)
-    desk.control.shut_down(desk.now)
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     while not desk.control.driver.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01)
@@ -711,7 +711,7 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
         desk.ask(Drive(Motion.FORWARD, 0.2))
         desk.run(0.1)
     began = desk.now
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     while not desk.control.driver.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01, reports=False)
@@ -724,8 +724,8 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
 
 
 def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Workbench) -> None:
-    desk.control.link_down("unplugged", desk.now)
-    desk.control.shut_down(desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
+    desk.control.driver.shut_down(desk.now)
     assert desk.control.driver.stops.finished
     desk.take()
     assert [(entry.code, entry.words) for entry in desk.logs] == [
@@ -736,11 +736,11 @@ def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_sto
 def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0))
     desk.run(0.5)
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     assert desk.ask(Stop()).words == (
         "NOT CONFIRMED: the gateway of red is shutting down and stops red itself. Look at the car."
     )
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     assert desk.ask(Stop()).words == (
         "NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car. "
         "It is stopped by its next gateway."
@@ -750,7 +750,7 @@ def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> N
 def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:
     """The previous gateway may have left the car driving."""
     desk = Workbench()
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     assert desk.control.driver.stops.finished
     desk.take()
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
@@ -764,7 +764,7 @@ def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
     pair.run(8.0)
     pair.lose_frames()
     began = pair.now
-    pair.control.shut_down(began)
+    pair.control.driver.shut_down(began)
     pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S + 0.1)
     assert pair.car.truth.mode is Mode.TRACKING
     assert pair.control.driver.stops.not_stopped
@@ -775,7 +775,7 @@ def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_
     pair = Pair(start_s=2.0).ready()
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
-    pair.control.shut_down(pair.now)
+    pair.control.driver.shut_down(pair.now)
     assert pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S) <= 1.1 + 4.5
     assert pair.control.driver.model.mode.verdict is Verdict.CONFIRMED
     assert pair.control.driver.model.basis == Basis.SHOWN
@@ -784,10 +784,10 @@ def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_
 
 def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
     desk.ask(FORWARD)
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     desk.run(0.5)
     assert desk.frames == [RUN, MODE00]
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     desk.take()
     assert desk.control.driver.stops.finished
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
@@ -817,7 +817,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         for _ in range(moments.randrange(5, 40)):
             desk.ask(anything(moments), moments.choice([PERSON, SCRIPT, COORDINATOR]), streamed=False)
             if moments.random() < 0.02:
-                desk.control.link_down("unplugged", desk.now)
+                desk.control.driver.link_down("unplugged", desk.now)
                 desk.control.link_up(desk.now)
                 links.add(len(desk.sent))
             desk.run(moments.choice([0.0, 0.01, 0.05, 0.3, 1.5]), reports=moments.random() < 0.8)

@@ -288,7 +288,7 @@ def test_without_leads_each_person_may_pause_and_then_nobody_moves() -> None:
 
 
 def test_a_pause_of_a_car_out_of_reach_is_in_force_all_the_same(desk: Workbench) -> None:
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     answer = desk.ask(Pause(), TEACHER)
     assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
     assert answer.words.startswith("NOT STOPPED: red is unreachable.")

@@ -142,7 +142,7 @@ def test_a_loan_counts_the_sleep(desk: Workbench, slept_s: float, *, left: bool,
 
 
 def test_a_sleep_while_the_link_is_down_sends_nothing_and_is_said(desk: Workbench) -> None:
-    desk.control.link_down("gone", desk.now)
+    desk.control.driver.link_down("gone", desk.now)
     desk.logs.clear()
     sleep(desk)
     assert desk.frames == []
@@ -163,7 +163,7 @@ def test_a_sleep_at_the_end_of_the_gateway_begins_no_stop_after_it() -> None:
     desk = Workbench("raspberry_pi").ready()
     desk.ask(FORWARD)
     desk.run(1.0)
-    desk.control.shut_down(desk.now)
+    desk.control.driver.shut_down(desk.now)
     sleep(desk)
     desk.run(10.0)
     assert desk.control.driver.stops.finished

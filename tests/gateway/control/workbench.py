@@ -118,7 +118,7 @@ class Workbench:
 
     def _hear(self, frame: bytes) -> None:
         for event in Decoder().feed(frame, self.now):
-            self.control.on_event(event, self.now)
+            self.control.driver.on_event(event, self.now)
         self.pump()
 
     def ask(
@@ -153,7 +153,7 @@ class Workbench:
         """Let time pass. Without `reports`, all readings of the car are lost."""
         end = self.now + seconds
         while self.now < end - 1e-9:
-            wake = min(self.car.report_at, self._next_tick, self.control.next_at(self.now))
+            wake = min(self.car.report_at, self._next_tick, self.control.driver.next_at(self.now))
             self._awake = self._awake + 1 if wake < self.now + SHORTEST_S else 0
             assert self._awake < 100, "a loop that never sleeps"
             self.now = min(end, max(self.now + 1e-9, wake))
@@ -175,9 +175,9 @@ class Workbench:
 
     def pump(self) -> None:
         """Write all frames that are due."""
-        while (write := self.control.poll(self.now)) is not None:
+        while (write := self.control.driver.poll(self.now)) is not None:
             self.sent.append((self.now, write.data, write.why))
-            self.control.on_written(write, self.now)
+            self.control.driver.on_written(write, self.now)
             self.car.wrote(write.frame, self.now)
         self.take()
 

@@ -26,7 +26,7 @@ class TankBench(Bench):
         """Let time pass, with a report each 0.2 s."""
         for _ in range(round(seconds / 0.2)):
             for event in self.control.driver.feed(REPORT if self.reports else b"", self.now):
-                self.control.on_event(event, self.now)
+                self.control.driver.on_event(event, self.now)
             super().run(0.2)
 
     def moves(self, since: float = 0.0) -> list[list[float]]:

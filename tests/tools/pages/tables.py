@@ -16,7 +16,7 @@ from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE
+from gateway.drivers.yahboom.stops.cases import CASES
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_PAUSE_S
@@ -124,7 +124,7 @@ def stop_table() -> str:
 def evidence_table() -> str:
     """Return the table of evidence for a stop, from the gateway's own table."""
     rows = ["| stop | shown by | otherwise |", "|---|---|---|"]
-    rows += [f"| {row.stop} | {row.shown_by or 'nothing'} | {row.otherwise} |" for row in EVIDENCE.values()]
+    rows += [f"| {row.stop} | {row.shown_by or 'nothing'} | {row.otherwise} |" for row in CASES]
     return "\n".join(rows)
 
 

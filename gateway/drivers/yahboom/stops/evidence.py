@@ -1,4 +1,4 @@
-"""Detects from the car's readings whether a stop arrived; a table lists the cases. Pure.
+"""Detects from the car's readings whether a stop arrived. `cases` lists what a stop can rest on. Pure.
 
 The car acknowledges nothing. All that a gateway has is the frames that it wrote, and the moments at which readings
 arrived. This essay is about what those moments can prove, what they cannot, and what is still doubtful.
@@ -45,8 +45,6 @@ ends a frame at a silence, and damage of any kind ends the comparison of interva
 *What is still doubtful.* A link that flips bits can turn the judged `MODE00` into another frame that blocks as long; no
 such frame is known. A car that pauses by itself just when it should, twice, would be believed. And a half-duplex link
 whose mute time changes from write to write can pass the control by chance.
-
-The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
 """
 
 from dataclasses import dataclass, field
@@ -95,118 +93,6 @@ READ_LATE_S: Final = 0.3
 """Maximum time from a frame to a report that was under way before the car read the frame."""
 IN_FLIGHT_S: Final = 0.1
 """Minimum time from a frame to a report that the car sent after it could have read the frame."""
-
-
-class StopCase(StrEnum):
-    """The basis of a stop, by what was stopped and what the car can report."""
-
-    LEFT_SHAPE = "left_shape"
-    LEFT_SILENT = "left_silent"
-    MANUAL = "manual"
-    NO_REACTION = "no_reaction"
-    NO_READINGS = "no_readings"
-    NO_ECHO = "no_echo"
-    FAN = "fan"
-    SOFT = "soft"
-    ACTED = "acted"
-    RASPBERRY_PI = "raspberry_pi"
-    UNKNOWN_PLATFORM = "unknown_platform"
-    WRONG_PLATFORM = "wrong_platform"
-    NOT_KNOWN = "not_known"
-
-
-@dataclass(frozen=True, slots=True)
-class EvidenceRow:
-    """One row of the table. `shown_by` is empty if the car cannot show the stop."""
-
-    stop: str
-    shown_by: str
-    otherwise: str
-    words: str = ""
-    """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
-
-
-EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
-    StopCase.LEFT_SHAPE: EvidenceRow(
-        "full, out of a mode in which the car reported",
-        "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
-        "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in "
-        "mode 0",
-        "the stop goes on",
-    ),
-    StopCase.LEFT_SILENT: EvidenceRow(
-        "full, out of a silent mode",
-        "the same, after the silence of the opening, when the mode was opened from a rest that was shown; else as in "
-        "mode 0",
-        "the stop goes on",
-    ),
-    StopCase.MANUAL: EvidenceRow(
-        "full or recovery, in mode 0 with a sonar echo",
-        "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
-        "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
-        "the stop goes on, and a command may take its place",
-    ),
-    StopCase.NO_REACTION: EvidenceRow(
-        "full or recovery, the reports of this car do not react to frames",
-        "",
-        "`sent` after a report; a general stop every 6 s",
-        "{car}'s reports do not react to frames: nothing shows that a stop arrived",
-    ),
-    StopCase.NO_READINGS: EvidenceRow(
-        "any, a car that sends no readings",
-        "",
-        "`sent`; a general stop every 6 s",
-        "{car} sends no readings: nothing shows that a stop arrived",
-    ),
-    StopCase.NO_ECHO: EvidenceRow(
-        "full or recovery, in mode 0 without an echo",
-        "",
-        "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
-        "{car} has no sonar echo, so its readings cannot show a stop now",
-    ),
-    StopCase.FAN: EvidenceRow(
-        "full or recovery, the fan runs (not Raspberry Pi)",
-        "",
-        "`sent`; the stop again every 6 s",
-        "{car} sends nothing while its fan runs",
-    ),
-    StopCase.SOFT: EvidenceRow(
-        "soft (a drive's end, or its sender lost)",
-        "",
-        "`sent`; a general stop every 6 s",
-        "readings do not show the end of a drive; `fleet stop {car}` checks it",
-    ),
-    StopCase.ACTED: EvidenceRow(
-        "none: a light, servo, whistle or LED frame at a rest that was shown",
-        "",
-        "`sent`; a general stop every 6 s",
-        "{car} got another frame after its confirmed stop; a link that loses bytes can turn it into a motion",
-    ),
-    StopCase.RASPBERRY_PI: EvidenceRow(
-        "any, Raspberry Pi",
-        "",
-        "`sent` after a report; a general stop every 6 s",
-        "a Raspberry Pi car never confirms a stop",
-    ),
-    StopCase.UNKNOWN_PLATFORM: EvidenceRow(
-        "any, platform unknown",
-        "",
-        "`sent` after a report; a general stop every 6 s",
-        "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
-    ),
-    StopCase.WRONG_PLATFORM: EvidenceRow(
-        "full or recovery, readings contradict the platform",
-        "as in mode 0",
-        "`sent` if it reports on in mode 0; then as without an echo",
-        "the readings of {car} contradict its platform, and nothing in them shows the stop",
-    ),
-    StopCase.NOT_KNOWN: EvidenceRow(
-        "full or recovery, it is not known yet whether the reports of this car react to frames",
-        "as in mode 0",
-        "the stop goes on until it has taken too long; then `sent`, and a general stop every 6 s",
-        "it is not known yet whether {car}'s reports show that a stop arrived",
-    ),
-}
 
 
 class Finding(StrEnum):

@@ -10,8 +10,8 @@ from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, ModeClose
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import FRAME_S, RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
-from gateway.drivers.yahboom.stops import sequences
-from gateway.drivers.yahboom.stops.evidence import StopCase
+from gateway.drivers.yahboom.stops import cases, sequences
+from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.sequences import StopSequence
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import FrameOrigin, Mode, Platform
@@ -152,13 +152,18 @@ class StopInProgress:
     at_rest: bool = False
     """True if the car had shown that it stands before it fell silent. Send it general stops only: unlike a named frame,
     a general stop that loses bytes cannot start the motors."""
-    case: StopCase = StopCase.MANUAL
+    case: StopCase = cases.MANUAL
     """The case of the stop, if the car does not show it."""
 
     @property
     def frames_sent(self) -> bool:
         """Return True if the last frame of this try is written."""
         return self.index >= len(self.sequence.steps)
+
+    @property
+    def is_soft(self) -> bool:
+        """Return True if it is the end of a drive."""
+        return self.sequence.rank == sequences.SOFT.rank
 
     @property
     def frame(self) -> Frame:

@@ -154,7 +154,7 @@ def test_a_raspberry_pi_car_that_never_sends_a_reading_is_taken_as_such_until_on
     assert [(end.phase, end.basis) for end in ends if end is not None] == [("sent", "sent")] * 2
     assert "platform_contradicted" in {record.code for record in pair.logs}
     assert not any(b"MODE" in data for _, data in pair.sent)
-    control.shut_down(pair.now)
+    control.driver.shut_down(pair.now)
     pair.until(lambda: control.driver.stops.finished, 2.0)
     assert not control.driver.stops.not_stopped
 

@@ -76,7 +76,7 @@ def test_several_e_stops_in_force_are_named_by_their_ids(desk: Workbench) -> Non
 
 
 def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench) -> None:
-    desk.control.link_down("unplugged", desk.now)
+    desk.control.driver.link_down("unplugged", desk.now)
     answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
     assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
     assert answer.words == (

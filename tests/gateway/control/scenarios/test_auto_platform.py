@@ -59,7 +59,7 @@ def test_before_it_is_settled_only_what_every_car_knows_is_sent() -> None:
 def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
     pair = paired("arduino")
     pair.until(lambda: pair.control.driver.model.profile.name == "arduino", 20.0)
-    pair.control.link_down("unplugged", pair.now)
+    pair.control.driver.link_down("unplugged", pair.now)
     other = Pair("raspberry_pi", transport=Transport.TCP)
     other.control = pair.control
     other.run(pair.now, linked=False)
@@ -86,7 +86,7 @@ def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
 ) -> None:
     pair = in_a_silent_mode(platform, mode)
     if gateway == "the same":
-        pair.control.link_down("unplugged", pair.now)
+        pair.control.driver.link_down("unplugged", pair.now)
     else:
         kept = json.loads(json.dumps(pair.control.driver.model.learned.kept()))
         pair.control = control(parse_platform("unknown"), auto=True, learned=Learned.restore(kept))
@@ -101,14 +101,14 @@ def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
 def test_what_a_car_was_is_forgotten_if_its_link_ends_without_a_word_after_a_mode_frame() -> None:
     """Behind the same address there may be a program that ends at a mode frame now. It must not end again and again."""
     pair = in_a_silent_mode("arduino", Mode.OBSTACLE_AVOIDANCE)
-    pair.control.link_down("unplugged", pair.now)
+    pair.control.driver.link_down("unplugged", pair.now)
     pair.car.feed = lambda *_: None  # type: ignore[method-assign]
     for counted in (1, 0, 0):
         pair.sent.clear()
         pair.connect()
         pair.run(6.0)
         assert min(1, sum(b"MODE00" in data for _, data in pair.sent)) == counted
-        pair.control.link_down("closed", pair.now)
+        pair.control.driver.link_down("closed", pair.now)
 
 
 def test_a_contradicted_profile_is_told_of_once() -> None:

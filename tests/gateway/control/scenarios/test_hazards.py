@@ -12,7 +12,8 @@ import pytest
 
 from gateway.control.commands import AimServo, Answer, Drive, Fan, Led, MoveArm, PartAction, SetLight, SetMode, Stop
 from gateway.drivers.yahboom.protocol.frames import General, parse_sent
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops import cases
+from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from schemas.words import Basis, Light, Mode, Motion, Phase, Reason
 from tests.gateway.sim.hazards import HAZARDS, Hazard
@@ -82,13 +83,13 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
     pair.run(SETTLED_S)
     assert pair.off_for_good_at() - asked_at <= answer.worst_case_s
     pi = isinstance(pair.car, RaspberryPiCar)
-    case = StopCase.RASPBERRY_PI if pi else sent
+    case = cases.RASPBERRY_PI if pi else sent
     last = pair.last_of("the-stop")
     assert last is not None
     if case is None:
         assert (last.phase, last.basis) == (Phase.COMPLETE, Basis.SHOWN)
     else:
-        words = EVIDENCE[case].words.format(car="red")
+        words = case.why("red")
         assert (last.phase, last.basis, last.words) == (Phase.SENT, Basis.SENT, words)
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", last.basis)
     pair.records.clear()
@@ -144,7 +145,7 @@ def no_echo(pair: Pair) -> None:
     pair.until(lambda: pair.car.truth.blocked, 3.0)
     pair.ask(Drive(Motion.FORWARD, 5.0))
     pair.run(0.06)
-    stops(pair, sent=StopCase.NO_ECHO)
+    stops(pair, sent=cases.NO_ECHO)
 
 
 @ours("stop, then MODE00, both while blocked")
@@ -263,7 +264,7 @@ def fan(pair: Pair) -> None:
     pair.ask(Fan())
     pair.until(lambda: pair.car.truth.fan, 3.0)
     driving(pair)
-    stops(pair, sent=StopCase.FAN)
+    stops(pair, sent=cases.FAN)
     assert pair.car.truth.fan
     assert sum(frame.fan for frame in general(pair)) == 1
 
@@ -340,7 +341,7 @@ def pi_lone_hash(pair: Pair) -> None:
 def pi_hang_up(pair: Pair) -> None:
     """Require that the gateway closes only after a stop. It cannot prevent a lost link, so it reports the danger."""
     driving(pair)
-    pair.control.shut_down(pair.now)
+    pair.control.driver.shut_down(pair.now)
     pair.until(lambda: pair.control.driver.stops.finished, 3.0)
     pair.lose("closed")
     pair.run(SETTLED_S, linked=False)

@@ -43,7 +43,7 @@ class Source:
         self.pair = pair
         self.sent: deque[Sent] = deque(maxlen=400)
         self.published: list[tuple[Sensors, frozenset[str], tuple[bool, bool] | None]] = []
-        send, heard = pair.car._send, pair.control.on_event
+        send, heard = pair.car._send, pair.control.driver.on_event
         seen: dict[str, Any] = {name: self._noted(name) for name in ("obstacle", "line", "light")}
 
         def noting(data: bytes) -> None:
@@ -59,7 +59,7 @@ class Source:
             heard(event, now)
 
         pair.car._send = noting  # type: ignore[method-assign]  # where a frame leaves the program
-        pair.control.on_event = publishing  # type: ignore[method-assign]  # where car.py publishes it
+        pair.control.driver.on_event = publishing  # type: ignore[method-assign]  # where car.py publishes it
 
     def _noted(self, name: str) -> deque[Any]:
         """Record the reads of one sensor. Return a queue with the last value."""

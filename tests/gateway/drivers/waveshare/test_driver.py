@@ -209,7 +209,7 @@ def test_a_firmware_that_changes_ends_the_drive() -> None:
     episode.run(1.0)
     line = b'{"T":1001,"L":0,"R":0,"r":0,"p":0,"y":0,"temp":40,"v":11.5}\r\n'
     for event in episode.control.driver.feed(line, episode.now):
-        episode.control.on_event(event, episode.now)
+        episode.control.driver.on_event(event, episode.now)
     episode.run(0.6)
     assert not episode.car.truth.driving
 

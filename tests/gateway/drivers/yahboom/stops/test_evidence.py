@@ -1,4 +1,4 @@
-"""Tests which readings show a stop, as tables, and which never do, as properties. Each row of EVIDENCE has a test.
+"""Tests which readings show a stop, as tables, and which never do, as properties. Each case has a test.
 
 The cars of the tables report every `INTERVAL_S`, and `MODE00` blocks them for `BLOCK_S`. Both were learned.
 """
@@ -15,16 +15,16 @@ from gateway.drivers.yahboom.estimate.learned import AGREEING_DELAYS, UNREACTED,
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.stops import cases
+from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.evidence import (
     EARLY_S,
-    EVIDENCE,
     LATE_S,
     LONGER_S,
     PAUSES,
     ROUND_TRIP_S,
     WIRE_S,
     Finding,
-    StopCase,
     StopEvidence,
 )
 from gateway.sim.model.traits import CarTraits
@@ -562,27 +562,27 @@ def fan() -> Pair:
 
 
 ROWS = [
-    (StopCase.LEFT_SHAPE, lambda: in_mode(Mode.TRACKING), "out of the mode that it reported"),
-    (StopCase.LEFT_SILENT, lambda: in_mode(Mode.REMOTE_CONTROL), "out of remote_control"),
-    (StopCase.MANUAL, driven, "2 pauses in its reports"),
-    (StopCase.NO_ECHO, lambda: driven(world=World.open_field()), "no sonar echo"),
-    (StopCase.FAN, fan, "while its fan runs"),
-    (StopCase.RASPBERRY_PI, lambda: driven("raspberry_pi"), "a Raspberry Pi car never confirms a stop"),
-    (StopCase.UNKNOWN_PLATFORM, lambda: driven("raspberry_pi", told="unknown"), "is not known"),
-    (StopCase.NO_REACTION, lambda: driven("stm32"), "do not react to frames"),
-    (StopCase.NO_READINGS, lambda: driven(told="arduino+no_readings", traits=CarTraits(readings=False)), "no readings"),
+    (cases.LEFT_SHAPE, lambda: in_mode(Mode.TRACKING), "out of the mode that it reported"),
+    (cases.LEFT_SILENT, lambda: in_mode(Mode.REMOTE_CONTROL), "out of remote_control"),
+    (cases.MANUAL, driven, "2 pauses in its reports"),
+    (cases.NO_ECHO, lambda: driven(world=World.open_field()), "no sonar echo"),
+    (cases.FAN, fan, "while its fan runs"),
+    (cases.RASPBERRY_PI, lambda: driven("raspberry_pi"), "a Raspberry Pi car never confirms a stop"),
+    (cases.UNKNOWN_PLATFORM, lambda: driven("raspberry_pi", told="unknown"), "is not known"),
+    (cases.NO_REACTION, lambda: driven("stm32"), "do not react to frames"),
+    (cases.NO_READINGS, lambda: driven(told="arduino+no_readings", traits=CarTraits(readings=False)), "no readings"),
 ]
 
 
-@pytest.mark.parametrize(("case", "situation", "words"), ROWS, ids=[row[0] for row in ROWS])
+@pytest.mark.parametrize(("case", "situation", "words"), ROWS, ids=[row[0].name for row in ROWS])
 def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words: str) -> None:
     pair = situation()
     phase, basis, said = ended(pair)
-    shown = case in (StopCase.LEFT_SHAPE, StopCase.LEFT_SILENT, StopCase.MANUAL)
+    shown = case in (cases.LEFT_SHAPE, cases.LEFT_SILENT, cases.MANUAL)
     assert (phase, basis) == ((Phase.COMPLETE, Basis.SHOWN) if shown else (Phase.SENT, Basis.SENT))
     assert words in said
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", basis)
-    assert bool(EVIDENCE[case].shown_by) == shown
+    assert bool(case.shown_by) == shown
     assert not pair.car.truth.driving
     assert shown or pair.control.driver.model.rest_case is case
 
@@ -590,9 +590,9 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
 def test_a_soft_stop_shows_nothing() -> None:
     """The row `soft`: the release of a drive, and the rest after it, are only sent."""
     pair = driven()
-    assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
+    assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, cases.SOFT.why("red"))
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
-    assert pair.control.driver.model.rest_case is StopCase.SOFT
+    assert pair.control.driver.model.rest_case is cases.SOFT
 
 
 def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
@@ -601,12 +601,12 @@ def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
     pair.until(lambda: pair.control.driver.model.basis == Basis.SHOWN, 9.0)
     pair.ask(Fan())
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
-    assert pair.control.driver.model.rest_case is StopCase.ACTED
+    assert pair.control.driver.model.rest_case is cases.ACTED
 
 
 def test_every_row_is_played() -> None:
-    elsewhere = {StopCase.SOFT, StopCase.ACTED, StopCase.WRONG_PLATFORM, StopCase.NOT_KNOWN}  # test_wrong_platform.py
-    assert {row[0] for row in ROWS} | elsewhere == set(EVIDENCE) == set(StopCase)
+    elsewhere = {cases.SOFT, cases.ACTED, cases.WRONG_PLATFORM, cases.NOT_KNOWN}  # test_wrong_platform.py
+    assert {row[0] for row in ROWS} | elsewhere == set(cases.CASES)
 
 
 def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -616,7 +616,7 @@ def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch
 
     def hear_a_line(frame: bytes = b"") -> None:
         hear(frame)
-        desk.control.on_event(Rejected(b"\r\n", desk.now, Cause.NO_START), desk.now)
+        desk.control.driver.on_event(Rejected(b"\r\n", desk.now, Cause.NO_START), desk.now)
 
     monkeypatch.setattr(desk, "hear", hear_a_line)
     desk.ask(Drive(Motion.FORWARD, 5.0))

@@ -15,8 +15,7 @@ from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from gateway.drivers.yahboom.stops import sequences, stopping
-from gateway.drivers.yahboom.stops.evidence import EVIDENCE, StopCase
+from gateway.drivers.yahboom.stops import cases, sequences, stopping
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
 from schemas.words import Basis, Mode, Motion, Phase, Platform
@@ -46,8 +45,8 @@ def judge(seen: Seen) -> None:
 
 
 ENDINGS = ((Phase.COMPLETE, Basis.SHOWN), (Phase.SENT, Basis.SENT))
-WHY_SENT = [EVIDENCE[case].words.format(car="red") for case in StopCase if not EVIDENCE[case].shown_by]
-WHY_SENT += [EVIDENCE[case].words.format(car="red") for case in (StopCase.WRONG_PLATFORM, StopCase.NOT_KNOWN)]
+WHY_SENT = [case.why("red") for case in cases.CASES if not case.shown_by]
+WHY_SENT += [case.why("red") for case in (cases.WRONG_PLATFORM, cases.NOT_KNOWN)]
 FOUND_S = 7.0
 """Maximum time until a car of an unknown platform is in mode 0 that was found in a mode that it reports."""
 

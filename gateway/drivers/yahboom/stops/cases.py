@@ -1,0 +1,270 @@
+"""The cases of a stop: what shows it, when it ends without being shown, and what is sent after it. Pure.
+
+A stop has a case from its beginning: what it rests on if the car does not show it. The case decides whether the stop
+may end as `sent`, and as which case it ends then. That one decides how the stop is repeated. A new case is a row here.
+
+The docs print `CASES` (docs/reference/stop-evidence.md).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.drivers.yahboom.protocol.platforms import StopStyle
+from schemas.words import Platform
+
+DOUBTED_PROBES: Final = 2
+"""Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopFacts:
+    """What a case may ask about the stop in progress."""
+
+    frames_sent: bool
+    """All frames of this try are written."""
+    sent_all: bool
+    """All frames of the first try are written, or a report came after its `MODE00`."""
+    is_time_up: bool
+    """The car has obeyed by now, if the frames arrived."""
+    reported: bool
+    """A report of mode 0 came after the last frame."""
+    reported_in_try: bool
+    """One came since this try began."""
+    without_echo: bool
+    """The reports after the newest `MODE00` have no echo."""
+    is_soft: bool
+    probes: int
+    fan_silences: bool
+    """The fan may run, and the car sends nothing while it does."""
+    can_show: bool
+    """The car shows a stop, or may."""
+
+
+def _never(facts: StopFacts) -> "StopCase | None":  # noqa: ARG001 - the default of `StopCase.ends`
+    return None
+
+
+def _no(facts: StopFacts) -> bool:  # noqa: ARG001 - the default of `StopCase.probes`
+    return False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StopCase:
+    """What a stop rests on, by what was stopped and what the car can report."""
+
+    name: str
+    stop: str
+    """Which stop it is, for the docs."""
+    shown_by: str
+    """What shows it; empty if the car cannot show it."""
+    otherwise: str
+    """What happens if it is not shown."""
+    words: str = ""
+    """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
+    ends: Callable[[StopFacts], "StopCase | None"] = _never
+    """Returns as which case a stop that began as this one ends without evidence; None if it goes on."""
+    probes: Callable[[StopFacts], bool] = _no
+    """Returns True if the car could react to a `MODE00` now, and show it."""
+    repeats_lost: bool = True
+    """True if the stop is sent again at once when the reports go on as before."""
+    is_sure: bool = True
+    """True if a car that ended a stop this way counts as standing."""
+    renews_whole: bool = False
+    """True if the whole stop is repeated: the car may still be in the mode that it should leave."""
+    clears: bool = False
+    """True if the first renewals are `MODE00`, which clears half a named frame."""
+
+    def why(self, car: str) -> str:
+        """Return why the stop of this car ends as `sent`."""
+        return self.words.format(car=car)
+
+
+def _ends_soft(facts: StopFacts) -> StopCase | None:
+    return SOFT if facts.is_time_up else None
+
+
+def _ends_without_readings(facts: StopFacts) -> StopCase | None:
+    return NO_READINGS if facts.is_time_up else None
+
+
+def _ends_on_raspberry_pi(facts: StopFacts) -> StopCase | None:
+    return RASPBERRY_PI if _had_report(facts) else _by_fan(facts)
+
+
+def _ends_on_unknown(facts: StopFacts) -> StopCase | None:
+    return UNKNOWN_PLATFORM if _had_report(facts) else _by_fan(facts)
+
+
+def _ends_on_wrong(facts: StopFacts) -> StopCase | None:
+    if facts.reported and facts.probes >= DOUBTED_PROBES:
+        return WRONG_PLATFORM
+    return _by_fan(facts) or _by_echo(facts)
+
+
+def _ends_in_mode_0(facts: StopFacts) -> StopCase | None:
+    mute = NO_REACTION if facts.reported_in_try and not facts.can_show else None
+    return _by_fan(facts) or _by_echo(facts) or mute
+
+
+def _had_report(facts: StopFacts) -> bool:
+    return facts.is_time_up and (facts.reported_in_try or facts.is_soft)
+
+
+def _by_fan(facts: StopFacts) -> StopCase | None:
+    return FAN if facts.is_time_up and facts.fan_silences else None
+
+
+def _by_echo(facts: StopFacts) -> StopCase | None:
+    if not facts.without_echo:
+        return None
+    return NO_ECHO if facts.can_show else NO_REACTION
+
+
+def _probes_wrong(facts: StopFacts) -> bool:
+    return facts.frames_sent and facts.probes < DOUBTED_PROBES
+
+
+def _probes_in_mode_0(facts: StopFacts) -> bool:
+    # The first frames of a stop always go out, unless the car is in mode 0 and reads.
+    return facts.can_show and facts.sent_all
+
+
+LEFT_SHAPE: Final = StopCase(
+    "left_shape",
+    "full, out of a mode in which the car reported",
+    "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
+    "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in "
+    "mode 0",
+    "the stop goes on",
+)
+LEFT_SILENT: Final = StopCase(
+    "left_silent",
+    "full, out of a silent mode",
+    "the same, after the silence of the opening, when the mode was opened from a rest that was shown; else as in "
+    "mode 0",
+    "the stop goes on",
+)
+MANUAL: Final = StopCase(
+    "manual",
+    "full or recovery, in mode 0 with a sonar echo",
+    "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
+    "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
+    "the stop goes on, and a command may take its place",
+    ends=_ends_in_mode_0,
+    probes=_probes_in_mode_0,
+)
+NO_REACTION: Final = StopCase(
+    "no_reaction",
+    "full or recovery, the reports of this car do not react to frames",
+    "",
+    "`sent` after a report; a general stop every 6 s",
+    "{car}'s reports do not react to frames: nothing shows that a stop arrived",
+    ends=_ends_in_mode_0,
+)
+NO_READINGS: Final = StopCase(
+    "no_readings",
+    "any, a car that sends no readings",
+    "",
+    "`sent`; a general stop every 6 s",
+    "{car} sends no readings: nothing shows that a stop arrived",
+    ends=_ends_without_readings,
+)
+NO_ECHO: Final = StopCase(
+    "no_echo",
+    "full or recovery, in mode 0 without an echo",
+    "",
+    "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
+    "{car} has no sonar echo, so its readings cannot show a stop now",
+    clears=True,
+)
+FAN: Final = StopCase(
+    "fan",
+    "full or recovery, the fan runs (not Raspberry Pi)",
+    "",
+    "`sent`; the stop again every 6 s",
+    "{car} sends nothing while its fan runs",
+    renews_whole=True,
+)
+SOFT: Final = StopCase(
+    "soft",
+    "soft (a drive's end, or its sender lost)",
+    "",
+    "`sent`; a general stop every 6 s",
+    "readings do not show the end of a drive; `fleet stop {car}` checks it",
+    ends=_ends_soft,
+    is_sure=False,
+)
+ACTED: Final = StopCase(
+    "acted",
+    "none: a light, servo, whistle or LED frame at a rest that was shown",
+    "",
+    "`sent`; a general stop every 6 s",
+    "{car} got another frame after its confirmed stop; a link that loses bytes can turn it into a motion",
+)
+RASPBERRY_PI: Final = StopCase(
+    "raspberry_pi",
+    "any, Raspberry Pi",
+    "",
+    "`sent` after a report; a general stop every 6 s",
+    "a Raspberry Pi car never confirms a stop",
+    ends=_ends_on_raspberry_pi,
+)
+UNKNOWN_PLATFORM: Final = StopCase(
+    "unknown_platform",
+    "any, platform unknown",
+    "",
+    "`sent` after a report; a general stop every 6 s",
+    "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
+    ends=_ends_on_unknown,
+)
+WRONG_PLATFORM: Final = StopCase(
+    "wrong_platform",
+    "full or recovery, readings contradict the platform",
+    "as in mode 0",
+    "`sent` if it reports on in mode 0; then as without an echo",
+    "the readings of {car} contradict its platform, and nothing in them shows the stop",
+    ends=_ends_on_wrong,
+    probes=_probes_wrong,
+    repeats_lost=False,
+    clears=True,
+)
+NOT_KNOWN: Final = StopCase(
+    "not_known",
+    "full or recovery, it is not known yet whether the reports of this car react to frames",
+    "as in mode 0",
+    "the stop goes on until it has taken too long; then `sent`, and a general stop every 6 s",
+    "it is not known yet whether {car}'s reports show that a stop arrived",
+)
+
+CASES: Final = (
+    LEFT_SHAPE,
+    LEFT_SILENT,
+    MANUAL,
+    NO_REACTION,
+    NO_READINGS,
+    NO_ECHO,
+    FAN,
+    SOFT,
+    ACTED,
+    RASPBERRY_PI,
+    UNKNOWN_PLATFORM,
+    WRONG_PLATFORM,
+    NOT_KNOWN,
+)
+"""All of them, in the order of the docs."""
+
+
+def case_of(style: StopStyle, platform: Platform, *, has_readings: bool, is_soft: bool, can_show: bool) -> StopCase:
+    """Return what a stop rests on if the car does not show it."""
+    if not has_readings:
+        return NO_READINGS
+    match style:
+        case StopStyle.GENERAL:
+            return RASPBERRY_PI if platform is Platform.RASPBERRY_PI else UNKNOWN_PLATFORM
+        case _ if is_soft:
+            return SOFT
+        case StopStyle.BOTH:
+            return WRONG_PLATFORM
+        case StopStyle.MODE_FRAME | StopStyle.TIMER:
+            return MANUAL if can_show else NO_REACTION

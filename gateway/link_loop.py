@@ -1,0 +1,199 @@
+"""Keeps the link of one car open, and reads from it: the decoder makes events of the bytes.
+
+Each event is published first, then control updates its state with it. A lost link is opened again, for ever.
+"""
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from typing import Final
+
+from gateway.bus.command_handler import CommandHandler
+from gateway.bus.publisher import RAW_PER_S, CarPublisher, shown_state
+from gateway.control.backoff import Attempts
+from gateway.control.controller import Controller
+from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
+from gateway.control.link_health import LinkHealth
+from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.wake import Wake
+from schemas.links import BAUD, SerialUrl, UsbUrl
+from schemas.words import FrameVerdict, Level, LinkState, Motors
+
+SLICE_BYTES: Final = 1024
+"""Maximum bytes that are decoded before other tasks run, a stop above all. A car sends 960 a second."""
+MAX_BYTES_AGE_S: Final = 0.25
+"""Discard bytes older than this; newer data matters more."""
+MIN_DAMAGED: Final = 3
+LOOK_INTERVAL_S: Final = 10.0
+"""Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
+FLOOD_LOG_PAUSE_S: Final = 10.0
+"""Minimum pause after a flood before the next one is logged."""
+BITS_PER_BYTE: Final = 10
+"""Bits of a byte on a UART: 8N1."""
+
+
+class LinkLoop:
+    """The link of one car. `keep_open` runs until it is cancelled."""
+
+    def __init__(
+        self,
+        url: LinkUrl,
+        control: Controller[Driver],
+        publisher: CarPublisher,
+        commands: CommandHandler,
+        wake: Wake,
+        *,
+        on_gap: Callable[[float], None],
+        on_open: Callable[[], None],
+    ) -> None:
+        """`on_gap`: looks for a gap of the loop before bytes are judged. `on_open`: the link is proven to be open."""
+        self._loop = asyncio.get_running_loop()
+        now = self._loop.time()
+        self.url = url
+        self.link: Link | None = None
+        """The open link."""
+        self.health = LinkHealth(since=now, bytes_per_s=control.driver.model.profile.baud / BITS_PER_BYTE)
+        self._car = control.car
+        self._control = control
+        self._driver = control.driver
+        self._publisher = publisher
+        self._commands = commands
+        self._wake = wake
+        self._on_gap = on_gap
+        self._on_open = on_open
+        self._baud = BaudWatch(url)
+        self._flood_until = now
+        self._attempts = Attempts()
+        self._trouble = ""
+        """The trouble of an open link that was logged last."""
+        self._damaged = 0
+        """Frames that were rejected since the last search for the trouble of the link."""
+        self._look_at = now
+
+    async def keep_open(self, *, may_fail: bool, is_in_use: Callable[[], Awaitable[bool]]) -> None:
+        """Keep the link open, and read from it. Raises LinkError if the first attempt fails and must not (`may_fail`).
+
+        is_in_use: True if another gateway, which has to end, may still have the port open.
+        """
+        looked_again = False
+        while True:
+            try:
+                link = await open_link(self.url, first=self._may_move)
+            except LinkError as error:
+                if not may_fail and not await is_in_use():
+                    if looked_again or not isinstance(error, Busy):
+                        raise
+                    looked_again = True  # the other gateway, which had the port, may have ended since
+                else:
+                    self.lost(str(error))
+                await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+                continue
+            may_fail = True
+            now = self._loop.time()
+            self.link = link
+            self._baud = BaudWatch(self.url)
+            self.health.on_open(now)
+            self._control.link_up(now)
+            if self._attempts.on_open(now):
+                self._on_open()
+            self._wake.set()
+            try:
+                await self._read(link)
+            except LinkLost as error:
+                self.on_events(self._driver.drop_bytes())
+                if self.link is link:
+                    self.lost(str(error))
+            await link.close()
+            await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+
+    @property
+    def _may_move(self) -> bool:
+        """True if the car may be moving while its link is down."""
+        return self._control.was_open and self._driver.model.motors is not Motors.OFF
+
+    async def _read(self, link: Link) -> None:
+        """Decode bytes until the link is lost."""
+        while True:
+            data = await link.read()
+            read_at = now = self._loop.time()
+            self.health.on_bytes(len(data), now)
+            self._on_gap(now)  # before the bytes: reports that are read late may look like a pause
+            before = shown_state(self._driver.model)
+            for start in range(0, len(data), SLICE_BYTES):
+                if start:
+                    await asyncio.sleep(0)
+                    now = self._loop.time()
+                if now > read_at + MAX_BYTES_AGE_S:
+                    self.on_events(self._driver.drop_bytes())
+                    self._on_flood("flood_bytes", len(data) - start, now)
+                    break
+                self.on_events(self._driver.feed(data[start : start + SLICE_BYTES], now))
+            if (doubt := self._baud.on_bytes(data)) is not None:
+                self.health.on_rejected(doubt.cause, 1)
+                self._commands.log(Level.WARNING, "no_frames", doubt.words)
+            if shown_state(self._driver.model) != before:
+                self._wake.set()
+            self._wake.set_if_due(now)
+
+    def _on_flood(self, counted_as: str, count: int, now: float) -> None:
+        """Count discarded data, and log each flood once."""
+        self.health.on_rejected(counted_as, count)
+        if now >= self._flood_until:
+            words = (
+                f"{self._car} sends more bytes than any car: another device, or a wrong baud rate? "
+                f"The gateway publishes {RAW_PER_S:g} raw frames a second and counts the rest in state/link."
+            )
+            self._commands.log(Level.WARNING, "flood", words)
+        self._flood_until = now + FLOOD_LOG_PAUSE_S
+
+    def on_events(self, events: list[Event]) -> None:
+        """Publish the measurements of the events, then update the state of the car with them."""
+        for event in events:
+            if not self._publisher.publish_event(event):
+                self._on_flood("raw_not_published", 1, event.at)
+            self._driver.on_event(event, self._loop.time())
+            if isinstance(event, TextLine):
+                self.health.on_rejected(FrameVerdict.TEXT)  # it shows a program, but not that of a car
+                continue
+            self.health.rx_frames += 1
+            if isinstance(event, Rejected):
+                self.health.on_rejected(event.cause)
+                self._damaged += 1
+                continue
+            self._baud.on_frame()
+            if not isinstance(event, Echo):
+                self.health.on_reading(event.at)
+            if self._attempts.check_proven(event.at, has_reading=True):
+                self._on_open()
+
+    def lost(self, reason: str) -> None:
+        """Fail what waits for the link: it is down."""
+        now = self._loop.time()
+        self.link = None
+        self.health.on_lost(reason, now)
+        self._driver.link_down(reason, now)
+        if self._attempts.on_failed(reason):
+            self._commands.log(Level.WARNING, "link_lost", reason)
+        self._wake.set()
+
+    def check(self, now: float) -> None:
+        """Log that the link has lasted, and what it found out if bytes are damaged or missing, once each."""
+        if self._attempts.check_proven(now, has_reading=False):
+            self._on_open()
+        if self.link is None:
+            return
+        is_stale = self.health.state is LinkState.STALE
+        if now >= self._look_at and (is_stale or self._damaged >= MIN_DAMAGED):
+            self._damaged, self._look_at = 0, now + LOOK_INTERVAL_S
+            self.link.look_for_trouble()
+        trouble = self.link.trouble
+        if trouble and trouble != self._trouble:
+            self._trouble = trouble
+            self.health.on_rejected("port_shared")
+            self._commands.log(Level.WARNING, "port_shared", trouble)
+
+
+def at_rate(url: LinkUrl, baud: int) -> LinkUrl:
+    """Return a link at the rate of its car, unless it names a rate of its own."""
+    return replace(url, baud=baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url
