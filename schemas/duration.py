@@ -10,6 +10,8 @@ _LONG_UNITS: Final = {
 }  # fmt: skip
 _NUMBER: Final = r"\d+(?:\.\d*)?|\.\d+"
 _DURATION: Final = re.compile(rf"(?:(?:{_NUMBER})(?:ms|h|m|s))+|(?:{_NUMBER})", re.ASCII)
+DURATION_PATTERN: Final = f"^({_DURATION.pattern})$"
+"""The pattern of a duration, for schemas of files."""
 _WORDY: Final = re.compile(rf"({_NUMBER}) ?([a-z]+?)s?", re.ASCII)
 _PART: Final = re.compile(rf"({_NUMBER})(ms|h|m|s|)", re.ASCII)
 

@@ -66,7 +66,7 @@ def find(
     A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none, or if
     a session with a hit could not be marked. The quota does not remove marked sessions.
     """
-    from fleet.recording.tools.find import parse_condition
+    from fleet.policy.car_condition import parse_condition
 
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+from fleet.conditions import BadExpression, Expression
+from fleet.conditions.functions import FUNCTIONS
 from fleet.fleetfile.models import (
     CAPABILITIES,
     ConsoleEntry,
@@ -17,11 +19,14 @@ from fleet.fleetfile.models import (
     LimitsEntry,
     PersonEntry,
     PersonRank,
+    PinEntry,
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
+from fleet.policy.car_condition import parse_condition
 from gateway import drivers
 from schemas.colors import Rgb, car_color, hex_color, parse_color
+from schemas.duration import parse_duration
 from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, LOW_V
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, normalize_name
@@ -79,12 +84,21 @@ class FleetPerson:
 
 
 @dataclass(frozen=True, slots=True)
+class PinRule:
+    """A condition of any car whose time is pinned in recordings, from `before_s` to `after_s`, s."""
+
+    condition: Expression
+    before_s: float
+    after_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
     endpoint: the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: no limit.
     console_port: the port of the web page; 0: the default. groups: cars by group. people: the only ones who may drive;
-    None: everyone may. unlinked: cars without a link, if they are allowed.
+    None: everyone may. unlinked: cars without a link, if they are allowed. pins: what is pinned in recordings.
     """
 
     name: str
@@ -102,6 +116,7 @@ class FleetFile:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     people: Mapping[str, FleetPerson] | None = None
     unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
+    pins: tuple[PinRule, ...] = ()
 
     @property
     def unbound(self) -> tuple[str, ...]:
@@ -159,6 +174,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         quota=record.quota if record else "",
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
         people=_resolve_people(file) if "people" in tree else None,
+        pins=tuple(map(_resolve_pin, file.pin)),
         text=text,
         path=path.absolute(),
         unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),
@@ -184,6 +200,10 @@ def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
         limits=Limits(**dict(limits)),
         roles=tuple(car["roles"]) if "roles" in car else None,
     )
+
+
+def _resolve_pin(pin: PinEntry) -> PinRule:
+    return PinRule(parse_condition(pin.when, FUNCTIONS), parse_duration(pin.before), parse_duration(pin.after))
 
 
 def _resolve_people(file: FileEntry) -> Mapping[str, FleetPerson]:
@@ -249,12 +269,27 @@ def _find_contradictions(
             if isinstance(car, str) and car not in cars:
                 yield ("groups", group, index), f"there is no car {quote_value(car)}. {suggest(car, cars)}"
     yield from _find_people_contradictions(tree, cars)
+    yield from _find_pin_faults(tree)
     for entry in () if moved else ("plan", "world"):
         given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
             there = _resolve_path(path, given)
             if there is not None and not there.is_file():
                 yield (entry,), f"there is no file {quote_value(given)} beside this one"
+
+
+def _find_pin_faults(tree: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
+    pins = tree.get("pin")
+    for index, pin in enumerate(pins if isinstance(pins, list) else ()):
+        when = _as_mapping(pin).get("when")
+        if isinstance(when, str):
+            try:
+                condition = parse_condition(when, FUNCTIONS)
+            except BadExpression as error:
+                yield ("pin", index, "when"), error.words
+            else:
+                if not condition.names:
+                    yield ("pin", index, "when"), "names no reading. Write a condition of one, such as range_m < 0.1."
 
 
 def _find_people_contradictions(tree: Mapping[str, Any], cars: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:

@@ -13,12 +13,20 @@ from fleet.links import parse_fleet_link
 from gateway import drivers
 from schemas import bus, keys
 from schemas.colors import COLOR_PATTERN, parse_color
+from schemas.duration import DURATION_PATTERN, parse_duration
 from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS
 from schemas.words import BatteryAction, Mode
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
+
+MIN_PIN_S: Final = 1.0
+"""Minimum time before and after a pinned moment: the recorder writes what is pinned once a second."""
+MAX_PIN_S: Final = 3600.0
+"""Maximum time before and after a pinned moment: the longest lesson."""
+MAX_PIN_RULES: Final = 50
+"""Maximum conditions of pins. The recorder asks all of them of each reading that they name."""
 
 
 class PersonRank(StrEnum):
@@ -90,6 +98,12 @@ def validate_path(text: str) -> str:
     return text
 
 
+def validate_pin_time(text: str) -> str:
+    """Return the time before or after a pinned moment if it is valid; raises ValueError."""
+    parse_duration(text, MIN_PIN_S, MAX_PIN_S)
+    return text
+
+
 PARTS: Final = frozenset().union(*(each.capabilities for each in drivers.built_in_profiles()))
 CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
@@ -111,6 +125,7 @@ _Platform = Annotated[str, AfterValidator(validate_platform), Field(json_schema_
 _Color = Annotated[str, AfterValidator(validate_color), Field(json_schema_extra={"pattern": COLOR_PATTERN})]
 _Size = Annotated[str, AfterValidator(validate_size), Field(json_schema_extra={"pattern": _SIZE.pattern})]
 _Path = Annotated[str, AfterValidator(validate_path)]
+_PinTime = Annotated[str, AfterValidator(validate_pin_time), Field(json_schema_extra={"pattern": DURATION_PATTERN})]
 _Volts = Annotated[float, Field(ge=EMPTY_V, le=FULL_V)]
 
 
@@ -175,6 +190,14 @@ class RecordEntry(Entry):
     )
 
 
+class PinEntry(Entry):
+    """A condition whose time the quota of the recordings takes last."""
+
+    when: str = Field(description="the condition, true of any car, as in plans: `mode.verdict == 'contradicted'`")
+    before: _PinTime = Field(default="30s", description="what is pinned before it: 1s to 1h")
+    after: _PinTime = Field(default="30s", description="what is pinned after it: 1s to 1h")
+
+
 class ConsoleEntry(Entry):
     """The web page of `fleet up`."""
 
@@ -191,6 +214,11 @@ class FileEntry(Entry):
     plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")
     record: bool | RecordEntry = Field(
         default=True, description="false: `fleet up` does not record; or where to, and how much"
+    )
+    pin: list[PinEntry] = Field(
+        default_factory=list,
+        max_length=MAX_PIN_RULES,
+        description="times that the quota takes last, `[{when: range_m < 0.1}]`, beside stops and marks",
     )
     console: bool | ConsoleEntry = Field(
         default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`"

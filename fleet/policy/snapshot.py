@@ -87,6 +87,11 @@ def topic_of(name: str) -> str:
     return _FIELDS[name].topic
 
 
+def value_of(name: str, seen: Observation) -> Any:
+    """Return the value of a name, or of a function of one, in a message of its topic. None if it was not measured."""
+    return _FIELDS[name].value(seen)
+
+
 @dataclass(frozen=True, slots=True)
 class Refusal:
     """A mode that a car's gateway refused, and why."""

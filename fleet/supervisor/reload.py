@@ -12,6 +12,7 @@ _FIXED_PROPERTIES: Final[Mapping[str, str]] = {
     "world": "the world",
     "recordings": "where recordings go",
     "quota": "how much it keeps",
+    "pins": "what it pins",
     "record": "whether it records",
     "console": "whether it serves the page",
     "console_port": "the port of the page",

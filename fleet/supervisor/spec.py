@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, default_color, profile_capabilities
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule, default_color, profile_capabilities
 from fleet.fleetfile.models import PersonRank
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
@@ -82,6 +82,8 @@ class FleetSpec:
     recordings: Path = RECORDINGS
     quota: str = ""
     """Maximum size of all sessions, as 20GB; empty: none."""
+    pins: tuple[PinRule, ...] = ()
+    """What is pinned in recordings. The recorder reads it from the file."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """The cars of each group."""
     colors: Mapping[str, str] = field(default_factory=dict)
@@ -149,6 +151,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         record=(file.record if file else True) if options.record is None else options.record,
         recordings=options.out or (file.recordings if file else None) or RECORDINGS,
         quota=file.quota if file else "",
+        pins=file.pins if file else (),
         groups=file.groups if file else {},
         people=people,
         colors={

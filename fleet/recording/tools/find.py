@@ -9,11 +9,11 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from fleet.conditions import BadExpression, Expression, parse, value_in
+from fleet.conditions import Expression, value_in
 from fleet.conditions.expression import KINDS
 from fleet.conditions.holding import HeldSpan, Holding
-from fleet.conditions.satisfiability import explain_impossible
-from fleet.policy.snapshot import ALIASES, NAMES, topic_of
+from fleet.policy.car_condition import holding_of
+from fleet.policy.snapshot import NAMES, topic_of
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
@@ -24,10 +24,6 @@ from schemas.words import Phase
 
 MODE: Final = TOPICS["state/mode"]
 COMMANDS: Final = TOPICS["event/command"]
-_STALE_NS: Final = {
-    topic_of(name): None if (after_s := TOPICS[topic_of(name)].stale_after_s) is None else round(after_s * 1e9)
-    for name in NAMES
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +44,6 @@ class Hit:
         return (self.end_ns - self.begin_ns) / 1e9
 
 
-def parse_condition(text: str) -> Expression:
-    """Return a condition over the names of plans. Raises BadExpression, also if it can never be true."""
-    expression = parse(text, NAMES, ALIASES)
-    if never := explain_impossible(expression):
-        raise BadExpression(text, 1, never)
-    return expression
-
-
 @dataclass(slots=True)
 class ConditionRun:
     """The hits of one car, from its messages in the order of their times."""
@@ -72,7 +60,7 @@ class ConditionRun:
     """Mode and command when the current hit began."""
 
     def __post_init__(self) -> None:
-        self._holding = Holding(self.expression, topic_of, _STALE_NS.__getitem__)
+        self._holding = holding_of(self.expression)
 
     def command(self, words: str) -> None:
         """Note the last command."""
@@ -94,11 +82,6 @@ class ConditionRun:
         """Return all hits. The last one ends with the last reading."""
         self._keep(self._holding.end())
         return self.hits
-
-    @property
-    def lasting_s(self) -> float | None:
-        """Return how long it has held until the newest reading, s; None if it does not hold."""
-        return None if self._holding.span is None else self._holding.span.length_s
 
     def _keep(self, span: HeldSpan | None) -> None:
         if span is not None and span.length_s >= self.for_s:

@@ -68,6 +68,38 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     assert blue.capabilities == profile_capabilities("raspberry_pi+arm") - servos
 
 
+ONE = "cars: {red: {link: COM1}}\n"
+
+
+def test_pins_have_the_conditions_of_plans() -> None:
+    fleet = _fleet(f"{ONE}pin:\n- {{when: battery_v < 6.6, before: 2m}}\n- {{when: 'rate(range_m) < -1', after: 1h}}\n")
+    assert [(str(pin.condition), pin.before_s, pin.after_s) for pin in fleet.pins] == [
+        ("battery_v < 6.6", 120, 30),
+        ("rate(range_m) < -1", 30, 3600),
+    ]
+    assert _fleet(ONE).pins == ()
+
+
+@pytest.mark.parametrize(
+    ("pin", "place", "fault"),
+    [
+        ("{when: rang_m < 0.1}", "2:14", "pin 1, when: rang_m is not a value. Did you mean range_m?"),
+        ("{when: range_m < 0}", "2:14", "never true"),
+        ("{when: 'true'}", "2:14", "names no reading"),
+        ("{when: range_m}", "2:14", "compare it"),
+        ("{before: 3s}", "2:7", "pin 1, when: is missing"),
+        ("{when: range_m < 1, before: 2h}", "2:35", "at most 1h"),
+        ("{when: range_m < 1, after: 0s}", "2:34", "at least 1s"),
+        ("{when: range_m < 1, after: 1 min}", "2:34", "write 1m"),
+        ("{when: range_m < 1, during: 3s}", "2:27", "There are after, before, when."),
+    ],
+)
+def test_what_is_wrong_about_a_pin(pin: str, place: str, fault: str) -> None:
+    (words,) = _faults(f"{ONE}pin: [{pin}]\n")
+    assert f"f.yaml:{place}: error" in words
+    assert fault in words
+
+
 TWO = "cars: {red: {link: COM1}, blue: {link: COM2}}\ngroups: {a: [red]}\n"
 
 
