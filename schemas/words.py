@@ -362,6 +362,18 @@ class RecorderState(StrEnum):
     STOPPED = "stopped"
 
 
+class PinCause(StrEnum):
+    """Why a time of a recording is pinned, so that the quota takes it last."""
+
+    CONDITION = "condition"
+    """A condition of the fleet file."""
+    ESTOP = "estop"
+    STOP_ALL = "stop_all"
+    NOT_SHOWN = "not_shown"
+    """A stop that the car did not show, or that did not reach it."""
+    MARK = "mark"
+
+
 class ProcessKind(StrEnum):
     """The kind of a process."""
 

@@ -14,6 +14,7 @@ from fleet.commands.group import chosen_person
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import aligned, echo_csv, echo_safely
 from fleet.commands.params import Duration, car_option, existing_sessions_place
+from fleet.policy.car_condition import parse_condition
 from fleet.recording import time_spec
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS, NoMark, add_mark
 from fleet.recording.session_lookup import sessions_in
@@ -66,8 +67,6 @@ def find(
     A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none, or if
     a session with a hit could not be marked. The quota does not remove marked sessions.
     """
-    from fleet.policy.car_condition import parse_condition
-
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")
     with cli_errors():

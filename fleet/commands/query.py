@@ -47,7 +47,11 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
         raise click.UsageError("give one question, or --tables; and --csv or --json, not both")
     place = existing_sessions_place(directory)
     text = sys.stdin.read() if sql == "-" else sql or ""
-    with progress_bar("tables", sum(1 for _ in sessions_in(place))) as advance:
+    try:
+        count = sum(1 for _ in sessions_in(place))
+    except OSError as error:
+        raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
+    with progress_bar("tables", count) as advance:
         try:
             catalog = Catalog(place, on_session=lambda _: advance(1))
         except FormatMissing as error:

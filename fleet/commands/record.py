@@ -5,7 +5,7 @@ import re
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -22,6 +22,9 @@ from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import RecorderState, RecorderVerb
+
+if TYPE_CHECKING:
+    from fleet.fleetfile.fleet_file import PinRule
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -75,7 +78,8 @@ examples:
   fleet record run --quota 20GB
   fleet record run --sessions /media/disk --segment-time 5m
 
-The quota does not remove marked sessions."""
+The quota takes whole files, the oldest of all sessions first. It takes last those around stops, marks, and what pin:
+of the fleet file says, and nothing of marked sessions."""
 )
 @click.option(
     "--sessions",
@@ -90,7 +94,9 @@ The quota does not remove marked sessions."""
     "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="Maximum size of a file."
 )
 @click.option(
-    "--segment-time", type=Duration(_WEEK_S), default="10m", show_default=True, help="Start a new file after this time."
+    "--segment-time",
+    type=Duration(_WEEK_S),
+    help="Start a new file after this time (default: 10m; with --quota 1m, because it takes whole files).",
 )
 @click.option(
     "--sync",
@@ -107,7 +113,7 @@ The quota does not remove marked sessions."""
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="Maximum size of all sessions in --sessions. The oldest ones without a mark are removed.",
+    help="Maximum size of all sessions in --sessions. The oldest minutes that nothing pins are removed.",
 )
 @click.option(
     "--keep-free",
@@ -116,7 +122,9 @@ The quota does not remove marked sessions."""
     show_default=True,
     help="Minimum free disk space. With less, recording pauses until there is room again.",
 )
-@click.option("--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml.")
+@click.option(
+    "--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml, and pin what its pin: says."
+)
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @connect_option()
 @fleet_option()
@@ -125,7 +133,7 @@ The quota does not remove marked sessions."""
 def run(
     place: Path,
     segment_size: int,
-    segment_time: float,
+    segment_time: float | None,
     sync: str,
     session_size: int | None,
     quota: int | None,
@@ -141,7 +149,7 @@ def run(
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
-    from fleet.recording.writing.retention import Quota
+    from fleet.recording.writing.retention import QUOTA_SEGMENT_S, Quota
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
@@ -150,7 +158,7 @@ def run(
         raise click.UsageError(limits.refusal)
     options = Options(
         segment_bytes=segment_size,
-        segment_s=segment_time,
+        segment_s=segment_time if segment_time is not None else QUOTA_SEGMENT_S if quota else Options().segment_s,
         sync=Sync(sync),
         quota=limits,
         reserve=Reserve(keep_free),
@@ -161,7 +169,7 @@ def run(
     signals.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True) as bus:
-            recorder = Recorder(bus, fleet, place, options, notify=_warn)
+            recorder = Recorder(bus, fleet, place, options, pins=_pins(fleet_file), notify=_warn)
             session = recorder.start()
             if full := recorder.full:
                 _say(
@@ -212,6 +220,19 @@ def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int |
 
 def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FBT001 - the flag of the command
     click.echo(json.dumps(values) if as_json else words)
+
+
+def _pins(fleet_file: Path | None) -> "tuple[PinRule, ...]":
+    """Return what a fleet file pins. Recording goes on without the pins of a file with mistakes."""
+    from fleet.fleetfile.fleet_file import read_fleet
+
+    if fleet_file is None:
+        return ()
+    try:
+        return read_fleet(fleet_file, unbound=True, moved=True).pins
+    except ValueError as error:  # a BadFile
+        _warn(f"nothing of pin: in {fleet_file} is pinned: {error}")
+        return ()
 
 
 def _warn(words: str) -> None:

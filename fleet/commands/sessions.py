@@ -16,6 +16,7 @@ from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.commands.session_part import part_of
 from fleet.recording import time_spec
+from fleet.recording.session_dir import REMOVED_FILE, removed_sessions
 from fleet.recording.session_lookup import sessions_place
 from schemas.keys import name_of
 from schemas.local_time import date_and_clock, of_iso
@@ -90,6 +91,17 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     A stop of several cars counts once, whoever asked for it. Damaged sessions are in the list, with what is wrong.
     """
     _show(_summaries(directory), as_json=as_json)
+    if not as_json:
+        _say_removed(directory or sessions_place())
+
+
+def _say_removed(place: Path) -> None:
+    """Say which sessions a quota has removed from a directory."""
+    if removed := removed_sessions(place):
+        times = [str(each.get(name, "")) for each in removed for name in ("from", "to")]
+        many = "1 session is" if len(removed) == 1 else f"{len(removed)} sessions are"
+        span = f"{of_iso(min(times))} to {of_iso(max(times))}"
+        echo_safely(f"{many} gone for the quota, of {span}: {place / REMOVED_FILE} lists them", err=True)
 
 
 @sessions.command(
@@ -146,6 +158,7 @@ def _show(found: list["SessionSummary"], *, as_json: bool) -> None:
 def _row(one: "SessionSummary") -> tuple[str, ...]:
     cars = ",".join(map(printable, one.cars[:5])) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
     marks = str(len(one.marks)) + (" kept" if one.kept else "")
+    marks += f", {len(one.pins)} pinned" if one.pins else ""
     length = time_spec.words(one.length_s)
     start = date_and_clock(one.start_ns / 1e9) if one.messages else "-"
     stops = "-" if one.stops is None else str(one.stops)
@@ -204,6 +217,13 @@ def _say_contents(about: "SessionSummary") -> None:
     for mark in about.marks:
         by = name_of(mark.get("by") or "") or "somebody"
         echo_safely(f"  mark: {of_iso(mark.get('time', ''))} {mark.get('text', '')!r} by {by}")
+    for pin in about.pins:
+        times = f"{of_iso(pin.get('from', ''))} to {of_iso(pin.get('to', ''))}"
+        cars = ", ".join(map(str, pin.get("cars", ())))
+        echo_safely(f"  pinned: {times}: {pin.get('cause')}: {pin.get('words')}{f' ({cars})' if cars else ''}")
+    for each in about.gone:
+        times = f"{of_iso(each['from'])} to {of_iso(each['to'])}"
+        echo_safely(f"  gone for the quota: {times}, {each['file']}{', pinned' * bool(each.get('pinned'))}")
     shown = {key: printable(key) for key in about.keys}
     width = max(map(len, shown.values()), default=0)
     for key, count in about.keys.items():

@@ -6,6 +6,8 @@
 - copies of the fleet file and the plan, if any;
 - `index.json`, a cache with the counts of each segment;
 - during recording `session.json.spare`, reserved space for the description if the disk gets full.
+
+`sessions/removed.json` lists the sessions that a quota has removed.
 """
 
 import contextlib
@@ -18,6 +20,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from fnmatch import fnmatch
 from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
@@ -29,6 +32,9 @@ from schemas.atomic_file import write_atomically
 SESSION_FILE: Final = "session.json"
 INDEX_FILE: Final = "index.json"
 SPARE_FILE: Final = "session.json.spare"
+REMOVED_FILE: Final = "removed.json"
+TABLES_PREFIX: Final = ".tables-"
+"""Begin of the names of directories with tables for questions (table_cache.py)."""
 SPARE_BYTES: Final = 256 * 1024
 """Reserved space: enough for the drops by key of 100 cars. Copy-on-write file systems (btrfs) may not honor it."""
 FLEET_FILE: Final = "fleet.yaml"
@@ -76,6 +82,10 @@ class SessionInfo:
     """True if the quota spares the session. The name is part of the file format."""
     stops: int | None = None
     """Number of recorded commands that stop cars. None if nobody has counted them."""
+    pins: Sequence[Mapping[str, Any]] = ()
+    """Times that the quota takes last, without those of marks: as `Pin.to_dict` writes them."""
+    gone: Sequence[Mapping[str, Any]] = ()
+    """Segments that the quota has taken: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Source session, tool (`recover`, `cut`) and losses; empty if the session was recorded."""
 
@@ -108,6 +118,52 @@ class SessionInfo:
             spare.replace(directory / SESSION_FILE)
             with contextlib.suppress(OSError):  # from the space that the old description has freed
                 reserve(directory)
+
+
+def gone_of(info: SessionInfo) -> list[Mapping[str, Any]]:
+    """Return the segments that the quota has taken from a session. Entries that are none are left out."""
+    wanted = {"file": str, "from": str, "to": str}
+    return [each for each in info.gone if all(isinstance(each.get(name), kind) for name, kind in wanted.items())]
+
+
+def gone_messages(info: SessionInfo) -> int | None:
+    """Return how many messages the quota has taken; None if nobody has counted them."""
+    counts = [each.get("messages") for each in info.gone]
+    known = [count for count in counts if isinstance(count, int)]
+    return sum(known) if len(known) == len(counts) else None
+
+
+def add_gone(directory: Path, gone: Sequence[Mapping[str, Any]]) -> None:
+    """List segments that the quota takes in `session.json`. Raises OSError, also if that cannot be read."""
+    path = directory / SESSION_FILE
+    values = read_json(path)
+    if not _is_valid(values):
+        raise OSError(errno.EIO, "is not a description", str(path))
+    listed = {each.get("file"): each for each in values.get("gone", [])}
+    listed |= {each["file"]: each for each in gone}
+    replace(path, {**values, "gone": [listed[name] for name in sorted(listed, key=str)]}, indent=2)
+
+
+def removed_sessions(place: Path) -> list[dict[str, Any]]:
+    """Return the sessions that a quota has removed from a directory, the newest last."""
+    listed = read_json(place / REMOVED_FILE).get("sessions")
+    return [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
+
+
+def indexed_segments(directory: Path) -> list[dict[str, Any]]:
+    """Return the entries of `index.json`; empty if there is none."""
+    indexed = read_json(directory / INDEX_FILE).get("segments") if directory.is_dir() else None
+    named = [one for one in indexed if isinstance(one, dict)] if isinstance(indexed, list) else []
+    return [one for one in named if isinstance(one.get("file"), str) and fnmatch(one["file"], SEGMENTS)]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file; empty if there is none."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 class NoMark(Exception):
@@ -172,12 +228,13 @@ def replace(path: Path, values: object, indent: int | None = None) -> None:
     write_atomically(path, f"{json.dumps(values, indent=indent)}\n".encode())
 
 
+_LISTS: Final = ("marks", "pins", "gone")
 _COUNTS: Final = ("drops", "missed", "recovered")
 _FIELD_TYPES: Final[Mapping[str, type]] = {
     **dict.fromkeys(("fleet", "started", "host", "error", "continues"), str),
     **dict.fromkeys(("format", "messages"), int),
     **dict.fromkeys(("versions", "origin", *_COUNTS), dict),
-    "marks": list,
+    **dict.fromkeys(_LISTS, list),
 }
 
 
@@ -186,7 +243,7 @@ def _is_valid(values: Mapping[str, Any]) -> bool:
     return (
         all(isinstance(values[name], kind) for name, kind in _FIELD_TYPES.items() if name in values)
         and all(isinstance(count, int) for name in _COUNTS for count in values.get(name, {}).values())
-        and all(isinstance(mark, dict) for mark in values.get("marks", []))
+        and all(isinstance(each, dict) for name in _LISTS for each in values.get(name, []))
         and isinstance(values.get("ended"), str | None)
         and isinstance(values.get("stops"), int | None)
     )

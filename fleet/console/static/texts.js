@@ -291,7 +291,7 @@ export const t = {
   refresh: "Refresh the list",
   noSessions: (place) => `No recordings in ${place} yet. \`fleet up\` records everything.`,
   sessionColumns: ["Session", "State", "Length", "Size", "Lost", "Marks", "Cars", "What to do"],
-  sessionStates: { whole: "✓ whole", recording: "● recording", cut: "✕ cut", damaged: "✕ damaged", recovered: "✓ recovered", unreadable: "✕ unreadable" },
+  sessionStates: { whole: "✓ whole", recording: "● recording", cut: "✕ cut", damaged: "✕ damaged", thinned: "✓ thinned", recovered: "✓ recovered", unreadable: "✕ unreadable" },
   verify: "Verify",
   download: "Download",
   exportAs: { csv: "Export CSV", parquet: "Export Parquet" },

@@ -4,16 +4,14 @@ A session is a directory (session_dir.py) or a single .mcap file of any writer. 
 """
 
 import errno
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, overload
+from typing import TYPE_CHECKING, Final, Literal, overload
 
 from mcap.records import Metadata
 
@@ -123,23 +121,31 @@ class Session:
             raise NoSession("; ".join(f"{segment} {words}" for segment, words in self.damage.items()))
         self.segments = tuple(segment for segment in there if segment not in self.damage)
         """Readable segments, in order."""
+        self.description = session_dir.SessionInfo.read(path) if whole else None
         if whole:
             numbered = {session_dir.segment(path, number + 1) for number in range(int(there[-1].stem))}
             # Only index.json shows that the last segment is missing.
-            closed = {path / one["file"] for one in _indexed_segments(path)}
-            if missing := sorted((numbered | closed) - set(there)):
+            closed = {path / one["file"] for one in session_dir.indexed_segments(path)}
+            if missing := sorted((numbered | closed) - set(there) - self._taken()):
                 self.damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
-            given = _json(path / session_dir.SESSION_FILE).get("format")
+            given = session_dir.read_json(path / session_dir.SESSION_FILE).get("format")
             if isinstance(given, int) and given > session_dir.FORMAT_VERSION:
                 raise NoSession(
                     f"{path} has format {given}, this version reads up to {session_dir.FORMAT_VERSION}: "
                     "update zenoh-car-fleet; "
                     f"its files can be read one by one, such as {there[0].name} in there"
                 )
-        self.description = session_dir.SessionInfo.read(path) if whole else None
 
     def __repr__(self) -> str:
         return f"Session({str(self.path)!r})"
+
+    def _taken(self) -> set[Path]:
+        """Return the segments that the quota has taken."""
+        return (
+            set()
+            if self.description is None
+            else {self.path / each["file"] for each in session_dir.gone_of(self.description)}
+        )
 
     def part(self, segments: tuple[Path, ...]) -> "Session":
         """Return these segments as a session of their own."""
@@ -154,7 +160,9 @@ class Session:
 
     def lacking(self, messages: int) -> str:
         """Return which messages session.json counts beyond these, in words; empty if none or unknown."""
-        total = self.description.messages if self.description is not None and self.description.closed else 0
+        info = self.description
+        gone = session_dir.gone_messages(info) if info is not None else 0
+        total = info.messages - gone if info is not None and info.closed and gone is not None else 0
         return f"says that there were {total} messages: {total - messages} are not here" if messages < total else ""
 
     @property
@@ -363,7 +371,7 @@ class Session:
 
     def expected(self) -> dict[Path, int | None]:
         """Return the expected messages of each segment, from its index or index.json; None if unknown."""
-        counts = ((each["file"], each.get("messages")) for each in _indexed_segments(self.path))
+        counts = ((each["file"], each.get("messages")) for each in session_dir.indexed_segments(self.path))
         indexed = {name: count for name, count in counts if isinstance(count, int)}
         found: dict[Path, int | None] = {}
         for segment, index in self.indexes().items():
@@ -409,18 +417,3 @@ def _recorded(row: Row) -> Recorded:
     return Recorded(
         info.channel.topic, data, message_of(info), info.channel.message_encoding, publish_ns, log_ns, sequence
     )
-
-
-def _indexed_segments(path: Path) -> list[dict[str, Any]]:
-    indexed = _json(path / session_dir.INDEX_FILE).get("segments") if path.is_dir() else None
-    named = [one for one in indexed if isinstance(one, dict)] if isinstance(indexed, list) else []
-    return [one for one in named if isinstance(one.get("file"), str) and fnmatch(one["file"], session_dir.SEGMENTS)]
-
-
-def _json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; empty if there is none."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return values if isinstance(values, dict) else {}

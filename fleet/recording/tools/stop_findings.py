@@ -71,12 +71,11 @@ class StopFindings:
         """Take in a message of `WATCHED_TOPICS`. at_ns: its time if it has no stamp."""
         if topic.startswith("state/"):
             self._states.setdefault(car, {})[topic] = message
+        elif not (code := failed_stop_code(topic, message)):
+            return
         elif topic == "event/log":
-            code = log_code(message)
-            if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
-                self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
-        elif message.verb in STOPPING_VERBS and message.phase in _FAILED:
-            code = NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
+            self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
+        else:
             asked = f"{message.verb} by {name_of(message.sender) or 'somebody'}"
             self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)
 
@@ -106,6 +105,16 @@ class StopFindings:
             yield f"its link was {link.what}{reason}"
         if health is not None and (health.doubted or health.shows_stops in (Shows.NO, Shows.UNKNOWN)):
             yield health.shows_stops_words or f"whether it shows stops: {health.shows_stops}"
+
+
+def failed_stop_code(topic: str, message: Any) -> str:
+    """Return the code of a stop that failed, by a message of `event/command` or `event/log`. Empty if it is none."""
+    if topic == "event/log":
+        code = log_code(message)
+        return code if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE) else ""
+    if message.verb not in STOPPING_VERBS or message.phase not in _FAILED:
+        return ""
+    return NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
 
 
 def log_code(record: Any) -> str:

@@ -32,6 +32,7 @@ class SessionState(StrEnum):
     RECORDING = "recording"
     CUT = "cut"  # the recorder did not close it
     DAMAGED = "damaged"  # files are missing or no MCAP files
+    THINNED = "thinned"  # whole but for what the quota took
     RECOVERED = "recovered"  # whole, but made from an incomplete session
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
 
@@ -61,6 +62,10 @@ class SessionSummary:
     marks: Sequence[Mapping[str, Any]] = ()
     kept: bool = False
     """True if the quota spares the session."""
+    pins: Sequence[Mapping[str, Any]] = ()
+    """Times that the quota takes last, without those of marks."""
+    gone: Sequence[Mapping[str, Any]] = ()
+    """Files that the quota has taken."""
     keys: Mapping[str, int] = field(default_factory=dict)
     """Messages by key."""
     start_ns: int = 0
@@ -124,10 +129,13 @@ def of_session(session: Session) -> SessionSummary:
         found.lost += missing if isinstance(missing, int) else 0
         found.marks = list(description.marks)
         found.kept = description.kept
+        found.pins, found.gone = list(description.pins), session_dir.gone_of(description)
         found.stops = description.stops if description.closed else None  # else the last ones may be uncounted
     found.state, found.words = _state(session, read)
     if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
+    if found.state is SessionState.WHOLE and found.gone:
+        found.state = SessionState.THINNED
     if found.state is SessionState.WHOLE and (words := lost_words(session)):
         found.state, found.words = SessionState.RECOVERED, words
     return found

@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Final, Self
 
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.session_dir import SEGMENTS
+from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX
 from fleet.recording.tools.export import export
 from fleet.recording.tools.table_formats import ParquetSink
 from fleet.recording.tools.tables import Column, Layout
 from schemas import messages
 from schemas.topics import TOPICS
 
-PREFIX: Final = ".tables-"
 _PART: Final = ".part"
 _NOTE: Final = "damage"
 """Name of the file that says what of the session could not be read."""
@@ -68,11 +67,6 @@ class CachedTables:
     def is_foreign(self, file: Path) -> bool:
         """Return True if the columns of a table are not those of this version."""
         return file.name.endswith(_FOREIGN)
-
-
-def is_cached(session: Path) -> bool:
-    """Return True if the tables of a session are made, and of its present state."""
-    return any(place.is_dir() for place in _places(session))
 
 
 def tables_of(session: Path) -> CachedTables:
@@ -142,7 +136,7 @@ def drop_orphans(place: Path) -> None:
     """Delete the tables of single files of a directory that are gone. Those of a directory went with it."""
     for home in place.glob(".*.mcap"):
         if home.is_dir() and not (place / home.name[1:]).exists():
-            for tables in home.glob(f"{PREFIX}*"):
+            for tables in home.glob(f"{TABLES_PREFIX}*"):
                 shutil.rmtree(tables, ignore_errors=True)
             with suppress(OSError):  # somebody else's directory
                 home.rmdir()
@@ -150,7 +144,7 @@ def drop_orphans(place: Path) -> None:
 
 def _drop_stale_parts(home: Path) -> None:
     """Delete what a process left that was killed, or lost its power."""
-    for part in home.glob(f"{PREFIX}*{_PART}"):
+    for part in home.glob(f"{TABLES_PREFIX}*{_PART}"):
         with suppress(OSError):
             newest = max(each.stat().st_mtime for each in (part, *part.iterdir()))
             if time.time() - newest > STALE_PART_S:
@@ -159,14 +153,14 @@ def _drop_stale_parts(home: Path) -> None:
 
 def _drop_others(place: Path) -> None:
     """Delete the tables of other states of the session. One that another question reads goes at the next time."""
-    for other in place.parent.glob(f"{PREFIX}*"):
+    for other in place.parent.glob(f"{TABLES_PREFIX}*"):
         if other != place and not other.name.endswith(_PART):
             shutil.rmtree(other, ignore_errors=True)
 
 
 def _places(session: Path) -> tuple[Path, Path]:
     """Return where the tables may be: in the session, or for a folder that is read-only among temporary files."""
-    name = f"{PREFIX}{_digest(session)}"
+    name = f"{TABLES_PREFIX}{_digest(session)}"
     home = session if session.is_dir() else session.parent / f".{session.name}"
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
     # Each user has a directory: another one's cannot be written.

@@ -155,10 +155,24 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
     if not origin.get("cars") and before.get("cars"):
         origin = {**origin, "cars": before["cars"]}
+    if old is not None and (gone := session_dir.gone_of(old)):
+        words = f"the quota had taken {len(gone)} files"
+        origin = {**origin, "lost": "; ".join(str(each) for each in (origin.get("lost"), words) if each)}
+        origin["missing"] = _sum((origin.get("missing"), session_dir.gone_messages(old)))
     base = old if old is not None else session_dir.SessionInfo(fleet, time_spec.iso(first), "", {})
     origin = {"by": origin["by"], "of": session.name, **origin}
+    marks = list(base.marks)
+    pins = list(base.pins)
+    if origin["by"] == "cut":  # those that lie outside are of no message here
+        begin, end = time_spec.iso(first), time_spec.iso(last)
+        marks = [mark for mark in marks if begin <= str(mark.get("time", "")) <= end]
+        pins = [pin for pin in pins if str(pin.get("from", "")) <= end and begin <= str(pin.get("to", ""))]
     replace(
         base,
+        marks=marks,
+        kept=base.kept and (bool(marks) or not base.marks),
+        pins=pins,
+        gone=(),
         started=time_spec.iso(first) if origin["by"] == "cut" else base.started,
         ended=time_spec.iso(last),
         closed=True,

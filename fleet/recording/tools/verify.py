@@ -51,6 +51,8 @@ class SessionVerdict:
     """Why the recorder did not close the session; empty if it did."""
     lost: str = ""
     """Losses of the session from which this one was made."""
+    gone: list[dict[str, Any]] = field(default_factory=list)
+    """Files that the quota has taken. Gaps there are in them and not in `missing`."""
     recording: bool = False
     """True if the session grew during the verification: its end is still to come."""
     missing: list[dict[str, Any]] = field(default_factory=list)
@@ -74,7 +76,7 @@ class SessionVerdict:
     def whole(self) -> bool:
         """True if no message is missing or duplicated, and no file damaged."""
         return (self.closed or self.recording) and not any(
-            (self.damage, self.lost, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
+            (self.damage, self.lost, self.gone, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
         )
 
     @property
@@ -100,6 +102,8 @@ class SessionVerdict:
             yield f"  lost: {self.lost}"
         if self.ended:
             yield f"  end: {self.ended}"
+        for one in self.gone:
+            yield f"  gone for the quota: {one['file']}, {one['from']} to {one['to']}"
         for one in self.missing[:MAX_LISTED_LINES]:
             yield f"  missing: {_missing_words(one)}"
         if len(self.missing) > MAX_LISTED_LINES:
@@ -243,6 +247,16 @@ def verify(
     # Damage found by reading names the lost messages, so it overrides damage found by CRC.
     verdict.damage = {path.name: words for path, words in sorted((session.damage | read).items())}
     description = session.description
+    if description is not None and (gone := session_dir.gone_of(description)):
+        verdict.gone = [dict(each) for each in gone]
+        verdict.missing = [
+            one
+            for one in verdict.missing
+            if not any(
+                iso_end >= time_spec.iso(one["after_ns"]) and begin <= time_spec.iso(one["before_ns"])
+                for begin, iso_end in ((each["from"], each["to"]) for each in gone)
+            )
+        ]
     if session.path.is_dir() and description is None:
         verdict.damage[session_dir.SESSION_FILE] = "is missing or unreadable: it names recorder and marks"
     if words := session.lacking(verdict.messages):

@@ -11,17 +11,18 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import zenoh
 
+from fleet.fleetfile.fleet_file import PinRule
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 from fleet.recording.writing.backfill import Backfill
+from fleet.recording.writing.pin_watch import PinWatch
 from fleet.recording.writing.receive_clock import ReceiveClock
-from fleet.recording.writing.retention import Quota
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
 from schemas.bus import Bus, messages_of, reply_value
@@ -99,6 +100,7 @@ class Recorder:
         root: Path,
         options: Options | None = None,
         *,
+        pins: Sequence[PinRule] = (),
         max_messages: int = MAX_QUEUED_MESSAGES,
         max_bytes: int = MAX_QUEUED_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -108,6 +110,8 @@ class Recorder:
         self._fleet = keys.check_name(fleet, "fleet name")
         self._root = root
         self._options = options or Options()
+        self._pin_rules = pins
+        self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes
         self._now = ReceiveClock(wall_ns).ns
@@ -294,8 +298,8 @@ class Recorder:
             self._writing = iter(batch)
             for item in self._writing:
                 add(*item)
-            for sample in backfilled:
-                self._session.add_backfilled(sample, self._now())
+            self._pin(batch)
+            self._add_backfilled(backfilled)
             if self._session.gaps:
                 # Do not request keys that the full queue dropped: their backfill would be dropped, too.
                 self._backfill.request(self._session.gaps.difference(self._drops))
@@ -304,6 +308,29 @@ class Recorder:
         with self._lock:
             self._queued_messages -= len(batch)
             self._queued_bytes -= sum(len(item[1]) for item in batch)
+
+    def _pin(self, batch: Sequence[_Item]) -> None:
+        """Pin what is worth it in messages that have come."""
+        watch = self._pin_watch
+        for key, payload, encoding, stamp, _, received_ns in batch:
+            if watch.is_watched(key):
+                published_ns = received_ns if stamp is None else stamp.get_time_as_ntp64().as_nanos()
+                for pin in watch.add(key, str(encoding), payload, published_ns, received_ns):
+                    self._session.pin(pin)
+
+    def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
+        late: list[tuple[int, zenoh.Sample]] = []
+        for sample in samples:
+            new = self._session.add_backfilled(sample, self._now())
+            if new and sample.timestamp is not None and self._pin_watch.is_watched(str(sample.key_expr)):
+                late.append((sample.timestamp.get_time_as_ntp64().as_nanos(), sample))
+        if not late:
+            return
+        self._pin_watch.begin_late()
+        for published_ns, sample in sorted(late, key=lambda each: each[0]):
+            key, encoding, payload = str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes()
+            for pin in self._pin_watch.add_late(key, encoding, payload, published_ns, self._now()):
+                self._session.pin(pin)
 
     def _tick(self) -> None:
         session = self._session
@@ -328,12 +355,10 @@ class Recorder:
         self._report_news(session)
 
     def _report_news(self, session: SessionWriter) -> None:
-        """Notify of each removed session, failed copy and new state once."""
-        for removed in session.removed:
-            self._notify(Quota.removal(removed))
-        for words in session.uncopied:
+        """Notify of what the quota took, and each failed copy and new state once."""
+        for words in (*session.quota_news, *session.uncopied):
             self._notify(words)
-        session.removed.clear()
+        session.quota_news.clear()
         session.uncopied.clear()
         # Numbers in the words change all the time: a pause is news once, a warning once for each text before its comma.
         now = {"full": session.full} if session.full else {}
@@ -433,6 +458,7 @@ class Recorder:
         except OSError as error:
             raise _CommandRefused(f"No session can be made in {self._root}: {error.strerror}") from None
         self._recording = True
+        self._pin_watch = PinWatch(self._pin_rules)  # what came meanwhile is not known
         self._publish()
 
     def _stop_session(self) -> None:

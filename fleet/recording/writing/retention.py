@@ -1,20 +1,47 @@
-"""The quota of a recorder: how large all sessions may be together, and which ones it removes."""
+"""The quota of a recorder: how large all sessions may be together, and the removal of what is too much.
+
+quota_order.py decides what goes. What is gone is listed: the segments of a session in its session.json, whole sessions
+in `removed.json` beside them.
+"""
 
 import contextlib
 import errno
 import shutil
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from fleet.recording import session_dir
+from fleet.recording.pins import Pin, pins_of
+from fleet.recording.reading.mcap_reader import McapReader, NotMcap
 from fleet.recording.session_dir import SESSION_FILE, SessionInfo
+from fleet.recording.time_spec import iso
 from fleet.recording.writing.disk_space import MB
+from fleet.recording.writing.quota_order import Spans, StoredSegment, StoredSession, Taking, choose
 
 SESSIONS_PER_QUOTA: Final = 10
-"""Minimum sessions in a quota. The quota removes whole sessions, so each uses at most a tenth unless told otherwise."""
+"""Minimum sessions in a quota. The quota spares the session that is being written, so each is at most a tenth of it."""
+QUOTA_SEGMENT_S: Final = 60.0
+"""Length of a segment, s, if there is a quota: it takes whole segments, and a pin is of a minute."""
+MAX_REMOVED: Final = 1000
+"""Maximum removed sessions that `removed.json` lists, the newest: 200 bytes each."""
 _UNCLOSED_IN_USE_S: Final = 60.0
 """Age below which an unclosed session may still belong to another recorder."""
+
+
+@dataclass(slots=True)
+class Enforced:
+    """What the quota has done."""
+
+    removed: list[Path] = field(default_factory=list)
+    """Sessions of which nothing is left."""
+    news: list[str] = field(default_factory=list)
+    """What a person should know: each session that is removed, and the first of its minutes that goes."""
+    warning: str = ""
+    """Why the sessions are still too large together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +49,7 @@ class Quota:
     """Maximum size of all sessions together, and of one, in bytes; 0 is no limit."""
 
     total: int = 0
-    """The oldest unmarked sessions are removed first."""
+    """The oldest unpinned segments of unmarked sessions are removed first."""
     session: int = 0
     """Size at which a session is closed and the next one begins; 0: a tenth of `total`."""
 
@@ -38,36 +65,154 @@ class Quota:
             return ""
         return (
             f"--session-size: {self.session / 10**6:g} MB is more than half of --quota: at most "
-            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota removes whole sessions"
+            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota takes nothing of the session that is written"
         )
 
-    def enforce(self, root: Path, keep: Path) -> tuple[list[Path], str]:
-        """Remove the oldest sessions below `root` until all fit: (removed sessions, a warning if they still do not).
+    def enforce(self, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> Enforced:
+        """Remove segments below `root` until all sessions fit.
 
-        Spare `keep`, marked sessions, directories of other programs and sessions that cannot be removed.
+        Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: those of
+        `keep`, whose session.json may not have them yet.
         """
+        done = Enforced()
         if not self.total:
-            return [], ""
-        sizes = {path.parent: _size(path.parent) for path in root.glob(f"*/{SESSION_FILE}")}
-        over = sum(sizes.values()) - self.total
-        removed = []
-        for session in sorted(sizes, key=lambda session: session.name):
-            if over <= 0:
-                break
-            if session != keep and _may_go(session):
-                try:
-                    _remove(session)
-                except OSError:
-                    continue  # perhaps another user's; the warning reports the excess
-                removed.append(session)
-                over -= sizes[session]
-        why = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
-        return removed, f"{root} has more than its quota, {why}" if over > 0 else ""
+            return done
+        paths = [path.parent for path in root.glob(f"*/{SESSION_FILE}")]
+        over = sum(map(_size, paths)) - self.total
+        if over <= 0:
+            return done
+        infos = {path: info for path in paths if (info := SessionInfo.read(path)) is not None}
+        spans = _spans(infos, keep, pins)
+        stored = [
+            _stored(path, info, spans[info.fleet])
+            for path, info in infos.items()
+            if path != keep and _may_go(path, info)
+        ]
+        taking = choose(stored, over, self.total)
+        for name in dict.fromkeys([*(each.session for each in taking.segments), *taking.tables, *taking.removed]):
+            freed = _take(root / name, infos[root / name], taking, done)
+            over -= freed
+        if over > 0:
+            why = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
+            done.warning = f"{root} has more than its quota, {why}"
+        return done
 
-    @staticmethod
-    def removal(session: Path) -> str:
-        """Return the news that this session was removed."""
-        return f"{session} is removed, the oldest session without a mark: the quota is full"
+
+def _spans(infos: Mapping[Path, SessionInfo], keep: Path, pins: Iterable[Pin]) -> dict[str, Spans]:
+    """Return the pinned times of each fleet."""
+    times: dict[str, list[tuple[int, int]]] = {}
+    for path, info in infos.items():
+        own = times.setdefault(info.fleet, [])
+        own += [(pin.begin_ns, pin.end_ns) for pin in pins_of(info.pins, info.marks)]
+        if path == keep:
+            own += [(pin.begin_ns, pin.end_ns) for pin in pins]
+    return {fleet: Spans(found) for fleet, found in times.items()}
+
+
+def _stored(path: Path, info: SessionInfo, spans: Spans) -> StoredSession:
+    indexed = {each["file"]: each for each in session_dir.indexed_segments(path)}
+    segments: list[StoredSegment] = []
+    before_ns = _start_ns(info)
+    for file in sorted(path.glob(session_dir.SEGMENTS)):
+        with contextlib.suppress(OSError):  # another recorder removes it now
+            found = _segment(file, indexed.get(file.name), before_ns)
+            # A file without an index ends when it was written last.
+            segments.append(replace(found, pinned=spans.touch(found.begin_ns, found.end_ns)))
+            before_ns = found.end_ns
+    tables = sum(_size(each) for each in path.glob(f"{session_dir.TABLES_PREFIX}*"))
+    other = _size(path) - tables - sum(each.bytes for each in segments)
+    return StoredSession(path.name, tuple(segments), tables, max(other, 0))
+
+
+def _start_ns(info: SessionInfo) -> int:
+    with contextlib.suppress(ValueError):
+        return int(datetime.fromisoformat(info.started).timestamp() * 1e9)
+    return 0
+
+
+def _segment(file: Path, entry: Mapping[str, Any] | None, before_ns: int) -> StoredSegment:
+    """Return the facts of a segment. entry: of index.json; before_ns: the end of the one before. Raises OSError."""
+    state = file.stat()
+    first_ns, last_ns, messages = ((entry or {}).get(name) for name in ("first_ns", "last_ns", "messages"))
+    if not (isinstance(first_ns, int) and isinstance(last_ns, int) and isinstance(messages, int)):
+        first_ns, last_ns, messages = before_ns, max(state.st_mtime_ns, before_ns), None
+        with contextlib.suppress(NotMcap):
+            index = McapReader(file).index()
+            if index is not None and (counts := index.statistics) is not None:
+                first_ns, last_ns = counts.message_start_time, counts.message_end_time
+                messages = counts.message_count
+    if messages == 0:
+        first_ns = last_ns = before_ns
+    return StoredSegment(file.parent.name, file.name, state.st_size, first_ns, last_ns, messages)
+
+
+def _take(session: Path, info: SessionInfo, taking: Taking, done: Enforced) -> int:
+    """Take from one session, and return the freed size in bytes. 0 if it cannot be changed."""
+    before = _size(session)
+    segments = [each for each in taking.segments if each.session == session.name]
+    try:
+        if session.name in taking.removed:
+            _remove(session)
+            done.removed.append(session)
+            done.news.append(f"{session} is removed, the oldest session without a mark: the quota is full")
+            with contextlib.suppress(OSError):  # the disk is full: the news says it, too
+                _list_removed(session, info, segments)
+            return before
+        for tables in session.glob(f"{session_dir.TABLES_PREFIX}*"):
+            shutil.rmtree(tables, ignore_errors=True)
+        if segments:
+            had_pinned = any(each.get("pinned") for each in info.gone)
+            _remove_segments(session, segments)
+            if not info.gone:
+                done.news.append(f"{session}: the quota is full and takes its minutes, the oldest unpinned ones first")
+            if not had_pinned and any(each.pinned for each in segments):
+                done.news.append(f"{session}: pinned minutes are gone, too: pins have at most half of the quota")
+    except OSError:  # perhaps another user's; the warning reports the excess
+        pass
+    return before - _size(session)
+
+
+def _remove_segments(session: Path, segments: Iterable[StoredSegment]) -> None:
+    """Delete segments, and list them in session.json first: else they would be damage. Raises OSError."""
+    gone = [
+        {
+            "file": each.file,
+            "from": iso(each.begin_ns),
+            "to": iso(each.end_ns),
+            "messages": each.messages,
+            "pinned": each.pinned,
+        }
+        for each in sorted(segments, key=lambda each: each.file)
+    ]
+    try:
+        session_dir.add_gone(session, gone)
+    except OSError as error:
+        if not session_dir.is_full(error):
+            raise
+        (session / str(gone[0]["file"])).unlink(missing_ok=True)  # makes room for the list
+        session_dir.add_gone(session, gone)
+    for each in gone:
+        (session / str(each["file"])).unlink(missing_ok=True)
+
+
+def _list_removed(session: Path, info: SessionInfo, segments: Iterable[StoredSegment]) -> None:
+    """Add a session to the list of those that are removed. Raises OSError."""
+    gone = session_dir.gone_of(info)
+    times = [(each["from"], each["to"]) for each in gone] + [
+        (iso(each.begin_ns), iso(each.end_ns)) for each in segments
+    ]
+    entry = {
+        "session": session.name,
+        "fleet": info.fleet,
+        "from": min((begin for begin, _ in times), default=info.started),
+        "to": max((end for _, end in times), default=info.started),
+        "messages": info.messages,
+        "pins": len(info.pins),
+        "removed": iso(int(datetime.now(UTC).timestamp() * 1e9)),
+    }
+    place = session.parent
+    listed = [*session_dir.removed_sessions(place), entry]
+    session_dir.replace(place / session_dir.REMOVED_FILE, {"sessions": listed[-MAX_REMOVED:]})
 
 
 def _remove(session: Path) -> None:
@@ -89,12 +234,13 @@ def _size(session: Path) -> int:
     return found
 
 
-def _may_go(session: Path) -> bool:
-    description = SessionInfo.read(session)
-    if description is None or description.kept:
+def _may_go(session: Path, description: SessionInfo) -> bool:
+    if description.kept:
         return False
     try:
-        newest = max((each.stat().st_mtime for each in session.iterdir() if not each.name.startswith(".")), default=0.0)
+        # Not session.json if there is a segment: the quota itself writes it.
+        files = [*session.glob(session_dir.SEGMENTS)] or [session / SESSION_FILE]
+        newest = max(each.stat().st_mtime for each in files)
     except OSError:
         return False
     return description.closed or time.time() - newest > _UNCLOSED_IN_USE_S

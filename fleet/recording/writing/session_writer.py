@@ -16,6 +16,7 @@ from typing import Any, Final
 import zenoh
 
 from fleet.recording import session_dir
+from fleet.recording.pins import Pin, PinList
 from fleet.recording.sequence_tracker import SequenceTracker
 from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
@@ -92,7 +93,11 @@ class SessionWriter:
         """Losses at the end of the session because the disk was full."""
         self.warning = ""
         self.removed: list[Path] = []
-        """Old sessions removed for the quota. The recorder reports and clears them."""
+        """Old sessions removed for the quota."""
+        self.quota_news: list[str] = []
+        """What the quota took, for a person. The recorder reports and clears it."""
+        self._pins = PinList()
+        self._pins_unwritten = False
         self._index: list[dict[str, Any]] = []
         self._written = self._closed_bytes = self._buffered_bytes = 0
         self._stops = StopCount()
@@ -139,15 +144,15 @@ class SessionWriter:
         else:
             self._put(state.channel, received_ns, payload, published_ns, sequence)
 
-    def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> None:
-        """Write a backfilled publication, unless it is recorded already or older than the session."""
+    def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> bool:
+        """Write a backfilled publication. Return False if it is recorded already, or older than the session."""
         source, stamp = sample.source_info, sample.timestamp
         if source is None or stamp is None:
-            return
+            return False
         published_ns = stamp.get_time_as_ntp64().as_nanos()
         key, sequence = str(sample.key_expr), sequence_of(source)
         if published_ns < self._resume_since_ns:
-            return
+            return False
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
@@ -157,11 +162,12 @@ class SessionWriter:
             not state.tracker.add_backfilled(sender, sequence, published_ns)
             or (key, sequence, published_ns) in self._recorded
         ):
-            return
+            return False
         self._irregular_keys.add(key)
         if state.tracker.missing < missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
+        return True
 
     def _write(self, row: Row) -> None:
         self._unflushed.append(row)
@@ -220,6 +226,7 @@ class SessionWriter:
 
     def tick(self, now_ns: int) -> None:
         """Flush, roll over to the next segment if it is due, and check the disk."""
+        self._write_pins()  # before the messages: a crash then costs no pin of a message that is here
         if self.full:
             self._resume(now_ns)
             return
@@ -243,6 +250,20 @@ class SessionWriter:
         self.description.marks, self.description.kept = marks, True
         if self._made:
             self.description.write(self.path)
+
+    def pin(self, pin: Pin) -> None:
+        """Pin a time. It is in session.json after the next tick."""
+        self._pins_unwritten = self._pins.add(pin) or self._pins_unwritten
+
+    def _write_pins(self) -> None:
+        if self._pins_unwritten and self._made:
+            self._describe_pins()
+            with contextlib.suppress(OSError):  # the disk is full or failed; the status names it
+                self.description.write(self.path)
+                self._pins_unwritten = False
+
+    def _describe_pins(self) -> None:
+        self.description.pins = [pin.to_dict() for pin in self._pins.pins]
 
     def close(self, now_ns: int) -> None:
         """Write the buffer and end the session, also into the reserve of the disk.
@@ -431,8 +452,10 @@ class SessionWriter:
 
     def _check_disk(self) -> None:
         """Enforce the quota, and pause if the disk is nearly full."""
-        removed, self.warning = self._options.quota.enforce(self._root, self.path)
-        self.removed += removed
+        done = self._options.quota.enforce(self._root, self.path, self._pins.pins)
+        self.removed += done.removed
+        self.quota_news += done.news
+        self.warning = done.warning
         reserve, free = self._options.reserve, self.free_bytes
         self.warning = reserve.warning(self._root, free) or self.warning
         if why := reserve.why_broken(free):
@@ -500,6 +523,7 @@ class SessionWriter:
         description.messages, description.stops = self._written, self._stops.count
         description.drops, description.missed = dict(self.drops), self.missed
         description.recovered = dict(self.recovered)
+        self._describe_pins()
         description.write(self.path)
 
 

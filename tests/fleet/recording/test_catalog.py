@@ -20,9 +20,9 @@ from fleet import Catalog
 from fleet.commands.query import MAX_CELL
 from fleet.recording.catalog import BadQuery, QueryFailed, view_name
 from fleet.recording.reading.session import NoSession
-from fleet.recording.session_dir import SessionInfo
+from fleet.recording.session_dir import TABLES_PREFIX, SessionInfo
 from fleet.recording.tools import table_cache
-from fleet.recording.tools.table_cache import PREFIX, STALE_PART_S, is_cached, tables_of
+from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
 from fleet.recording.writing.retention import Quota
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
@@ -109,14 +109,15 @@ def test_a_quote_in_the_name_of_a_session_is_no_sql(sessions: Path) -> None:
 
 def test_tables_are_made_once_and_anew_for_a_session_that_grew(sessions: Path) -> None:
     first = tables_of(sessions / "one").directory
-    assert is_cached(sessions / "one")
+    assert first.is_dir()
     assert tables_of(sessions / "one").directory == first
     make(sessions / "more", "red", [5.0])
     shutil.copy(sessions / "more" / "0001.mcap", sessions / "one" / "0002.mcap")
-    assert not is_cached(sessions / "one")
     second = tables_of(sessions / "one").directory
     assert second != first
-    assert [each.name for each in (sessions / "one").glob(f"{PREFIX}*")] == [second.name], "the old ones are gone"
+    assert [each.name for each in (sessions / "one").glob(f"{TABLES_PREFIX}*")] == [second.name], (
+        "the old ones are gone"
+    )
     shutil.rmtree(second)
     assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE session = 'one'") == [{"n": 6}]
 
@@ -150,7 +151,7 @@ def test_two_questions_at_once_make_whole_tables(sessions: Path) -> None:
     for thread in threads:
         thread.join(timeout=60)
     assert answers == [7] * 4
-    left = [each.name for each in (sessions / "one").iterdir() if each.name.startswith(PREFIX)]
+    left = [each.name for each in (sessions / "one").iterdir() if each.name.startswith(TABLES_PREFIX)]
     assert len(left) == 1
 
 
@@ -201,7 +202,7 @@ def test_no_sessions_are_no_traceback(tmp_path: Path) -> None:
 
 def no_tables(place: Path) -> bool:
     """Return True if nothing is left of tables, whole or half made."""
-    return not [*place.rglob(f"{PREFIX}*")]
+    return not [*place.rglob(f"{TABLES_PREFIX}*")]
 
 
 def test_of_many_sessions_the_damaged_ones_are_named_and_their_intact_rest_counts(tmp_path: Path) -> None:
@@ -282,7 +283,7 @@ def test_an_interrupted_session_that_grows_while_it_is_asked(sessions: Path) -> 
     assert (before, after) == (11, 15)
     # The first two find their tables gone, and ask again.
     assert [catalog.query("FROM sensor_range").num_rows for catalog in catalogs] == [after, after]
-    assert len([*live.glob(f"{PREFIX}*")]) == 1
+    assert len([*live.glob(f"{TABLES_PREFIX}*")]) == 1
 
 
 def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
@@ -290,14 +291,14 @@ def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
     with pytest.raises(NoSession):
         tables_of(sessions / "two")
     with pytest.raises(NoSession):  # it was there a moment ago
-        table_cache._made(sessions / "two", sessions / "two" / f"{PREFIX}x")
+        table_cache._made(sessions / "two", sessions / "two" / f"{TABLES_PREFIX}x")
     assert [each.name for each in sessions.iterdir()] == ["one"]
 
 
 def test_tables_of_a_file_that_is_gone_go_too(sessions: Path) -> None:
     lone = shutil.copy(sessions / "two" / "0001.mcap", sessions / "lone.mcap")
     Catalog(sessions)
-    assert [*(sessions / ".lone.mcap").glob(f"{PREFIX}*")]
+    assert [*(sessions / ".lone.mcap").glob(f"{TABLES_PREFIX}*")]
     lone.unlink()
     Catalog(sessions)
     assert not (sessions / ".lone.mcap").exists()
@@ -307,7 +308,7 @@ def test_the_quota_deletes_a_session_in_which_a_question_makes_its_tables(
     sessions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     SessionInfo("fleet", "2026-01-01T00:00:00Z", "h", {}, closed=True).write(sessions / "two")
-    rmtree, meanwhile = shutil.rmtree, [sessions / "two" / f"{PREFIX}x.part"]
+    rmtree, meanwhile = shutil.rmtree, [sessions / "two" / f"{TABLES_PREFIX}x.part"]
 
     def and_a_question(path: Path, **more: Any) -> None:
         if not meanwhile:
@@ -319,14 +320,13 @@ def test_the_quota_deletes_a_session_in_which_a_question_makes_its_tables(
         path.rmdir()
 
     monkeypatch.setattr(shutil, "rmtree", and_a_question)
-    removed, _ = Quota(total=1).enforce(sessions, sessions / "one")
-    assert removed == [sessions / "two"]
+    assert Quota(total=1).enforce(sessions, sessions / "one").removed == [sessions / "two"]
     assert not (sessions / "two").exists()
 
 
 @pytest.mark.parametrize("age_s", [0.0, STALE_PART_S + 60])
 def test_what_a_killed_question_left_goes_when_it_is_old(sessions: Path, age_s: float) -> None:
-    part = sessions / "one" / f"{PREFIX}0123-abc.part"
+    part = sessions / "one" / f"{TABLES_PREFIX}0123-abc.part"
     part.mkdir()
     (part / "fleet.v1.Range.parquet").write_bytes(b"half")
     for each in (part / "fleet.v1.Range.parquet", part):

@@ -1,0 +1,108 @@
+"""What is pinned in a session: times that the quota takes last, each with its cause. Pure.
+
+`pin_watch.py` finds them live, `session.json` keeps them, `quota_order.py` spares them. A pin may reach beyond its
+session: what lay before it is in the one before.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any, Final, Self
+
+from fleet.recording.time_spec import iso
+from schemas.words import PinCause
+
+PIN_BEFORE_NS: Final = 30_000_000_000
+PIN_AFTER_NS: Final = 30_000_000_000
+"""Time around a stop or a mark that is pinned, ns: its minute."""
+MAX_PINS: Final = 500
+"""Maximum pins of a session: session.json has 150 bytes for each, and is written each second in which one changes.
+Beyond it pins of one cause grow together."""
+_MS_NS: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Pin:
+    """A time that is pinned. Times on the recorder's clock, ns since the epoch."""
+
+    begin_ns: int
+    end_ns: int
+    cause: str
+    """A word of PinCause, or of a newer version."""
+    words: str
+    """The condition, the first command and its sender, or the text of the mark."""
+    cars: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        times = {"from": iso(self.begin_ns), "to": iso(self.end_ns + _MS_NS - 1)}
+        return {**times, "cause": self.cause, "words": self.words, "cars": list(self.cars)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self | None:
+        """Return the pin of JSON values; None if they are none."""
+        try:
+            begin_ns, end_ns = _ns(values["from"]), _ns(values["to"])
+            cars = tuple(str(car) for car in values.get("cars", ()))
+            return cls(begin_ns, end_ns, str(values["cause"]), str(values.get("words", "")), cars)
+        except (KeyError, ValueError, TypeError, OverflowError):
+            return None
+
+
+def _ns(text: str) -> int:
+    when = datetime.fromisoformat(text)
+    return int(when.replace(microsecond=0).timestamp()) * 1_000_000_000 + when.microsecond * 1000
+
+
+def minute_of(at_ns: int, cause: PinCause, words: str, cars: Iterable[str] = ()) -> Pin:
+    """Return the pin of the minute around a moment."""
+    return Pin(at_ns - PIN_BEFORE_NS, at_ns + PIN_AFTER_NS, cause, words, tuple(cars))
+
+
+@dataclass(slots=True)
+class PinList:
+    """The pins of one session. Those of one cause that touch each other are one."""
+
+    pins: list[Pin] = field(default_factory=list)
+
+    def add(self, pin: Pin) -> bool:
+        """Add a pin. Return False if nothing changes."""
+        index = self._place_of(pin)
+        if index is None:
+            self.pins.append(pin)
+            return True
+        old = self.pins[index]
+        self.pins[index] = _merge(old, pin)
+        return self.pins[index] != old
+
+    def _place_of(self, pin: Pin) -> int | None:
+        """Return which pin grows by this one."""
+        # The newest is the likely one.
+        same = [index for index in reversed(range(len(self.pins))) if _is_of_one_cause(self.pins[index], pin)]
+        touched = (
+            index
+            for index in same
+            if self.pins[index].begin_ns <= pin.end_ns and pin.begin_ns <= self.pins[index].end_ns
+        )
+        return next(touched, same[0] if same and len(self.pins) >= MAX_PINS else None)
+
+
+def _is_of_one_cause(one: Pin, other: Pin) -> bool:
+    # The words of a stop have its sender: the first one is enough.
+    return one.cause == other.cause and (one.cause != PinCause.CONDITION or one.words == other.words)
+
+
+def _merge(old: Pin, new: Pin) -> Pin:
+    cars = old.cars if set(new.cars) <= set(old.cars) else tuple(dict.fromkeys((*old.cars, *new.cars)))
+    return replace(old, begin_ns=min(old.begin_ns, new.begin_ns), end_ns=max(old.end_ns, new.end_ns), cars=cars)
+
+
+def pins_of(pins: Iterable[Mapping[str, Any]], marks: Iterable[Mapping[str, Any]]) -> list[Pin]:
+    """Return the pins of a session and those of its marks, sorted by time. What is no pin is left out."""
+    found = [pin for values in pins if (pin := Pin.from_dict(values)) is not None]
+    for mark in marks:
+        try:
+            found.append(minute_of(_ns(mark["time"]), PinCause.MARK, str(mark.get("text", ""))))
+        except (KeyError, ValueError, TypeError, OverflowError):
+            continue
+    return sorted(found, key=lambda pin: (pin.begin_ns, pin.end_ns))

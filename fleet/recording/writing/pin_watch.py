@@ -1,0 +1,158 @@
+"""Finds what is to be pinned, in the messages as they come: conditions of the fleet file, and stops. Pure.
+
+Conditions have the meaning of `fleet find`: the same evaluator gets the same readings with their own times. A pin is
+on the recorder's clock, as its files are: so it lies around the moment at which the reading came. A backfilled
+reading came late, and its file is that of its coming: its pin lies around its own time, and lasts until it came.
+
+A STOP of all cars is one command with one id, of which each gateway tells. So it is known by its second car, or by its
+only one if there are no others.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from google.protobuf.message import DecodeError
+
+from fleet.conditions.functions import KEPT_READINGS
+from fleet.conditions.holding import Holding
+from fleet.fleetfile.fleet_file import PinRule
+from fleet.policy.car_condition import holding_of
+from fleet.policy.snapshot import topic_of, value_of
+from fleet.recording.pins import Pin, minute_of
+from fleet.recording.stop_count import MAX_RECENT_IDS
+from fleet.recording.tools.car_timeline import message_time_ns
+from fleet.recording.tools.stop_findings import failed_stop_code
+from schemas import keys, messages
+from schemas.commands import STOPPING_VERBS
+from schemas.messages import Observation
+from schemas.topics import TOPICS
+from schemas.words import PinCause, Verb
+
+CLOCK_STEP_NS: Final = 60_000_000_000
+"""Minimum step back of a car's times that is a step of its clock, and no delay of a network: as `fleet wait` has it."""
+_EVENTS: Final = ("event/command", "event/log")
+
+
+@dataclass(slots=True)
+class _CarConditions:
+    """The conditions over the readings of one car."""
+
+    holdings: dict[int, Holding] = field(default_factory=dict)
+    """By the number of the rule."""
+    readings: dict[str, Observation] = field(default_factory=dict)
+    """The newest by topic."""
+    times_ns: dict[str, int] = field(default_factory=dict)
+    """Their times."""
+
+
+class ConditionPins:
+    """The pins of conditions, from readings that come in the order of their times; those out of order do not count."""
+
+    def __init__(self, rules: Sequence[PinRule]) -> None:
+        self._rules: dict[str, list[tuple[int, PinRule]]] = {}
+        for number, rule in enumerate(rules):
+            for topic in dict.fromkeys(map(topic_of, rule.condition.names)):
+                self._rules.setdefault(topic, []).append((number, rule))
+        self._cars: dict[str, _CarConditions] = {}
+
+    @property
+    def topics(self) -> Collection[str]:
+        """The topics that they use."""
+        return self._rules.keys()
+
+    def add(self, car: str, topic: str, message: Any, at_ns: int, came_ns: int) -> Iterable[Pin]:
+        """Take in a reading, and yield pins. at_ns: its own time; came_ns: the recorder's time that belongs to it."""
+        state = self._cars.setdefault(car, _CarConditions())
+        newest_ns = state.times_ns.get(topic, at_ns)
+        if at_ns < newest_ns - CLOCK_STEP_NS:
+            state = self._cars[car] = _CarConditions()
+        elif at_ns < newest_ns:
+            return
+        before = state.readings.get(topic)
+        earlier = () if before is None else (*before.earlier, replace(before, earlier=()))
+        seen = Observation(message, at_ns / 1e9, earlier[1 - KEPT_READINGS :])
+        state.readings[topic], state.times_ns[topic] = seen, at_ns
+        for number, rule in self._rules.get(topic, ()):
+            holding = state.holdings.get(number)
+            if holding is None:
+                holding = state.holdings[number] = holding_of(rule.condition)
+            holding.add(topic, lambda name: value_of(name, seen), at_ns)
+            if (span := holding.span) is not None:
+                begin_ns = came_ns - max(at_ns - span.begin_ns, 0) - round(rule.before_s * 1e9)
+                end_ns = came_ns + round(rule.after_s * 1e9)
+                yield Pin(begin_ns, end_ns, PinCause.CONDITION, str(rule.condition), (car,))
+
+
+class PinWatch:
+    """The pins of a recording, from its messages."""
+
+    def __init__(self, rules: Sequence[PinRule] = ()) -> None:
+        self._rules = rules
+        self._conditions = ConditionPins(rules)
+        self._late: ConditionPins | None = None
+        self._keys: dict[str, tuple[str, str] | None] = {}
+        """Car and topic of each key; None if it is of no use here."""
+        self._cars: set[str] = set()
+        self._stopped: dict[str, set[str]] = {}
+        """The cars that each stop has reached, by its id."""
+
+    def is_watched(self, key: str) -> bool:
+        """Return True if messages on this key can pin anything."""
+        try:
+            return self._keys[key] is not None
+        except KeyError:
+            parsed = keys.parse(key)
+            is_of_car = parsed is not None and not parsed.car.startswith("@")
+            if parsed is not None and is_of_car:
+                self._cars.add(parsed.car)
+            wanted = parsed is not None and is_of_car and parsed.topic in (*_EVENTS, *self._conditions.topics)
+            self._keys[key] = (parsed.car, parsed.topic) if parsed is not None and wanted else None
+            return wanted
+
+    def begin_late(self) -> None:
+        """Begin a batch of backfilled messages, in the order of their times. Conditions see them without the others."""
+        self._late = ConditionPins(self._rules)
+
+    def add(self, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int) -> list[Pin]:
+        """Take in a message that came just now, and return what it pins."""
+        return self._add(self._conditions, key, encoding, payload, published_ns, came_ns)
+
+    def add_late(self, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int) -> list[Pin]:
+        """Take in a backfilled message of the batch, and return what it pins."""
+        assert self._late is not None
+        found = self._add(self._late, key, encoding, payload, published_ns, published_ns)
+        return [replace(pin, end_ns=max(pin.end_ns, came_ns)) for pin in found]
+
+    def _add(
+        self, conditions: ConditionPins, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int
+    ) -> list[Pin]:
+        if not self.is_watched(key) or (place := self._keys[key]) is None:
+            return []
+        car, topic = place
+        if messages.name_in(encoding) != TOPICS[topic].message:
+            return []  # any program can publish there
+        try:
+            message: Any = messages.message_class(TOPICS[topic].message).FromString(payload)
+        except DecodeError:
+            return []
+        if topic in _EVENTS:
+            return [minute_of(came_ns, cause, words, cars) for cause, words, cars in self._stops(car, topic, message)]
+        return list(conditions.add(car, topic, message, message_time_ns(message, published_ns), came_ns))
+
+    def _stops(self, car: str, topic: str, message: Any) -> Iterable[tuple[PinCause, str, Collection[str]]]:
+        if failed_stop_code(topic, message):
+            words = message.message if topic == "event/log" else message.words or message.reason
+            yield PinCause.NOT_SHOWN, words, (car,)
+        if topic != "event/command" or message.verb not in STOPPING_VERBS:
+            return
+        words = f"{message.verb} by {keys.name_of(message.sender) or 'somebody'}"
+        if message.verb == Verb.ESTOP:
+            yield PinCause.ESTOP, words, (car,)
+        elif message.id:
+            reached = self._stopped.setdefault(message.id, set())
+            reached.add(car)
+            if len(self._stopped) > MAX_RECENT_IDS:
+                del self._stopped[next(iter(self._stopped))]
+            if len(reached) > 1 or reached >= self._cars:
+                yield PinCause.STOP_ALL, words, sorted(reached)
