@@ -107,6 +107,7 @@ def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_s
         cars.close()
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(240)
 def test_fleet_down_says_stopped_of_cars_that_stand(tmp_path: Path, fleet: FleetProcesses) -> None:
     modes = ["manual", "tracking", "obstacle_avoidance", "remote_control"]

@@ -18,6 +18,7 @@ from mcap.records import Metadata
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
 from fleet.recording.left_out import LeftOut, LeftOutCause
+from fleet.recording.reading.mcap_copy import SESSION_METADATA, McapCopy
 from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
@@ -37,7 +38,6 @@ from fleet.recording.tools.analysis import (
     warn_of_modes,
 )
 from fleet.recording.tools.mode_spans import MODE, ModeSpan, sensor_of, spans_without
-from fleet.recording.writing.mcap_copy import SESSION_METADATA, McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.recording import session_dir, time_spec
+from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.tables import car_of
-from fleet.recording.writing.mcap_copy import McapCopy
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
 MAX_SEGMENT_PAYLOAD_BYTES: Final = 256 << 20

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
+from fleet.recording.reading.mcap_copy import SESSION_METADATA
 from fleet.recording.session_dir import write_all
-from fleet.recording.writing.mcap_copy import SESSION_METADATA
 from schemas import messages
 
 _LOSS_METADATA: Final = "recording"

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, may_have_enum
+from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
-from fleet.recording.writing.mcap_copy import McapCopy
 
 Wanted = Callable[[str], bool]
 MAX_VARIANTS: Final = 16
