@@ -69,6 +69,7 @@ EVENTS: Final[dict[str, EventCode]] = {
         Level.WARNING, "The car has restarted. The gateway stops it first, and sets it up again."
     ),
     "moves_unasked": EventCode(Level.WARNING, "The car moves, and nobody here drives it. The gateway stops it."),
+    "other_program": EventCode(Level.WARNING, "Another program talks to the car, and can drive it."),
     "wheel_stands": EventCode(Level.WARNING, "A wheel stands in a drive. The gateway stops the car."),
     "battery_ok": EventCode(Level.INFO, "The battery is above both limits again."),
     "battery_low": EventCode(Level.WARNING, "The battery is below the first limit."),

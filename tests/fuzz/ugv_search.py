@@ -11,7 +11,7 @@ from gateway import drivers
 from gateway.control.commands import Action, ChangeSpeed, Command, Drive, EmergencyStop, Find, Resume, SetLight, Stop
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
-from gateway.control.events import CommandRecord
+from gateway.control.events import CommandRecord, LogRecord
 from gateway.drivers.waveshare.driver import ALLOWED, DRIVE, PWM
 from gateway.sim.model.factory import build_ugv
 from gateway.sim.model.ir_remote import Button
@@ -43,6 +43,7 @@ class UgvEpisode:
     faults: list[str] = field(default_factory=list)
     sent: list[tuple[float, bytes]] = field(default_factory=list)
     records: list[CommandRecord] = field(default_factory=list)
+    logs: list[LogRecord] = field(default_factory=list)
     shown: int = 0
     drives: int = 0
 
@@ -106,7 +107,11 @@ class UgvEpisode:
         self._take_records()
 
     def _take_records(self) -> None:
-        self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
+        for each in self.control.take_records():
+            if isinstance(each, CommandRecord):
+                self.records.append(each)
+            else:
+                self.logs.append(each)
 
     def _is_lost(self) -> bool:
         return self.loss > 0 and self.moments.random() < self.loss

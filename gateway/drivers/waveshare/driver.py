@@ -29,7 +29,8 @@ link is open we listen for a moment before we write, and wait for the end of a b
 nothing.
 
 *Who else drives.* The car has a web page with a known password, and takes commands by radio. Both feed the dead-man. So
-wheels that turn while our last command is a stop are noticed, named, and stopped.
+wheels that turn while our last command is a stop are noticed, named, and stopped. Without encoders nothing shows that.
+But the page asks as long as it is open, and the car prints each answer here, too: that is named on every chassis.
 """
 
 import json
@@ -114,6 +115,7 @@ _SIDES: Final[Mapping[Motion, tuple[float, float]]] = {
 """Shares of the left and the right wheel."""
 _BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]")
 """Text of the ESP32's own boot program."""
+_OWN: Final = re.compile(rb'\{"T":(1|11|13[012]|136|14[23]|900|1005)[,}]')  # a late echo, or an error of a servo
 
 
 class Setup(Enum):
@@ -155,7 +157,8 @@ class WaveshareDriver(PlainDriver):
         self._moved_at = float("-inf")
         """When the last motion was written."""
         self._named_at = float("-inf")
-        """When a motion that nobody commanded was last logged."""
+        """When a motion that nobody commanded, or another program, was last logged."""
+        self._answered_at = float("-inf")
         self._forget_car(float("-inf"))
 
     def _forget_car(self, listen_until: float) -> None:
@@ -278,12 +281,22 @@ class WaveshareDriver(PlainDriver):
 
     def _on_text(self, event: TextLine, now: float) -> None:
         if event.raw.startswith(b"{"):
-            return  # an answer to somebody else, or an error of a servo
+            self._on_answer(event, now)
+            return
         if _BOOT.search(event.raw) and self._setup is not Setup.LISTEN:
             self._on_restart("it prints the text of a boot", now)
         if self._setup is Setup.LISTEN:
             self._booting = True
             self._listen_on(now)
+
+    def _on_answer(self, event: TextLine, now: float) -> None:
+        """Name who else talks to the car: it answers what nobody here has asked."""
+        if self._setup is Setup.READY and not _OWN.match(event.raw):
+            again, self._answered_at = now < self._answered_at + UNASKED_LOG_S, now
+            if again and now >= self._named_at + UNASKED_LOG_S:
+                self._named_at = now
+                words = f"another program talks to {self._model.name}, and can drive it: is its own web page open?"
+                self._log.log(Level.WARNING, "other_program", words, now)
 
     def _on_restart(self, why: str, now: float) -> None:
         """Take the permission to drive back: a reset has forgotten the chassis, the dead-man and the stream."""
@@ -319,10 +332,9 @@ class WaveshareDriver(PlainDriver):
     def _on_nameless(self, event: Feedback, now: float) -> None:
         """Say once why a car is not driven whose feedback tells no firmware."""
         self._nameless += 1
-        if self._nameless != STANDS_REPORTS:
-            return
-        words = f"{self._model.name} is not driven: its feedback is of no known firmware: {event.raw[:120]!r}"
-        self._log.log(Level.WARNING, "platform_contradicted", words, now)
+        if self._nameless == STANDS_REPORTS:
+            words = f"{self._model.name} is not driven: its feedback is of no known firmware: {event.raw[:120]!r}"
+            self._log.log(Level.WARNING, "platform_contradicted", words, now)
 
     def _say_what_it_shows(self) -> None:
         car = self._model.name
@@ -363,8 +375,7 @@ class WaveshareDriver(PlainDriver):
         """Take measured wheel speeds: as evidence of a stop, of encoders, or of a motion that nobody commanded."""
         model = self._model
         turning = [abs(speed) >= TURNS_M_S for speed in (event.left_m_s, event.right_m_s)]
-        if any(turning):
-            model.turned_at = event.at
+        model.turned_at = event.at if any(turning) else model.turned_at
         if model.motors is Motors.ON:
             self._turned = [seen or turns for seen, turns in zip(self._turned, turning, strict=True)]
         self._check_stuck(turning, now)
@@ -563,5 +574,4 @@ class WaveshareDriver(PlainDriver):
 
 
 def _light(*, is_on: bool) -> bytes:
-    value = 255 if is_on else 0
-    return line(OUTPUTS, IO4=value, IO5=value)
+    return line(OUTPUTS, IO4=255 * is_on, IO5=255 * is_on)

@@ -33,6 +33,10 @@ MAX_DOCUMENT: Final = 256
 BATTERY_S: Final = 10.0
 PAGE_S: Final = 1.5
 """Interval at which the car's own web page drives it on, for as long as it is open."""
+PAGE_ASKS_S: Final = ((1.0, 130), (2.5, 405))
+"""Intervals of the questions that it asks meanwhile. The answers go to the UART, too."""
+PAGE_OPEN_S: Final = 10.0
+"""Time after the last press in which it is closed."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
 DEAD_DUTY: Final = 23.0
@@ -178,6 +182,7 @@ class UgvCar:
         if button is not Button.STOP:
             self._page = SIGNS[button]
         self._page_at = now
+        self._page_open = now, now + PAGE_OPEN_S
         if button is Button.STOP:
             self._obey({"T": 1, "L": 0, "R": 0})
         return True
@@ -228,6 +233,8 @@ class UgvCar:
         self._blocked_until = -inf
         self._page = None
         self._page_at = inf
+        self._page_open = (-inf, -inf)
+        """Since when the page is open, and until when."""
         self._volts: tuple[float, float] = (self._body.battery_v(now) * 1.5, now)
         self._speed_at = now
         self._odometer = [0.0, 0.0]
@@ -272,6 +279,10 @@ class UgvCar:
         if self._page is not None and now >= self._page_at:
             self._page_at = now + PAGE_S
             self._obey({"T": 1, "L": 0.3 * self._page[0], "R": 0.3 * self._page[1]})
+        since, until = self._page_open
+        for interval_s, question in PAGE_ASKS_S if now < until else ():
+            if (now - since) % interval_s < LOOP_S:
+                self._obey({"T": question})
 
     @property
     def _is_closed(self) -> bool:

@@ -118,6 +118,20 @@ def test_a_motion_that_nobody_commanded_is_stopped() -> None:
     assert episode.control.driver.model.trust.state in (CarTrust.RECOVERING, CarTrust.STOPPED)
 
 
+def test_the_open_web_page_of_a_car_without_encoders_is_named() -> None:
+    episode = ready("wave_rover")
+    episode.car.press(Button.FORWARD, episode.now)
+    episode.run(8.0)
+    assert "other_program" in [each.code for each in episode.logs]
+
+
+def test_its_own_questions_and_settings_name_no_other_program() -> None:
+    episode = ready("wave_rover")
+    episode.ask(Drive(Motion.FORWARD, 2.0))
+    episode.run(30.0)
+    assert "other_program" not in [each.code for each in episode.logs]
+
+
 def test_a_wheel_without_a_signal_ends_the_drive() -> None:
     episode = ready("ugv_rover", options=frozenset({"no_encoder"}))
     episode.ask(Drive(Motion.FORWARD, 5.0))
