@@ -119,7 +119,7 @@ _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (whe
 
 _EXTRAS: Final = {
     **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
-    **dict.fromkeys(("duckdb", "pyarrow", "pandas", "matplotlib"), "analysis"),
+    **dict.fromkeys(("duckdb", "pyarrow", "pandas", "matplotlib", "rosbags"), "analysis"),
     **dict.fromkeys(("starlette", "uvicorn", "cryptography", "segno", "ifaddr"), "console"),
     "bleak": "ble",
 }
