@@ -3,6 +3,7 @@
 Once with all tables made, once after those of one session in a hundred are gone.
 """
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,34 +14,40 @@ import duckdb
 from mcap.writer import Writer
 
 from fleet import Catalog
+from fleet.recording.tools.table_cache import tables_of
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import Made, drive_about
 
-SESSIONS = 200
-ROWS = 2_000
-"""Distances of a session: half an hour at one a second."""
+SESSIONS = 1000
+ROWS = 10_000
+"""Distances of a session: nearly three hours at one a second."""
+FRAMES = 90_000
+"""Frames of a session, which the question does not look at. So all sessions have 10^8 rows."""
 DIFFERENT = 10
-"""Sessions that are written. The others are copies under other names: only their number matters to a question."""
+"""Sessions that are written. The others are hard links under other names: only their number matters to a question."""
 QUESTION = "SELECT session, car, count(*) n, min(range_m) nearest FROM {} WHERE range_m < 0.5 GROUP BY ALL"
 MAX_AFTER_LOSS_S = 20.0
 """Goal of issue 32."""
 
 
-def _sessions(place: Path, count: int, rows: int) -> None:
-    """Write sessions with every topic of a car, and one that has many rows."""
+def _sessions(place: Path, count: int, rows: int, frames: int) -> None:
+    """Write sessions with every topic of a car, and make their tables."""
     for number in range(count):
         session = place / f"s{number:04d}"
         if number >= DIFFERENT:
-            shutil.copytree(place / f"s{number % DIFFERENT:04d}", session)
+            shutil.copytree(place / f"s{number % DIFFERENT:04d}", session, copy_function=os.link)
             continue
         session.mkdir(parents=True)
         made = Made(session / "0001.mcap", Writer)
         drive_about(made, "red", number, 5)
         for row in range(rows):
             made.put("fleet/blue/sensor/range", pb.Range(range_m=(row * (number + 7)) % 100 / 50), 10 + row)
+        for row in range(frames):
+            made.put("fleet/blue/frame/rx", pb.RxFrame(data=b"$4WD,CSB120,PV8.3#", verdict="sensors"), 10 + row / 9)
         made.close()
+        tables_of(session)
 
 
 def _timed(ask: Callable[[], int], expected: int) -> float:
@@ -73,7 +80,7 @@ def run(scale: Scale) -> list[Measured]:
     with scratch() as directory:
         place = directory / "sessions"
         count = scale.count(SESSIONS, least=DIFFERENT)
-        _sessions(place, count, scale.count(ROWS, least=100))
+        _sessions(place, count, scale.count(ROWS, least=100), scale.count(FRAMES))
         expected = _ours(place)
 
         def ours_after_loss() -> float:

@@ -7,6 +7,7 @@ deletes it loses nothing but time. A table whose columns are not those of this v
 """
 
 import errno
+import fnmatch
 import hashlib
 import os
 import re
@@ -158,14 +159,15 @@ def _drop_others(place: Path) -> None:
             shutil.rmtree(other, ignore_errors=True)
 
 
-def _places(session: Path) -> tuple[Path, Path]:
-    """Return where the tables may be: in the session, or for a folder that is read-only among temporary files."""
+def _places(session: Path) -> Iterator[Path]:
+    """Yield where the tables may be: in the session, or for a folder that is read-only among temporary files."""
     name = f"{TABLES_PREFIX}{_digest(session)}"
     home = session if session.is_dir() else session.parent / f".{session.name}"
+    yield home / name
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
     # Each user has a directory: another one's cannot be written.
     user = f"zenoh-car-fleet-tables-{os.getuid() if hasattr(os, 'getuid') else 0}"
-    return home / name, Path(tempfile.gettempdir()) / user / owner / session.name / name
+    yield Path(tempfile.gettempdir()) / user / owner / session.name / name
 
 
 @cache
@@ -174,11 +176,14 @@ def _layouts_text() -> str:
 
 
 def _digest(session: Path) -> str:
-    files = sorted(session.glob(SEGMENTS)) if session.is_dir() else [session]
     # Where a version names a column differently, all are made anew.
     facts = [_FORMAT, _layouts_text()]
-    for each in files:
+    # A question looks at a thousand sessions: os.stat takes a third of the time of Path.glob and Path.stat.
+    directory, names = os.fspath(session.parent), [session.name]
+    with suppress(NotADirectoryError, FileNotFoundError):
+        directory, names = os.fspath(session), fnmatch.filter(os.listdir(session), SEGMENTS)  # noqa: PTH208
+    for name in sorted(names):
         with suppress(FileNotFoundError):  # the quota deletes it meanwhile
-            state = each.stat()
-            facts.append(f"{each.name} {state.st_size} {state.st_mtime_ns}")
+            state = os.stat(f"{directory}{os.sep}{name}")  # noqa: PTH116
+            facts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
