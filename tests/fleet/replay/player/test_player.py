@@ -1,6 +1,7 @@
 """Replays a session to the bus: under another name, byte for byte, on time, and without taking commands."""
 
 import json
+import random
 import signal
 from collections.abc import Iterator
 from itertools import pairwise
@@ -12,7 +13,12 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.writer import Writer
 
+from fleet.client.condition import KeyCondition
+from fleet.client.reading import Reading
+from fleet.client.wait import ConditionWait
+from fleet.policy.car_condition import parse_condition
 from fleet.recording.reading.session import Recorded, Session
+from fleet.recording.tools.find import find_in
 from fleet.replay.player.player import Player
 from fleet.replay.player.schedule import Schedule
 from schemas import bus
@@ -105,6 +111,37 @@ def test_all_of_it_comes_again_as_it_was(fleet: FleetProcesses, session: Path) -
     assert max((put_last - at) - (due_last - due) for due, at in early) > -0.05 * S
     assert lines[0].startswith("made as fleet again at tcp/127.0.0.1:")
     assert lines[0].endswith("3 times as fast: blue, green, red; Ctrl-C ends")
+
+
+@pytest.mark.parametrize(("seed", "for_s"), [(1, 0.0), (2, 2.0), (3, 5.0)])
+def test_who_watches_it_sees_the_hits_that_find_finds(
+    seed: int, for_s: float, fleet: FleetProcesses, tmp_path: Path
+) -> None:
+    chance, at_s = random.Random(seed), 0.0
+    made = Made(tmp_path / "made.mcap", InOrder)
+    for _ in range(60):
+        at_s += chance.choice([0.1, 0.5, 1.0, 1.0, 2.9, 3.1])
+        reading = chance.choice([pb.Range(range_m=0.1)] * 6 + [pb.Range(range_m=0.5), pb.Range(no_echo=True)])
+        made.put("fleet/red/sensor/range", reading, at_s)
+    made.close()
+    condition, key = "range_m < 0.3", "again/red/sensor/range"
+    wait, came, ended = ConditionWait(KeyCondition.of(condition, key), for_s), 0, []
+
+    def on_sample(sample: bus.Sample) -> None:
+        nonlocal came
+        came += 1
+        reading = Reading.of(key, sample.message(), sample.time_ns)
+        if wait.ends(reading, reading.time):
+            ended.append(reading.time.timestamp())
+
+    fleet.bus.subscribe(key, on_sample)
+    assert play(fleet, tmp_path / "made.mcap", "--as", "again", "--rate", "200").wait() == 0
+    wait_for(lambda: came == 60, "all has come")
+    hits = find_in(Session(tmp_path / "made.mcap"), parse_condition(condition), ["red"], for_s)
+    assert hits
+    spans = [(hit.begin_ns / S + for_s, hit.end_ns / S) for hit in hits]
+    assert all(any(begin - 1e-3 <= at <= end + 1e-3 for begin, end in spans) for at in ended)
+    assert all(any(begin - 1e-3 <= at <= end + 1e-3 for at in ended) for begin, end in spans)
 
 
 def test_it_looks_like_a_fleet_and_takes_no_command(fleet: FleetProcesses, session: Path) -> None:
