@@ -75,8 +75,8 @@ _ROWS: Final = (
     CommandType(Verb.LEASE, "reserve the car for a moment, or release it", "done"),
     CommandType(
         Verb.FIND,
-        "blink and beep, without moving: shows which car is which",
-        "blinks and beeps sent",
+        "blink, and beep if the car can, without moving: shows which car is which",
+        "blinking sent",
         subcommand="identify",
         section="Drive",
     ),

@@ -249,5 +249,5 @@ class CarCommands(ABC, Generic[R]):
         return self.do(end_loan_request())
 
     def find(self) -> R:
-        """Blink and beep, without moving."""
+        """Blink, and beep if the car can, without moving."""
         return self.do(plain_request(Verb.FIND))

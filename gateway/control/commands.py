@@ -150,7 +150,7 @@ class TakeLease:
 
 @dataclass(frozen=True, slots=True)
 class Find:
-    """Make the car blink and beep, without moving it."""
+    """Make the car blink, and beep if it can, without moving it."""
 
 
 Action = (
