@@ -151,10 +151,15 @@ def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
     tile = page.locator("[data-car=red]")
     expect(tile).to_contain_text("standing")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
-    expect(tile).to_contain_text("↑ forward")
+    expect(tile).to_contain_text("forward · mia")
+    expect(tile).to_have_attribute("data-direction", "forward")
+    playing = "document.getAnimations().map((each) => [each.animationName, each.effect.target.textContent])"
+    assert page.evaluate(playing) == [["up", "↑"]]
+    page.emulate_media(reduced_motion="reduce")
+    assert page.evaluate(playing) == []
     expect(page.locator("[data-summary]")).to_contain_text("1 moving")
     stage.person.stop(["red"])
-    expect(tile).not_to_contain_text("forward")
+    expect(tile).to_have_attribute("data-direction", "none")
     stage.stands()
 
 
