@@ -175,19 +175,19 @@ function Selection({ cars }) {
 
 // What a driver looks at while the thumb is on the pad.
 const FULL_BAR_M = 2; // what the bar of the distance can show
-const Distance = ({ range_m }) => html`<span class="gauge"><span class="dim">${t.distance}</span> <b>${
+const Distance = ({ range_m }) => html`<span class="gauge"><span class="dim">${t.distance}</span> <strong>${
   range_m === undefined ? t.noReading : range_m === null ? t.noEcho : t.metres(range_m)
-}</b><span class="bar wide-bar" aria-hidden="true"><span style=${{ transform: `scaleX(${Math.min(1, (range_m ?? 0) / FULL_BAR_M)})` }}></span></span></span>`;
+}</strong><span class="bar wide-bar" aria-hidden="true"><span style=${{ transform: `scaleX(${Math.min(1, (range_m ?? 0) / FULL_BAR_M)})` }}></span></span></span>`;
 
-const Lights = ({ values }) => html`<span class="lights" aria-hidden="true">${values.map((on) => html`<i class=${on ? "on" : ""}></i>`)}</span>`;
+const Lights = ({ values }) => html`<span class="lights" aria-hidden="true">${values.map((on) => html`<span class=${on ? "on" : ""}></span>`)}</span>`;
 // Lights in the order of the sensors, and their words: unseen ones where the lights say enough.
 const Sides = ({ name, values, words, isAlarm, unseen }) => html`<span class=${isAlarm && values?.some(Boolean) ? "gauge bad" : "gauge"}
-  ><span class="dim">${name}</span> ${values ? html`<${Lights} values=${values} /> <b class=${unseen ? "unseen" : ""}>${words(values)}</b>` : html`<b>${t.noReading}</b>`}</span>`;
+  ><span class="dim">${name}</span> ${values ? html`<${Lights} values=${values} /> <strong class=${unseen ? "unseen" : ""}>${words(values)}</strong>` : html`<strong>${t.noReading}</strong>`}</span>`;
 const named = (names, values) => names.filter((_, at) => values[at]);
 
 const Live = ({ cars }) => html`<section class="live" aria-label=${t.live}>
   <p class="gauge delay"><span class="dim">${t.delay}</span>${" "}
-    <b data-delay=${delay_ms} class=${delay_ms !== null && delay_ms > LONG_DELAY_MS ? "bad" : ""}>${delay_ms === null ? t.noReading : t.delayOf(delay_ms)}</b></p>
+    <strong data-delay=${delay_ms} class=${delay_ms !== null && delay_ms > LONG_DELAY_MS ? "bad" : ""}>${delay_ms === null ? t.noReading : t.delayOf(delay_ms)}</strong></p>
   <ul class="plain">
     ${cars.map(
       (car) => html`<li key=${car.name} class="car" data-live=${car.name} style=${{ "--car": car.color }}>
