@@ -1,6 +1,8 @@
 """Queries the supervisor of a fleet for its status."""
 
+from collections.abc import Sequence
 from contextlib import suppress
+from itertools import islice
 from typing import Any, Final
 
 from schemas import keys, topics
@@ -9,6 +11,8 @@ from schemas.colors import Rgb, parse_color
 from schemas.topics import Qos
 
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
+MAX_GROUPS: Final = 64
+"""Maximum number of groups that are taken from a status: anybody may publish one."""
 COLORS_TIMEOUT_S: Final = 0.5
 """Timeout for the colors of the cars: a supervisor that hangs must not delay a table."""
 
@@ -30,10 +34,14 @@ def fleets_on(bus: Bus) -> dict[str, set[str]]:
     return found
 
 
+def ask_cars(bus: Bus, fleet: str) -> list[Any]:
+    """Return the statuses as `ask_status` does, for the colors and groups of the cars: it waits for a short time."""
+    return ask_status(bus, fleet, COLORS_TIMEOUT_S)
+
+
 def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
     """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
-    answers = ask_status(bus, fleet, COLORS_TIMEOUT_S)
-    return {car: color for status in answers for car, color in colors_of(status).items()}
+    return {car: color for status in ask_cars(bus, fleet) for car, color in colors_of(status).items()}
 
 
 def colors_of(status: Any) -> dict[str, Rgb]:
@@ -43,3 +51,9 @@ def colors_of(status: Any) -> dict[str, Rgb]:
         with suppress(ValueError):  # anybody may answer
             colors[car] = parse_color(color)
     return colors
+
+
+def groups_of(status: Any) -> dict[str, Sequence[str]]:
+    """Return the cars of each group in a fleet.v1.Supervision, by name. Skip what is no name."""
+    named = sorted(name for name in status.groups if keys.is_name(name))
+    return {name: [*filter(keys.is_name, status.groups[name].split(","))] for name in islice(named, MAX_GROUPS)}

@@ -14,7 +14,7 @@ from click.shell_completion import CompletionItem
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.lost_hub import describe_running
-from fleet.client.supervision import ask_status, fleets_on
+from fleet.client.supervision import ask_status, fleets_on, groups_of
 from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
 from fleet.recording.time_spec import ago_s
 from schemas import keys
@@ -301,7 +301,7 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
 
 def _groups_of_status(status: Iterable[Any]) -> Mapping[str, Sequence[str]]:
     """Return the groups that supervisors name."""
-    return {name: [car for car in cars.split(",") if car] for each in status for name, cars in each.groups.items()}
+    return {name: cars for each in status for name, cars in groups_of(each).items()}
 
 
 def _groups_of_file() -> Mapping[str, Sequence[str]]:

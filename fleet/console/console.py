@@ -16,7 +16,7 @@ from fleet.client.client import default_sender
 from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, estop_request, pause_request, plain_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
-from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
+from fleet.client.supervision import SUPERVISOR_STATUS, ask_cars, colors_of, groups_of
 from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
@@ -82,6 +82,8 @@ class Console:
         self._view = FleetView(self._color_of)
         self._colors: Mapping[str, Rgb] = {}
         """The colors of the cars, as the running fleet says. `fleet reload` changes them."""
+        self.groups: Mapping[str, Sequence[str]] = {}
+        """The cars of each group, as the running fleet says."""
         self._unrecorded = ""
         """Why not everything is recorded, as the running fleet says."""
         self._said_left_out = False
@@ -112,6 +114,8 @@ class Console:
             "echo": self._on_echo,
             "press": self._on_press,
             "release": self._on_release,
+            # A page asks so how long its messages take.
+            "ping": lambda page, message: page.answer(t="pong", id=message.number("id")),
             Verb.STOP: lambda page, message: self.stop_all(message.text("id"), page.operator),
             Verb.ESTOP: self._on_estop,
             Verb.PAUSE: self._on_pause,
@@ -129,8 +133,8 @@ class Console:
         """Serve the pages until the task is cancelled."""
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
         # Before any message comes: a car keeps the color that it has first.
-        self._colors = await self._fleet.call(ask_colors, bus, name)
-        self._view.list_cars(self._colors)
+        for status in await self._fleet.call(ask_cars, bus, name):
+            self._take_fleet(status)
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
@@ -147,7 +151,12 @@ class Console:
         if (found := message_in(sample, logging.WARNING)) is None:
             return
         self._unrecorded = found[1].unrecorded
-        if colors := colors_of(found[1]):
+        self._take_fleet(found[1])
+
+    def _take_fleet(self, status: Any) -> None:
+        """Take the cars with their colors, and the groups, of a fleet.v1.Supervision."""
+        self.groups = groups_of(status)
+        if colors := colors_of(status):
             self._colors = colors
             self._view.list_cars(colors)
             self._view.update_colors()
@@ -200,6 +209,7 @@ class Console:
         }
         for page in self._pages.values():
             page.show_new("rights", rights[page.operator.sender])
+            page.show_new("groups", {"groups": self.groups})
         for press in self._presses.alive:
             page = self._pages[press.client]
             refused = rights[page.operator.sender]["cars"]

@@ -28,12 +28,20 @@ def management_refusal(cars: Mapping[str, Authority], sender: str) -> str:
 
 
 def rights_of(sender: str, cars: Mapping[str, Authority]) -> dict[str, Any]:
-    """Return the words of what is refused to this sender, by car and action, and for the whole fleet."""
+    """Return the words of what is refused to this sender, by car and action, and for the whole fleet.
+
+    `mine` are the cars that the people of the fleet and loans give to this sender, whatever else refuses now.
+    """
     by_car = {car: _cached(car, authority, sender) for car, authority in cars.items()}
     fleet = {str(right): next(_common(by_car, right), "") for right in (Right.PAUSE, Right.UNPAUSE)}
     fleet["manage"] = management_refusal(cars, sender)
     leads = any(person_of(sender) in each.people.leads for each in cars.values())
-    return {"cars": by_car, **fleet, "lead": leads}
+    mine = [car for car, authority in cars.items() if _is_mine(authority, sender)]
+    return {"cars": by_car, **fleet, "lead": leads, "mine": mine}
+
+
+def _is_mine(authority: Authority, sender: str) -> bool:
+    return authority.may_drive(authority.people.ranked(Sender(sender, Rank.PERSON))) is None
 
 
 def _common(by_car: Mapping[str, Mapping[Right, str]], right: Right) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """Where things are on the pages, in a real browser: a pad in reach, tiles that stay, and a small first load."""
 
 import re
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,7 +9,9 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from fleet.client.client import Fleet as Client
+from fleet.client.supervision import SUPERVISOR_STATUS
 from schemas import keys
+from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage
 from tests.support.processes import PATIENCE_S
 
@@ -17,11 +20,16 @@ pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
 TOUCH: dict[str, Any] = {"has_touch": True, "is_mobile": True}
 PORTRAIT: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, **TOUCH}
 LANDSCAPE: dict[str, Any] = {"viewport": {"width": 844, "height": 390}, **TOUCH}
+TABLET: dict[str, Any] = {"viewport": {"width": 820, "height": 1180}, **TOUCH}
 LAPTOP: dict[str, Any] = {"viewport": {"width": 1366, "height": 768}}
 MANY = 20
 """A class: two pupils a car."""
 MAX_FIRST_LOAD = 150_000
 """Maximum size of the first load as it is sent, bytes."""
+TOUCH_PX = 44
+"""Minimum height of what a finger presses (WCAG 2.5.5)."""
+MIN_CONTRAST = 3.0
+"""Minimum contrast of a mark to what is around it (WCAG 1.4.11)."""
 MIN_PAD_SHARE = 1 / 3
 """Minimum share of the screen for the pad of a phone that is held across."""
 
@@ -146,15 +154,142 @@ def test_no_tile_moves_when_a_car_gets_into_trouble(stage: ConsoleStage, held: d
     assert boxes(tiles) == before
 
 
+def test_no_tile_moves_when_cars_come(stage: ConsoleStage) -> None:
+    page = stage.page()
+    tiles = page.locator("[data-car]")
+    expect(tiles).to_have_count(len(CARS))
+    before = boxes(tiles)
+    tokens = [stage.fleet.bus.token(keys.car_token("fleet", name)) for name in ("aaa", "middle")]
+    try:
+        expect(tiles).to_have_count(len(CARS) + 2)
+        assert {car: box for car, box in boxes(tiles).items() if car in CARS} == before
+        page.locator("nav a", has_text="Drive").click()
+        chips = page.locator(".car-chip input").evaluate_all("(all) => all.map((each) => each.name)")
+        assert chips == [f"select-{car}" for car in (*sorted(CARS), "aaa", "middle")]
+    finally:
+        for token in tokens:
+            token.undeclare()  # type: ignore[no-untyped-call]
+        stage.console.process.kill()
+        stage.console.process.wait()
+        stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)  # this one has not known them
+
+
+@pytest.fixture
+def grouped(stage: ConsoleStage) -> Iterator[ConsoleStage]:
+    """Say what a supervisor says of groups, until the pages know it."""
+    status = pb.Supervision(groups={"left": "red,blue,nobody", "right": "green", "gone": "nobody"})
+    publisher = stage.fleet.bus.publisher("fleet/@supervisor/status", SUPERVISOR_STATUS, keys.SUPERVISOR)
+    publisher.put(status, time.time_ns())
+    yield stage
+    publisher.put(pb.Supervision(), time.time_ns())
+
+
+def test_fleet_shows_a_group_and_drive_chooses_one(grouped: ConsoleStage) -> None:
+    page = grouped.page()
+    sets = page.locator("[data-set]")
+    expect(sets).to_have_text([re.compile(words) for words in (r"All\s*3", r"@left\s*2", r"@right\s*1")])
+    page.locator("[data-set='@right']").click()
+    expect(page.locator("[data-car]")).to_have_count(1)
+    expect(page.locator("[data-summary]")).to_contain_text("3 cars")
+    grouped.person.car("red").estop("smoke").check()
+    page.locator("[data-trouble=red]").click()  # of a car that the group hides
+    expect(page.locator("[data-details=red]")).to_be_visible()
+    expect(page.locator("[data-car]")).to_have_count(len(CARS))
+    page.locator("nav a", has_text="Drive").click()
+    page.locator("[data-set='@left']").click()
+    expect(page.locator(".car-chip.chosen")).to_have_text([re.compile("blue"), re.compile("red")])
+    expect(page.locator("[data-live]")).to_have_count(2)
+    page.locator("[data-set='@left']").click()
+    expect(page.locator(".car-chip.chosen")).to_have_count(0)
+
+
+def test_drive_says_how_long_a_message_takes(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red", wired=True)
+    delay = page.locator("[data-delay]")
+    expect(delay).to_have_text(re.compile(r"\d+ ms"))
+    expect(delay).not_to_have_class("bad")
+    stage.wire.cut()
+    try:
+        expect(delay).to_have_class("bad")
+    finally:
+        stage.wire.mend()
+    expect(delay).not_to_have_class("bad")
+
+
+def test_each_page_is_two_presses_away_on_a_phone(stage: ConsoleStage) -> None:
+    names = stage.page().locator("nav a").all_inner_texts()
+    page = stage.page(**PORTRAIT)
+    assert is_in_reach(page, "nav a")
+    shown = page.locator("nav a").all_inner_texts()
+    page.locator("nav a").last.click()
+    assert [*shown[:-1], *(name.strip() for name in page.locator("main li a").all_inner_texts())] == names
+    page.locator("main li a").last.click()
+    page.locator("main h1", has_text="Set up").wait_for()
+    assert page.locator("nav a[aria-current]").all_inner_texts() == [shown[-1]]
+
+
+@pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE, TABLET, LAPTOP], ids=["phone", "across", "tablet", "laptop"])
+def test_nothing_is_wider_than_the_screen_and_all_that_is_pressed_is_large(
+    many: ConsoleStage, held: dict[str, Any]
+) -> None:
+    page = many.page(**held)
+    controls = "main button, main select, main input:not([type=checkbox]), main summary, nav a, .stopbar button"
+    small = "(all) => all.map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect().height])"
+    page.locator("[data-car=red]").wait_for()
+    for path in ("#/", "#/drive"):
+        page.goto(f"{many.console.address}/{path}")
+        if path == "#/drive":
+            page.locator("input[name=select-red]").check()
+            page.locator("[data-mode=manual]").wait_for()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert page.evaluate("document.querySelector('main').scrollWidth <= document.querySelector('main').clientWidth")
+        assert [each for each in page.locator(controls).evaluate_all(small) if 0 < each[1] < TOUCH_PX] == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_white_and_a_black_car_are_seen(stage: ConsoleStage, scheme: str) -> None:
+    page = stage.page(**LAPTOP, color_scheme=scheme)
+    tile = page.locator("[data-car=red]")
+    for color in ("#ffffff", "#000000"):
+        tile.evaluate("(tile, color) => tile.style.setProperty('--car', color)", color)
+        edge, ground = tile.evaluate(
+            "(tile) => [getComputedStyle(tile, '::before').borderLeftColor, getComputedStyle(tile).backgroundColor]"
+        )
+        mark = (255,) * 3 if color == "#ffffff" else (0,) * 3
+        assert max(contrast(rgb(edge), rgb(ground)), contrast(mark, rgb(ground))) >= MIN_CONTRAST
+        assert contrast(rgb(edge), mark) >= MIN_CONTRAST or contrast(mark, rgb(ground)) >= MIN_CONTRAST
+
+
+def rgb(text: str) -> tuple[int, ...]:
+    """Return the parts of a color as the browser writes it."""
+    return tuple(int(each) for each in re.findall(r"\d+", text)[:3])
+
+
+def contrast(one: tuple[int, ...], other: tuple[int, ...]) -> float:
+    """Return the contrast of two colors by WCAG 2."""
+
+    def luminance(color: tuple[int, ...]) -> float:
+        parts = [part / 255 / 12.92 if part <= 10 else ((part / 255 + 0.055) / 1.055) ** 2.4 for part in color]
+        return 0.2126 * parts[0] + 0.7152 * parts[1] + 0.0722 * parts[2]
+
+    dark, light = sorted(map(luminance, (one, other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
 def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
     page = stage.page()
     tile = page.locator("[data-car=red]")
     expect(tile).to_contain_text("standing")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
-    expect(tile).to_contain_text("↑ forward")
+    expect(tile).to_contain_text("forward · mia")
+    expect(tile).to_have_attribute("data-direction", "forward")
+    playing = "document.getAnimations().map((each) => [each.animationName, each.effect.target.textContent])"
+    assert page.evaluate(playing) == [["up", "↑"]]
+    page.emulate_media(reduced_motion="reduce")
+    assert page.evaluate(playing) == []
     expect(page.locator("[data-summary]")).to_contain_text("1 moving")
     stage.person.stop(["red"])
-    expect(tile).not_to_contain_text("forward")
+    expect(tile).to_have_attribute("data-direction", "none")
     stage.stands()
 
 

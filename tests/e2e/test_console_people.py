@@ -58,7 +58,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
 
     # A group that has other cars sees why it cannot drive this one, and may stop it.
     expect(theirs.locator("[data-control=drive] .refused")).to_have_text("group_b drives other cars, not red.")
-    expect(theirs.locator("[data-do=led]")).to_be_disabled()
+    expect(theirs.locator("[data-mode], [data-do]")).to_have_count(0)
     assert theirs.locator(forward).get_attribute("aria-disabled") == "true"
     theirs.locator(forward).click(force=True)
     hold_until_driving(ours, room.judge)
@@ -67,9 +67,8 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     ours.mouse.up()
 
     # Only the lead pauses. A group that holds the button loses the car, and holding on does not bring it back.
-    ours.locator("#pause").click()
-    expect(ours.locator("[data-asking=pause] .danger")).to_be_disabled()
-    expect(ours.locator("[data-asking=pause] .refused")).to_have_text("Only a lead may (teacher).")
+    expect(ours.locator("[data-mode]").first).to_be_enabled()
+    expect(ours.locator("#pause, [data-control=lend]")).to_have_count(0)
     hold_until_driving(ours, room.judge)
     teacher.locator("#pause").click()
     teacher.locator("input[name=why]").fill("look here")
@@ -109,3 +108,34 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     expect(ours.locator("[data-control=drive] .refused")).to_have_count(0)
     hold_until_driving(ours, room.judge)
     ours.mouse.up()
+
+
+def test_a_group_has_its_own_cars_first_and_those_of_others_one_press_away(room: Room) -> None:
+    expect.set_options(timeout=PATIENCE_S * 1000)
+    _, (link,) = room.fleet.simulate("blue:arduino:tcp")
+    people = ("teacher:lead", "group_b", "group_a:other")
+    room.fleet.gateway(link, "--people-only", *(word for name in people for word in ("--person", name)), car="blue")
+    room.fleet.ready("blue")
+    ours, teacher = room.page("group_a"), room.page("teacher")
+    chips = "(all) => all.map((each) => each.name.slice(7))"
+    for page, own in ((ours, ["red"]), (teacher, ["blue", "red"])):
+        page.goto(page.url.replace("drive", ""))
+        expect(page.locator("[data-car]")).to_have_count(2)
+        page.reload()  # the place of a car that came later is behind
+        expect(page.locator("[data-car]")).to_have_count(2)
+        cars = page.locator("[data-car]").evaluate_all("(all) => all.map((each) => each.dataset.car)")
+        assert cars == (["red", "blue"] if page is ours else own)
+        page.locator("nav a", has_text="Drive").click()
+        assert page.locator(".chooser > .car-chips input").evaluate_all(chips) == own
+    expect(teacher.locator(".others")).to_have_count(0)
+    blue = ours.locator(".others input[name=select-blue]")
+    expect(blue).not_to_be_visible()
+    ours.locator(".others summary").click()
+    ours.locator("input[name=select-red]").uncheck()
+    blue.check()
+    expect(ours.locator("[data-control=drive] .refused")).to_have_text("group_a drives other cars, not blue.")
+    expect(ours.locator("[data-mode], [data-do]")).to_have_count(0)
+    ours.locator("nav a", has_text="Fleet").click()
+    ours.locator("[data-set=mine]").click()
+    expect(ours.locator("[data-car]")).to_have_count(1)
+    expect(ours.locator("[data-car=red]")).to_be_visible()

@@ -3,6 +3,7 @@
 `CONSOLE_PRESSES`, `CONSOLE_PHONE_PRESSES` and `CONSOLE_PLOT_S` make it shorter.
 """
 
+import json
 import os
 import time
 from collections import deque
@@ -26,7 +27,8 @@ from tests.support.wire_record import WireRecord
 
 pytestmark = pytest.mark.soak
 
-KINDS = ("arduino", "stm32+arm")
+# The other programs send nothing while they track.
+KINDS = ("arduino", "arduino+arm")
 CARS = [f"car{number:02d}" for number in range(20)]
 PRESSES = int(os.environ.get("CONSOLE_PRESSES", "200"))
 PHONE_PRESSES = int(os.environ.get("CONSOLE_PHONE_PRESSES", "40"))
@@ -34,6 +36,11 @@ PLOT_S = float(os.environ.get("CONSOLE_PLOT_S", "600"))
 WIRE_P95_S = 0.1
 PHONE_P99_S = 0.15
 THROTTLE = 4
+PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+SCROLLS = 5
+SCROLL_PX = 600
+MIN_FRAMES_HZ = 50
+FRAMES = ["devtools.timeline.frame", "disabled-by-default-devtools.timeline.frame"]
 MAX_SHARE = 0.3
 """Maximum share of a core for the server, with one page."""
 MAX_GROWTH_MB = 10.0
@@ -188,13 +195,14 @@ def share(values: list[float], part: float) -> float:
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
 
-def open_page(playwright: Any, twenty: TwentyCars, path: str = "") -> Page:
+def open_page(playwright: Any, twenty: TwentyCars, path: str = "", **options: Any) -> Page:
     browser = playwright.chromium.launch(executable_path=find_chromium(playwright))
-    page: Page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+    shown = options or {"viewport": {"width": 1280, "height": 900}}
+    page: Page = browser.new_context(**shown).new_page()
     page.add_init_script(NOTE_PRESS)
     page.goto(f"http://127.0.0.1:{twenty.port}/{path}")
     page.set_default_timeout(60_000)
-    page.locator("nav a[aria-current=page]").wait_for()
+    page.locator("nav a[aria-current]").wait_for()
     return page
 
 
@@ -219,13 +227,46 @@ def test_a_stop_is_at_twenty_cars_within_a_tenth_of_a_second(twenty: TwentyCars)
 def test_every_stop_of_a_slow_phone_arrives(twenty: TwentyCars) -> None:
     times = StopTimes([])
     with sync_playwright() as playwright:
-        page = open_page(playwright, twenty)
+        page = open_page(playwright, twenty, **PHONE)
         page.context.new_cdp_session(page).send("Emulation.setCPUThrottlingRate", {"rate": THROTTLE})
         for _ in range(PHONE_PRESSES):
             twenty.stop(page, times)  # waits until each car has got bytes
         twenty.wait_shown(page)
     print(f"\nslow phone, {PHONE_PRESSES} of {PHONE_PRESSES} arrived: {times}")
     assert share(times.free, 0.99) <= PHONE_P99_S
+
+
+def frames_of(trace: bytes) -> list[float]:
+    """Return the times at which the browser drew a frame of the page, s, by its own trace."""
+    events = json.loads(trace)["traceEvents"]
+    return sorted(each["ts"] / 1e6 for each in events if each["name"] == "DrawFrame")
+
+
+def test_twenty_moving_cars_scroll_smoothly_on_a_slow_phone(twenty: TwentyCars) -> None:
+    twenty.track()
+    rates = []
+    with sync_playwright() as playwright:
+        page = open_page(playwright, twenty, **PHONE)
+        page.locator("[data-car]").nth(len(CARS) - 1).wait_for()
+        page.locator(".tile.moving").nth(len(CARS) // 2).wait_for()
+        devtools, browser = page.context.new_cdp_session(page), page.context.browser
+        assert browser is not None
+        devtools.send("Emulation.setCPUThrottlingRate", {"rate": THROTTLE})
+        tiles, way = page.locator(".tiles"), {"x": 195, "y": 500, "speed": 600, "gestureSourceType": "mouse"}
+
+        def scroll(distance: int) -> bool:
+            before = tiles.evaluate("(tiles) => tiles.scrollTop")
+            devtools.send("Input.synthesizeScrollGesture", way | {"yDistance": -distance})
+            return bool(tiles.evaluate("(tiles) => tiles.scrollTop") == before + distance)
+
+        wait_for(lambda: scroll(SCROLL_PX), "the new page scrolls")
+        for number in range(SCROLLS):
+            browser.start_tracing(page=page, categories=FRAMES)
+            assert scroll(SCROLL_PX if number % 2 else -SCROLL_PX)
+            frames = frames_of(browser.stop_tracing())
+            rates.append((len(frames) - 1) / (frames[-1] - frames[0]))
+    print(f"\nscrolling twenty cars at throttle {THROTTLE}: {', '.join(f'{each:.0f}' for each in rates)} frames/s")
+    assert sorted(rates)[len(rates) // 2] >= MIN_FRAMES_HZ
 
 
 def probe(twenty: TwentyCars) -> list[float]:

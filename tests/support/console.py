@@ -140,7 +140,7 @@ class ConsoleStage:
         page.set_default_timeout(PATIENCE_S * 1000)
         host = f"localhost:{self.console.port}" if wired else f"127.0.0.1:{self.console.port}"
         page.goto(f"http://{host}/{path}")
-        page.locator("nav a[aria-current=page]").wait_for()
+        page.locator("nav a[aria-current]").wait_for()
         page.locator(".fleet-name", has_text="fleet").wait_for()
         return page
 

@@ -1,6 +1,6 @@
 // The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
 
-import { clock, estopAll, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
+import { carsInPlace, changed, clock, estopAll, isReady, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
@@ -9,7 +9,7 @@ import { PlanPage } from "./plan-page.js";
 import { SessionsPage } from "./sessions-page.js";
 import { SetupPage } from "./setup-page.js";
 import { stopStates, t } from "./texts.js";
-import { Component, html, Refused, render, useEffect, useRef, useState, Verdict } from "./ui.js";
+import { Component, html, Icon, Refused, render, useEffect, useRef, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
@@ -39,17 +39,33 @@ function PlotsLater({ cars }) {
   return failed ? html`<h1>${t.plots}</h1><p>${t.unreachable}</p>` : html`<p>${t.loading}</p>`;
 }
 
-// Each page with the symbol of its tab.
+// Each page with the drawing of its tab.
 const PAGES = {
-  "#/": [t.fleet, FleetPage, "▦"],
-  "#/drive": [t.drive, DrivePage, "✥"],
-  "#/plan": [t.plan, PlanPage, "☰"],
-  "#/plots": [t.plots, PlotsLater, "∿"],
-  "#/inspect": [t.inspect, InspectPage, "⌕"],
-  "#/people": [t.people, PeoplePage, "☺"],
-  "#/sessions": [t.sessions, SessionsPage, "◉"],
-  "#/setup": [t.setup, SetupPage, "⚙"],
+  "#/": [t.fleet, FleetPage, "fleet"],
+  "#/drive": [t.drive, DrivePage, "drive"],
+  "#/plan": [t.plan, PlanPage, "plan"],
+  "#/plots": [t.plots, PlotsLater, "plots"],
+  "#/inspect": [t.inspect, InspectPage, "inspect"],
+  "#/people": [t.people, PeoplePage, "people"],
+  "#/sessions": [t.sessions, SessionsPage, "sessions"],
+  "#/setup": [t.setup, SetupPage, "setup"],
 };
+
+// A phone that is held upright has room for five tabs. The last one leads to the other pages.
+const narrow = matchMedia("(max-width: 34rem) and (orientation: portrait)");
+narrow.addEventListener("change", changed);
+const MORE = "#/more";
+const FIRST_TABS = 4;
+const tabs = () => {
+  const all = Object.entries(PAGES);
+  return narrow.matches ? [...all.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, "more"]]] : all;
+};
+const MorePage = () => html`<h1>${t.more}</h1>
+  <ul class="plain more">
+    ${Object.entries(PAGES).slice(FIRST_TABS).map(
+      ([to, [name, , drawing]]) => html`<li key=${to}><a class="button" href=${to}><${Icon} name=${drawing} /> ${name}</a></li>`,
+    )}
+  </ul>`;
 
 // ---------------------------------------------------------------- STOP
 
@@ -119,24 +135,25 @@ function StopBar() {
     setWhy("");
   };
   const toggle = (what) => setAsking(asking === what ? null : what);
-  const refused = store.rights.pause;
-  const forbidden = asking === "pause" && refused !== "";
-  const onWhyKey = (event) => event.key === "Enter" && !event.repeat && !event.isComposing && !forbidden && act();
+  // A pause is for leads. Until the rights are known its place stays empty: STOP must not become smaller under a finger.
+  const mayPause = store.rights === null || store.rights.pause === "";
+  const onWhyKey = (event) => event.key === "Enter" && !event.repeat && !event.isComposing && act();
   return html`<section class="stopbar" aria-label="STOP">
-    ${asking &&
+    ${asking && (mayPause || asking === "estop") &&
     html`<div class="estop" data-asking=${asking}>
       <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} onKeyDown=${onWhyKey} /></label>
-      <button class="danger" disabled=${forbidden} onClick=${act}>
+      <button class="danger" onClick=${act}>
         ${asking === "estop" ? t.estopNow : t.pauseNow}</button>
       <button onClick=${() => setAsking(null)}>${t.cancel}</button>
-      ${asking === "pause" && refused && html`<${Refused} words=${[refused]} />`}
     </div>`}
     <div class="stop-row">
       <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
-        <span aria-hidden="true">⬣</span> ${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}
+        <${Icon} name="stop" /><span>${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}</span>
       </button>
-      <button id="pause" aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>${t.pause}</button>
-      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}>${t.estop}</button>
+      ${mayPause &&
+      html`<button id="pause" class=${store.rights === null ? "later" : ""} aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>
+        <${Icon} name="pause" />${t.pause}</button>`}
+      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} name="estop" />${t.estop}</button>
     </div>
   </section>`;
 }
@@ -155,14 +172,16 @@ function Paused({ cars }) {
   </div>`;
 }
 
-// Above the content on a large screen, a tab bar at the bottom of a phone, which a finger pushes sideways.
+// Above the content on a large screen, a tab bar at the bottom of a phone.
 function Navigation({ here }) {
   const bar = useRef(null);
-  useEffect(() => bar.current.querySelector("[aria-current]").scrollIntoView({ block: "nearest", inline: "nearest" }), [here]);
+  const shown = tabs();
+  const current = shown.some(([to]) => to === here) ? here : MORE;
+  useEffect(() => bar.current.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest", inline: "nearest" }), [current]);
   return html`<nav aria-label="Pages" ref=${bar}>
-    ${Object.entries(PAGES).map(
-      ([to, [name, , symbol]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : undefined}
-        ><span class="tab-symbol" aria-hidden="true">${symbol}</span>${name}</a>`,
+    ${shown.map(
+      ([to, [name, , drawing]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : to === current ? "true" : undefined}
+        ><${Icon} name=${drawing} />${name}</a>`,
     )}
   </nav>`;
 }
@@ -174,8 +193,9 @@ class App extends Component {
   }
   render() {
     const { state } = store;
-    const here = location.hash in PAGES ? location.hash : "#/";
-    const [title, Page] = PAGES[here];
+    const asked = location.hash === MORE ? [t.more, MorePage] : PAGES[location.hash];
+    const here = asked === undefined ? "#/" : location.hash;
+    const [title, Page] = asked ?? PAGES["#/"];
     document.title = `${title} – ${t.title}`;
     return html`
       <a class="skip" href="#content" onClick=${(event) => {
@@ -184,11 +204,11 @@ class App extends Component {
       }}>${t.skip}</a>
       <${Navigation} here=${here} />
       <header class="top">
-        <span class="person">${store.hello ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
+        <span class="person">${store.hello && store.rights ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
-      <main id="content" tabindex="-1">
-        ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}
+      <main id="content" tabindex="-1" class=${here === "#/" ? "filled" : ""}>
+        ${isReady() ? html`<${Page} key=${here} cars=${carsInPlace()} />` : html`<h1>${t.title}</h1><p>${t.connecting}</p>`}
       </main>
       <div class="notices">
         ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
@@ -196,9 +216,9 @@ class App extends Component {
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
         ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
         ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
-        <${Paused} cars=${state?.cars ?? []} />
-        <${Report} report=${state?.stop ?? null} />
+        ${isReady() && html`<${Paused} cars=${state.cars} />`}
       </div>
+      <${Report} report=${state?.stop ?? null} />
       <${StopBar} />
     `;
   }

@@ -2,6 +2,7 @@
 
 import { parse, seen } from "./foreign.js";
 import { motionOf } from "./holds.js";
+import { placed } from "./places.js";
 
 const RECONNECT_MS = 500;
 const NOT_PAIRED = 4001; // the close code of a page whose device was revoked, or whose pairing has expired
@@ -28,7 +29,9 @@ function remembered() {
 const listeners = new Set();
 export const store = {
   state: null,
-  rights: { cars: {}, pause: "", unpause: "", manage: "", lead: false }, // what this person may not do: words by car and action
+  rights: null, // what this person may not do: words by car and action; `mine`: the cars of this person
+  groups: {}, // the names of cars by group
+  places: [], // the name of the car at each place
   hello: null,
   connected: false,
   lost: false,
@@ -155,10 +158,36 @@ const personOf = (sender) => seen(sender.split("@")[0] || sender);
 export const who = (sender) => (sender === store.hello?.sender ? describe.you : personOf(sender));
 
 // Why cars refuse an action of this person, each once. The gateways decide; the page says it before.
+const refusal = (action, car) => store.rights?.cars[car]?.[action];
 export function refusals(action, cars) {
-  return [...new Set(cars.map((car) => store.rights.cars[car]?.[action]).filter(Boolean))];
+  return [...new Set(cars.map((car) => refusal(action, car)).filter(Boolean))];
 }
-export const isRefused = (action, cars) => cars.length > 0 && cars.every((car) => store.rights.cars[car]?.[action]);
+export const isRefused = (action, cars) => cars.length > 0 && cars.every((car) => refusal(action, car));
+
+// The cars that the fleet file or a loan gives to this person, whatever else keeps them from driving now.
+export const isMine = (car) => store.rights.mine.includes(car);
+export const isShared = (names) => names.some(isMine) && !names.every(isMine);
+
+// Sets of cars with the names that a person gives them: all, mine, and each group. `members` may name cars that are not there.
+export function carSets(cars) {
+  const names = cars.map((car) => car.name);
+  const sets = [{ key: "all", name: describe.allCars, members: names }];
+  if (isShared(names)) sets.push({ key: "mine", name: describe.mine, members: store.rights.mine });
+  for (const [name, members] of Object.entries(store.groups)) sets.push({ key: `@${name}`, name: `@${name}`, members });
+  return sets
+    .map((set) => ({ ...set, cars: names.filter((name) => set.members.includes(name)) }))
+    .filter((set) => set.key === "all" || set.cars.length > 0);
+}
+
+// Both are there before anything is drawn: with the rights it is known whose cars come first.
+export const isReady = () => store.state !== null && store.rights !== null;
+
+// The cars in the order of their places.
+export function carsInPlace() {
+  const cars = new Map(store.state.cars.map((car) => [car.name, car]));
+  store.places = placed(store.places, [...cars.keys()], isShared([...cars.keys()]) ? isMine : () => false);
+  return store.places.filter((name) => cars.has(name)).map((name) => cars.get(name));
+}
 
 export function pauseAll(why) {
   send({ t: "pause", id: newId(), why });
@@ -244,6 +273,7 @@ export function on(kind, handler) {
 
 export function askBySocket(kind, fields) {
   send({ t: kind, id: ++requestNumber, ...fields });
+  return requestNumber;
 }
 
 // What a page wants from now on, also of a console that was started again. `end` is sent when it wants nothing more.
@@ -294,6 +324,9 @@ function onMessage(text) {
       return;
     case "rights":
       store.rights = message;
+      break;
+    case "groups":
+      store.groups = message.groups;
       break;
     case "hello":
       store.hello = message;

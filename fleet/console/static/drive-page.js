@@ -1,8 +1,10 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
-import { changed, command, isHeld, isRefused, lease, onTick, press, refusals, release, select, store, who } from "./console.js";
+import {
+  askBySocket, changed, command, isHeld, isMine, isRefused, isShared, lease, on, onTick, press, refusals, release, select, store, who,
+} from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
-import { Battery, html, Refused, Results, useEffect, useState } from "./ui.js";
+import { Battery, html, Refused, Results, SetChips, useEffect, useRef, useState } from "./ui.js";
 
 const KEYS = {
   ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
@@ -67,6 +69,34 @@ function useDriving() {
   }, []);
 }
 
+// ---------------------------------------------------------------- the delay
+
+const PING_INTERVAL_MS = 1000;
+// The console ends a press whose echo is older than 300 ms. Half of that is a connection on which a drive soon ends.
+const LONG_DELAY_MS = 150;
+let ping = null; // the one without an answer: {id, at}
+let delay_ms = null;
+on("pong", (message) => {
+  if (message.id !== ping?.id) return false;
+  delay_ms = Math.round(performance.now() - ping.at);
+  ping = null;
+});
+
+// The time of a message to the console and back. While no answer comes it grows.
+function measureDelay() {
+  if (ping === null || !store.connected) ping = { id: askBySocket("ping"), at: performance.now() };
+  else delay_ms = Math.round(performance.now() - ping.at);
+}
+
+function useDelay() {
+  useEffect(() => {
+    [ping, delay_ms] = [null, null];
+    measureDelay();
+    const timer = setInterval(measureDelay, PING_INTERVAL_MS);
+    return () => clearInterval(timer);
+  }, []);
+}
+
 // ---------------------------------------------------------------- the parts
 
 // A button that was pressed with the mouse does not get the focus: Space shall stop afterwards, not drive.
@@ -104,36 +134,72 @@ const Pad = () => html`<div class="pads">
   <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>
   <p class="hint" id="pad-hint">${t.padHint}</p>`;
 
+function choose(names) {
+  select(names);
+  release();
+  changed();
+}
+
+const Chip = ({ car }) => {
+  const chosen = store.selected.has(car.name);
+  const toggle = () => choose(chosen ? [...store.selected].filter((name) => name !== car.name) : [...store.selected, car.name]);
+  return html`<label class=${chosen ? "car-chip car chosen" : "car-chip car"} style=${{ "--car": car.color }}>
+    <input type="checkbox" name=${`select-${car.name}`} checked=${chosen} onChange=${toggle} />
+    <span aria-hidden="true">${chosen ? "✓" : "+"}</span> ${car.name}
+  </label>`;
+};
+
+// Who has cars of their own sees those; the cars of others are one press away, since nobody here drives them.
 function Selection({ cars }) {
-  const toggle = (name) => {
-    const names = new Set(store.selected);
-    if (!names.delete(name)) names.add(name);
-    select(names);
-    release();
-    changed();
-  };
-  return html`<fieldset class="selection car-chips">
-    <legend class="unseen">${t.select}</legend>
-    ${cars.map(
-      (car) => html`<label key=${car.name} class=${store.selected.has(car.name) ? "car-chip chosen" : "car-chip"} style=${{ "--car": car.color }}>
-        <input type="checkbox" name=${`select-${car.name}`} checked=${store.selected.has(car.name)} onChange=${() => toggle(car.name)} />
-        <span aria-hidden="true">${store.selected.has(car.name) ? "✓" : "+"}</span> ${car.name}
-      </label>`,
-    )}
-  </fieldset>`;
+  const chooser = useRef(null);
+  // A phone has room for a few chips: the chosen one shall be among them.
+  useEffect(() => chooser.current.querySelector(".chosen")?.scrollIntoView({ block: "nearest", inline: "center" }), []);
+  const shared = isShared(cars.map((car) => car.name));
+  const [own, others] = shared ? [cars.filter((car) => isMine(car.name)), cars.filter((car) => !isMine(car.name))] : [cars, []];
+  const chosen = names();
+  const isOn = (set) => set.cars.length === chosen.length && chosen.every((name) => set.cars.includes(name));
+  return html`<div class="chooser" ref=${chooser}>
+    <${SetChips} cars=${own} label=${t.selectSet} isOn=${isOn} onPress=${(set) => choose(isOn(set) ? [] : set.cars)} />
+    <fieldset class="car-chips">
+      <legend class="unseen">${t.select}</legend>
+      ${own.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}
+    </fieldset>
+    ${others.length > 0 &&
+    html`<details class="others" open=${others.some((car) => store.selected.has(car.name))}>
+      <summary>${t.otherCars(others.length)}</summary>
+      <fieldset class="car-chips"><legend class="unseen">${t.otherCars(others.length)}</legend>
+        ${others.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}</fieldset>
+    </details>`}
+  </div>`;
 }
 
 // What a driver looks at while the thumb is on the pad.
-const Live = ({ cars }) => html`<ul class="plain live">
-  ${cars.map(
-    (car) => html`<li key=${car.name} data-live=${car.name}>
-      <strong>${car.name}</strong>${" "}
-      <span>${t.distance} ${car.range_m === undefined ? t.noReading : car.range_m === null ? t.noEcho : `${car.range_m.toFixed(2)} m`}</span>
-      <span class=${car.obstacle?.some(Boolean) ? "bad" : ""}>${t.obstacle} ${car.obstacle ? t.seesObstacle(t.sideNames.filter((_, side) => car.obstacle[side])) : t.noReading}</span>
-      <${Battery} battery=${car.gateway ? car.battery : undefined} />
-    </li>`,
-  )}
-</ul>`;
+const FULL_BAR_M = 2; // what the bar of the distance can show
+const Distance = ({ range_m }) => html`<span class="gauge"><span class="dim">${t.distance}</span> <strong>${
+  range_m === undefined ? t.noReading : range_m === null ? t.noEcho : t.metres(range_m)
+}</strong><span class="bar wide-bar" aria-hidden="true"><span style=${{ transform: `scaleX(${Math.min(1, (range_m ?? 0) / FULL_BAR_M)})` }}></span></span></span>`;
+
+const Lights = ({ values }) => html`<span class="lights" aria-hidden="true">${values.map((on) => html`<span class=${on ? "on" : ""}></span>`)}</span>`;
+// Lights in the order of the sensors, and their words: unseen ones where the lights say enough.
+const Sides = ({ name, values, words, isAlarm, unseen }) => html`<span class=${isAlarm && values?.some(Boolean) ? "gauge bad" : "gauge"}
+  ><span class="dim">${name}</span> ${values ? html`<${Lights} values=${values} /> <strong class=${unseen ? "unseen" : ""}>${words(values)}</strong>` : html`<strong>${t.noReading}</strong>`}</span>`;
+const named = (names, values) => names.filter((_, at) => values[at]);
+
+const Live = ({ cars }) => html`<section class="live" aria-label=${t.live}>
+  <p class="gauge delay"><span class="dim">${t.delay}</span>${" "}
+    <strong data-delay=${delay_ms} class=${delay_ms !== null && delay_ms > LONG_DELAY_MS ? "bad" : ""}>${delay_ms === null ? t.noReading : t.delayOf(delay_ms)}</strong></p>
+  <ul class="plain">
+    ${cars.map(
+      (car) => html`<li key=${car.name} class="car" data-live=${car.name} style=${{ "--car": car.color }}>
+        <strong>${car.name}</strong>
+        <${Distance} range_m=${car.range_m} />
+        <${Sides} name=${t.obstacle} values=${car.obstacle} words=${(values) => t.seesObstacle(named(t.sideNames, values))} isAlarm />
+        <${Sides} name=${t.line} values=${car.line} words=${(values) => t.seesLine(named(t.lineNames, values))} unseen />
+        <span class="gauge"><span class="dim">${t.battery}</span> <${Battery} battery=${car.gateway ? car.battery : undefined} /></span>
+      </li>`,
+    )}
+  </ul>
+</section>`;
 
 const Leases = ({ cars }) => html`<section>
   <h2>${t.lease}</h2>
@@ -157,10 +223,10 @@ function Lend({ cars }) {
   const [to, setTo] = useState("");
   const [minutes, setMinutes] = useState(10);
   const chosen = people.includes(to) ? to : (people[0] ?? to);
-  const refused = isRefused("lend", names());
+  if (isRefused("lend", names())) return null; // as of a pupil
   return html`<section data-control="lend">
     <h2>${t.lend}</h2>
-    <fieldset class="bare controls" disabled=${refused}>
+    <fieldset class="bare controls">
       <label>${t.lendTo}${" "}
         ${people.length > 0
           ? html`<select name="to" value=${chosen} onChange=${(event) => setTo(event.target.value)}>
@@ -239,7 +305,7 @@ function Led() {
   </div>`;
 }
 
-const Lights = ({ cars }) => html`<div class="controls">
+const LightColors = ({ cars }) => html`<div class="controls">
   ${common(cars, "lights").map(
     (light) => html`<button key=${light} data-light=${light} onClick=${() => command("light", names(), { light })}>${light}</button>`,
   )}
@@ -294,11 +360,10 @@ const Fan = ({ cars }) => html`<button data-do="fan" onClick=${() => command("fa
 
 const Controls = ({ cars }) => html`
   <${Leases} cars=${cars} />
-  <${Lend} cars=${cars} />
   <${Offer} title=${t.mode} needs="mode" cars=${cars}><${Modes} cars=${cars} /><//>
   <${Offer} title=${t.speed} needs="speed" cars=${cars}><${Speed} cars=${cars} /><//>
   <${Offer} title=${t.led} needs="led" cars=${cars}><${Led} /><//>
-  <${Offer} title=${t.light} needs="light" cars=${cars}><${Lights} cars=${cars} /><//>
+  <${Offer} title=${t.light} needs="light" cars=${cars}><${LightColors} cars=${cars} /><//>
   <${Offer} title=${t.sounds} needs="whistle" cars=${cars}>
     <div class="controls">
       <button data-do="whistle" onClick=${() => command("whistle", names())}>${t.whistle}</button>
@@ -314,11 +379,13 @@ const Controls = ({ cars }) => html`
   <//>
   <${Offer} title=${t.arm} needs="arm" cars=${cars}><${Arm} /><//>
   <${Offer} title=${t.fan} needs="fan" cars=${cars}><${Fan} cars=${cars} /><//>
+  <${Lend} cars=${cars} />
   <${Lacking} cars=${cars} />
 `;
 
 export function DrivePage({ cars }) {
   useDriving();
+  useDelay();
   const driven = selected();
   return html`<div class="drive">
     <h1 class="unseen">${t.drive}</h1>
@@ -327,7 +394,8 @@ export function DrivePage({ cars }) {
     <${Live} cars=${driven} />
     <div class="drive-controls">
       <${Results} />
-      ${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}
+      ${driven.length === 0 && html`<p>${t.selectHint}</p>`}
+      ${driven.some((car) => isMine(car.name)) && html`<${Controls} cars=${driven} />`}
     </div>
   </div>`;
 }

@@ -3,9 +3,9 @@
 // No tile ever moves: a press must not meet another car than the one that the eye has chosen. So each tile has one
 // size whatever is in it, and what comes and goes (trouble, all about a car) has a place of its own.
 
-import { changed, clock, command, isRefused, refusals, select, store, who } from "./console.js";
-import { links, modes, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
-import { Battery, html, Memo, Refused, Results, useState, Verdict } from "./ui.js";
+import { carSets, changed, clock, command, isRefused, refusals, select, store, who } from "./console.js";
+import { arrows, links, modes, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
+import { Battery, html, Memo, Refused, Results, SetChips, useState, Verdict } from "./ui.js";
 
 export const motorName = (car) => {
   const { state, basis } = car.motors;
@@ -75,7 +75,14 @@ const Loan = ({ car }) =>
 const silence = (car) => (car.silent_s ?? 0) + store.silent_s;
 
 const isMoving = (car) => car.motors.state === "on";
-const movesAs = (car) => (isMoving(car) && car.motion.motion in motions && !["stop", "unknown"].includes(car.motion.motion) ? motions[car.motion.motion] : t.isMoving);
+
+// The direction for the eye, which moves as the car does; the word beside it is for all.
+const directionOf = (car) => (isMoving(car) ? (car.motion.motion in arrows ? car.motion.motion : "some") : "none");
+function Motion({ car }) {
+  if (!isMoving(car)) return html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`;
+  const { motion, owner } = car.motion;
+  return html`<strong>${motion in arrows ? arrows[motion][1] : t.isMoving}</strong>${owner ? ` · ${who(owner)}` : ""}`;
+}
 
 // What is wrong with a car, the worst first, each with its class and short words.
 function troublesOf(car) {
@@ -98,15 +105,23 @@ function choose(name) {
   changed();
 }
 
+let filter = "all"; // the key of the set of cars that the page shows
+function filterBy(key) {
+  filter = key;
+  changed();
+}
+
 function Tile({ car }) {
   const troubles = troublesOf(car);
-  const mark = car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : "";
-  const moving = isMoving(car);
-  return html`<button class=${`tile ${moving ? "moving" : ""} ${troubles[0]?.level ?? ""}`} style=${{ "--car": car.color }} data-car=${car.name}
-    aria-pressed=${chosen === car.name} onClick=${() => choose(car.name)}>
+  const mark =
+    car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : car.lease ? t.drivenMark(who(car.lease.holder)) : "";
+  const direction = directionOf(car);
+  return html`<button class=${`tile car ${direction === "none" ? "" : "moving"} ${troubles[0]?.level ?? ""}`} style=${{ "--car": car.color }}
+    data-car=${car.name} data-direction=${direction} aria-pressed=${chosen === car.name} onClick=${() => choose(car.name)}>
     <span class="tile-name">${car.name}</span>
-    <span class="tile-motion">${moving ? movesAs(car) : html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`}</span>
-    <span class="tile-mode">${(modes[car.mode.asked] ?? modes.unknown)[0]}<${Battery} battery=${car.battery} /></span>
+    <span class="tile-arrow" aria-hidden="true">${direction === "none" ? "" : (arrows[direction]?.[0] ?? "»")}</span>
+    <span class="tile-motion"><${Motion} car=${car} /></span>
+    <span class="tile-mode">${(modes[car.mode.asked] ?? modes.unknown)[0]}</span><${Battery} battery=${car.battery} />
     <span class="tile-trouble">
       ${troubles.length > 0
         ? html`<span class="bad" data-old=${troubles.some((each) => each.name === "old") ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>`
@@ -118,6 +133,7 @@ function Tile({ car }) {
 const TroubleStrip = ({ cars }) => {
   const troubled = cars.filter((car) => troublesOf(car).length > 0);
   const show = (name) => {
+    filter = "all"; // so that the tile is there, too
     choose(name);
     document.querySelector(`[data-car="${CSS.escape(name)}"]`)?.scrollIntoView({ block: "nearest" });
   };
@@ -136,7 +152,7 @@ function Details({ car }) {
   const silent_s = silence(car);
   const reports = car.gateway && silent_s === 0 && (car.link.state === "online" || car.link.state === "quiet");
   const missing = reports ? t.notMeasured : t.notKnown;
-  return html`<article class="card" style=${{ "--car": car.color }} aria-label=${t.details(car.name)} data-details=${car.name}>
+  return html`<article class="card car" style=${{ "--car": car.color }} aria-label=${t.details(car.name)} data-details=${car.name}>
     <header>
       <h2>${car.name}</h2>
       <span class="platform">${car.platform}</span>
@@ -201,15 +217,24 @@ export function FleetPage({ cars }) {
   const shown = cars.find((car) => car.name === chosen);
   const count = (is) => cars.filter(is).length;
   const troubled = count((car) => troublesOf(car).length > 0);
+  const set = carSets(cars).find((each) => each.key === filter && filter !== "all");
+  // A car that has gone leaves its place empty.
+  const places = set === undefined ? store.places : store.places.filter((name) => set.members.includes(name));
+  const byName = new Map(cars.map((car) => [car.name, car]));
   return html`<div class="fleet">
     <div class="summary">
       <h1>${t.fleet}</h1>
       <p data-summary>${t.summary(cars.length, count(isMoving), count((car) => car.hold !== null), troubled)}</p>
+      <${SetChips} cars=${cars} label=${t.filter} isOn=${(each) => each.key === (set?.key ?? "all")} onPress=${(each) => filterBy(each.key)} />
     </div>
     <${TroubleStrip} cars=${cars} />
     <div class="tiles">
       ${cars.length === 0 && html`<p>${t.noCars}</p>`}
-      ${cars.map((car) => html`<${Memo} key=${car.name} data=${drawn(car, chosen === car.name)} draw=${() => html`<${Tile} car=${car} />`} />`)}
+      ${places.map((name) => {
+        const car = byName.get(name);
+        if (car === undefined) return html`<div class="cell" key=${name}></div>`;
+        return html`<${Memo} key=${name} data=${drawn(car, chosen === name)} draw=${() => html`<${Tile} car=${car} />`} />`;
+      })}
     </div>
     <div class=${shown ? "details" : "details empty"}>
       ${shown

@@ -43,6 +43,16 @@ export const motions = {
   unknown: "unknown",
 };
 
+// For the eye: where the car goes. And the word for it.
+export const arrows = {
+  forward: ["↑", "forward"],
+  back: ["↓", "back"],
+  left: ["↰", "left"],
+  right: ["↱", "right"],
+  spin_left: ["↺", "spins left"],
+  spin_right: ["↻", "spins right"],
+};
+
 export const modes = {
   manual: ["Manual", "Stops the car. Then you drive it."],
   remote_control: ["Infrared remote", "Only the infrared remote drives the car. It reports nothing."],
@@ -77,6 +87,10 @@ export const pad = [
 export const t = {
   title: "Fleet console",
   fleet: "Fleet",
+  more: "More",
+  allCars: "All",
+  mine: "Mine",
+  filter: "Cars to show",
   drive: "Drive",
   noCars: "No car is on the bus yet. `fleet up` connects the cars of your fleet file; `fleet up --sim 3` simulates three.",
   connecting: "Connecting to the console…",
@@ -144,7 +158,10 @@ export const t = {
   stale: (car, ago) => `${car} has not reported for ${ago}, but its link is open.`,
   staleDo: "Is it on, its fan off, and near enough?",
   select: "Cars to drive",
-  selectHint: "Select at least one car.",
+  selectHint: "Choose at least one car.",
+  selectSet: "Choose cars at once",
+  otherCars: (count) => `${count} more that others drive`,
+  live: "What the cars say now",
   padLabel: "Hold to drive",
   padHint: "Hold a button, an arrow key, or W A S D; forward and a turn are an arc. Release all and the cars stop.",
   driving: (motion, cars) => `${motion}: ${cars.join(", ")}`,
@@ -309,6 +326,7 @@ export const t = {
   isMoving: "moving",
   holdMark: "on hold",
   lentMark: (to) => `lent to ${to}`,
+  drivenMark: (who) => `${who} drives`,
   troubles: {
     estopped: () => "E-stopped",
     gone: () => "gateway gone",
@@ -322,5 +340,8 @@ export const t = {
   summary: (all, moving, held, troubled) =>
     [`${all} ${all === 1 ? "car" : "cars"}`, `${moving} moving`, held && `${held} on hold`, troubled && `${troubled} in trouble`].filter(Boolean).join(" · "),
   noReading: "–",
+  delay: "Delay",
+  delayOf: (ms) => `${ms} ms`,
+  metres: (m) => `${m.toFixed(2)} m`,
   lacking: (cars, controls) => `Not with ${cars.length === 1 ? cars[0] : "these cars"}: ${controls.join(", ")}`,
 };

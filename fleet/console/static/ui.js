@@ -3,11 +3,26 @@
 import { Component, h, render } from "./vendor/preact.js";
 import { useEffect, useRef, useState } from "./vendor/preact-hooks.js";
 import htm from "./vendor/htm.js";
-import { store } from "./console.js";
+import { carSets, store } from "./console.js";
+import { icon } from "./icons.js";
 import { t } from "./texts.js";
 
 export const html = htm.bind(h);
 export { Component, render, useEffect, useRef, useState };
+
+export const Icon = ({ name }) => icon(html, name);
+
+// Chips for all cars, the person's own ones, and each group. `isOn` tells which of these sets are chosen.
+export const SetChips = ({ cars, label, isOn, onPress }) => {
+  const sets = carSets(cars);
+  if (sets.length === 1) return null;
+  return html`<div class="sets" role="group" aria-label=${label}>
+    ${sets.map(
+      (set) => html`<button key=${set.key} class="set" data-set=${set.key} aria-pressed=${isOn(set)} onClick=${() => onPress(set)}>
+        <bdi>${set.name}</bdi> <small>${set.cars.length}</small></button>`,
+    )}
+  </div>`;
+};
 
 // A symbol for the eye and a word for all: never color alone.
 export const Verdict = ({ table, name, detail = "" }) => {
@@ -22,7 +37,7 @@ export function Battery({ battery }) {
   if (!battery) return html`<span class="battery dim">${t.noReading}</span>`;
   const share = battery.charge === null ? null : Math.round(battery.charge * 100);
   return html`<span class=${`battery level-${battery.level}`}>
-    ${share !== null && html`<span class="bar" aria-hidden="true"><span style=${{ width: `${share}%` }}></span></span>`}
+    ${share !== null && html`<span class="bar" aria-hidden="true"><span style=${{ transform: `scaleX(${share / 100})` }}></span></span>`}
     ${share === null ? `${battery.v.toFixed(1)} V` : `${share} %`}
   </span>`;
 }

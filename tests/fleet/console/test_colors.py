@@ -44,7 +44,8 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_aft
                 return [each["color"] for each in console._view.as_list(0.0)]
 
             def reloaded() -> bool:
-                status = pb.Supervision(colors={"red": "#040506"}, unrecorded="0.1 MB are left")
+                groups = {"left": "red,blue", "a b": "red", "right": "<b>,green"}
+                status = pb.Supervision(colors={"red": "#040506"}, unrecorded="0.1 MB are left", groups=groups)
                 statuses.put(status, time.time_ns())
                 return colors() == ["#040506"]
 
@@ -60,6 +61,7 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_aft
             assert await asyncio.to_thread(wait_for, colors, "red is there") == ["#010203"]
             assert await asyncio.to_thread(wait_for, reloaded, "the color changes")
             assert json.loads(console._state(0.0))["unrecorded"] == "0.1 MB are left"
+            assert console.groups == {"left": ["red", "blue"], "right": ["green"]}
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
             await console.close()

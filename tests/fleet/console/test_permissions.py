@@ -146,3 +146,18 @@ def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
     assert rights_of(ANN, {"red": strict, "blue": Authority()})["pause"] == ""
     assert rights_of(TEACHER, {"red": strict})["cars"] == {"red": {}}
     assert rights_of(ANN, {})["pause"] == ""
+
+
+def test_mine_are_the_cars_of_a_person_whatever_else_refuses_now() -> None:
+    people = People.parse(["teacher:lead", "ann", "bob:other"])
+    paused = (FleetPause("p1", TEACHER, "lunch", 0, LEAD),)
+    cars = {
+        "red": Authority(people, pauses=paused),
+        "blue": Authority(people, loan=Loan("bob", TEACHER, LEAD, 0)),
+        "green": Authority(people, estops=(Estop("e1", TEACHER, "smoke", 0, fleet_wide=True, rank=LEAD),)),
+    }
+    assert rights_of(ANN, cars)["mine"] == ["red", "green"]
+    assert rights_of(BOB, cars)["mine"] == ["blue"]
+    assert rights_of(TEACHER, cars)["mine"] == ["red", "blue", "green"]
+    assert rights_of(ZED, cars)["mine"] == []
+    assert rights_of(ZED, {"red": Authority()})["mine"] == ["red"], "nobody is listed"

@@ -281,6 +281,14 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     assert driver.ask("GET", "/sessions")[0] == 200
 
 
+def test_a_ping_is_answered_with_its_number(stage: ServerStage) -> None:
+    with stage.device("mia").socket() as page:
+        page.send(json.dumps({"t": "ping", "id": 7}))
+        assert next_message(page, "pong")["id"] == 7
+        page.send(json.dumps({"t": "ping", "id": "7"}))
+        assert next_message(page, "bad")["words"] == "id is not a whole number"
+
+
 def test_what_a_pupil_may_not_do_ends_no_press_of_a_lead(stage: ServerStage) -> None:
     teacher, pupil = stage.device("teacher", "--rank", "lead"), stage.device("eva")
     with teacher.socket() as page, pupil.socket() as other:
