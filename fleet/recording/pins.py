@@ -6,10 +6,9 @@ session: what lay before it is in the one before.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from typing import Any, Final, Self
 
-from fleet.recording.time_spec import iso
+from fleet.recording.time_spec import iso, iso_ns
 from schemas.words import PinCause
 
 PIN_BEFORE_NS: Final = 30_000_000_000
@@ -42,16 +41,11 @@ class Pin:
     def from_dict(cls, values: Mapping[str, Any]) -> Self | None:
         """Return the pin of JSON values; None if they are none."""
         try:
-            begin_ns, end_ns = _ns(values["from"]), _ns(values["to"])
+            begin_ns, end_ns = iso_ns(values["from"]), iso_ns(values["to"])
             cars = tuple(str(car) for car in values.get("cars", ()))
             return cls(begin_ns, end_ns, str(values["cause"]), str(values.get("words", "")), cars)
         except (KeyError, ValueError, TypeError, OverflowError):
             return None
-
-
-def _ns(text: str) -> int:
-    when = datetime.fromisoformat(text)
-    return int(when.replace(microsecond=0).timestamp()) * 1_000_000_000 + when.microsecond * 1000
 
 
 def minute_of(at_ns: int, cause: PinCause, words: str, cars: Iterable[str] = ()) -> Pin:
@@ -102,7 +96,7 @@ def pins_of(pins: Iterable[Mapping[str, Any]], marks: Iterable[Mapping[str, Any]
     found = [pin for values in pins if (pin := Pin.from_dict(values)) is not None]
     for mark in marks:
         try:
-            found.append(minute_of(_ns(mark["time"]), PinCause.MARK, str(mark.get("text", ""))))
+            found.append(minute_of(iso_ns(mark["time"]), PinCause.MARK, str(mark.get("text", ""))))
         except (KeyError, ValueError, TypeError, OverflowError):
             continue
     return sorted(found, key=lambda pin: (pin.begin_ns, pin.end_ns))

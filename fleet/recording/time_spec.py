@@ -144,6 +144,12 @@ def iso(ns: int) -> str:
     return f"{when:%Y-%m-%dT%H:%M:%S}.{ns // 1_000_000 % 1000:03d}Z"
 
 
+def iso_ns(text: str) -> int:
+    """Return a stored time (ISO 8601), ns since the epoch. Raises ValueError, OverflowError if it is none."""
+    when = datetime.fromisoformat(text)
+    return int(when.replace(microsecond=0).timestamp()) * _NS + when.microsecond * 1000
+
+
 def words(seconds: float) -> str:
     """Return a duration as users write it: 59.2s, 1m30s, 2h05m."""
     if seconds < 60:

@@ -1,12 +1,12 @@
 """Finds an interrupted session that can be continued, because publishers still cache the lost messages."""
 
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Final
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.time_spec import iso_ns
 from schemas.topics import CACHE_S
 
 RESUME_WINDOW_S: Final = 3 * CACHE_S
@@ -60,7 +60,7 @@ def _predecessors(session: Session, start_ns: int) -> list[Session]:
 
 def _started_ns(session: Session) -> int:
     assert session.description is not None
-    return int(datetime.fromisoformat(session.description.started).timestamp() * 1e9)
+    return iso_ns(session.description.started)
 
 
 def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:

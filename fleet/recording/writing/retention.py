@@ -18,7 +18,7 @@ from fleet.recording import session_dir
 from fleet.recording.pins import Pin, pins_of
 from fleet.recording.reading.mcap_reader import McapReader, NotMcap
 from fleet.recording.session_dir import SESSION_FILE, SessionInfo
-from fleet.recording.time_spec import iso
+from fleet.recording.time_spec import iso, iso_ns
 from fleet.recording.writing.disk_space import MB
 from fleet.recording.writing.quota_order import Spans, StoredSegment, StoredSession, Taking, choose
 
@@ -125,8 +125,8 @@ def _stored(path: Path, info: SessionInfo, spans: Spans) -> StoredSession:
 
 
 def _start_ns(info: SessionInfo) -> int:
-    with contextlib.suppress(ValueError):
-        return int(datetime.fromisoformat(info.started).timestamp() * 1e9)
+    with contextlib.suppress(ValueError, OverflowError):
+        return iso_ns(info.started)
     return 0
 
 

@@ -92,8 +92,6 @@ class SessionWriter:
         self.cost = ""
         """Losses at the end of the session because the disk was full."""
         self.warning = ""
-        self.removed: list[Path] = []
-        """Old sessions removed for the quota."""
         self.quota_news: list[str] = []
         """What the quota took, for a person. The recorder reports and clears it."""
         self._pins = PinList()
@@ -453,7 +451,6 @@ class SessionWriter:
     def _check_disk(self) -> None:
         """Enforce the quota, and pause if the disk is nearly full."""
         done = self._options.quota.enforce(self._root, self.path, self._pins.pins)
-        self.removed += done.removed
         self.quota_news += done.news
         self.warning = done.warning
         reserve, free = self._options.reserve, self.free_bytes
