@@ -16,7 +16,7 @@ from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.selection import Selection
+from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.tables import car_of
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
@@ -73,7 +73,8 @@ def _missing(session: Session, count: int, words: str) -> int | None:
     if not words:
         return 0
     if description is not None and description.closed and description.messages:
-        return max(description.messages - count, 0)
+        gone = session_dir.gone_messages(description)
+        return None if gone is None else max(description.messages - gone - count, 0)
     if description is not None and not description.closed:
         return None
     expected = _sum(session.expected().values())
@@ -110,7 +111,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
             raise NoSession(f"nothing of {session.path} lies there")
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
         about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
-        _describe(session, new, count, about)
+        _describe(session, new, count, about, selection)
     return count
 
 
@@ -137,7 +138,9 @@ def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
     return count
 
 
-def _describe(session: Session, new: Path, count: int, origin: Mapping[str, object]) -> None:
+def _describe(
+    session: Session, new: Path, count: int, origin: Mapping[str, object], selection: Selection = EVERYTHING
+) -> None:
     """Write `session.json`, and copy the other files of the old session."""
     first = last = None
     fleet = ""
@@ -155,18 +158,15 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
     if not origin.get("cars") and before.get("cars"):
         origin = {**origin, "cars": before["cars"]}
-    if old is not None and (gone := session_dir.gone_of(old)):
-        words = f"the quota had taken {len(gone)} files"
+    gone = [each for each in session_dir.gone_of(old) if _has(selection, each["from"], each["to"])] if old else []
+    if old is not None and gone:
+        words = f"the quota had taken {len(gone)} {'files' if len(gone) > 1 else 'file'}"
         origin = {**origin, "lost": "; ".join(str(each) for each in (origin.get("lost"), words) if each)}
         origin["missing"] = _sum((origin.get("missing"), session_dir.gone_messages(old)))
     base = old if old is not None else session_dir.SessionInfo(fleet, time_spec.iso(first), "", {})
     origin = {"by": origin["by"], "of": session.name, **origin}
-    marks = list(base.marks)
-    pins = list(base.pins)
-    if origin["by"] == "cut":  # those that lie outside are of no message here
-        begin, end = time_spec.iso(first), time_spec.iso(last)
-        marks = [mark for mark in marks if begin <= str(mark.get("time", "")) <= end]
-        pins = [pin for pin in pins if str(pin.get("from", "")) <= end and begin <= str(pin.get("to", ""))]
+    marks = [mark for mark in base.marks if _has(selection, mark.get("time"), mark.get("time"))]
+    pins = [pin for pin in base.pins if _has(selection, pin.get("from"), pin.get("to"))]
     replace(
         base,
         marks=marks,
@@ -186,6 +186,14 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         for name in COPIED:
             if (session.path / name).is_file():
                 shutil.copyfile(session.path / name, new / name)
+
+
+def _has(selection: Selection, begin: object, end: object) -> bool:
+    """Return True if a stored span of time has a moment in the selection, or is none: somebody wrote it by hand."""
+    try:
+        return selection.overlaps(time_spec.iso_ns(str(begin)), time_spec.iso_ns(str(end)))
+    except (ValueError, OverflowError):
+        return True
 
 
 def origin_of(session: Session) -> Mapping[str, Any]:
