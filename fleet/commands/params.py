@@ -382,6 +382,10 @@ def warn_if_missing(written: str, cars: Sequence[str]) -> None:
 def existing_sessions_place(directory: Path | None) -> Path:
     """Return the directory of sessions that was named, or the usual one. Raises a ClickException if there is none."""
     place = directory or sessions_place()
-    if not place.is_dir():
+    try:
+        is_there = place.is_dir()
+    except OSError as error:  # a directory on the way is closed to us
+        raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
+    if not is_there:
         raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")
     return place

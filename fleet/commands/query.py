@@ -39,6 +39,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
+    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
@@ -69,6 +70,8 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     except QueryFailed as error:
         raise click.ClickException(str(error)) from None
     _write(tuple(answer.column_names), _rows(answer), as_csv=as_csv, as_json=as_json)
+    if catalog.damage and not catalog.sessions:
+        raise click.exceptions.Exit(1)
 
 
 def _rows(answer: Any) -> Iterator[tuple[Any, ...]]:

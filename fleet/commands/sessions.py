@@ -134,7 +134,8 @@ def _summaries(directory: Path | None) -> list["SessionSummary"]:
     try:
         found = list(overviews(place)) if directory is not None or place.exists() else []
     except OSError as error:
-        why = f"{place} cannot be listed: {error.strerror}." if place.exists() else f"There is no directory {place}."
+        is_missing = isinstance(error, FileNotFoundError)
+        why = f"There is no directory {place}." if is_missing else f"{place} cannot be listed: {error.strerror}."
         raise click.ClickException(f"{why} `fleet sessions` without a name lists those here.") from None
     if not found:
         click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)

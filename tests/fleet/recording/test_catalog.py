@@ -1,5 +1,6 @@
 """Questions in SQL to all sessions, and the tables that are kept beside them."""
 
+import errno
 import json
 import os
 import shutil
@@ -29,6 +30,7 @@ from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, Made
 from tests.support import in_process
 from tests.support.disk import MAY_MOUNT, disk
+from tests.support.no_superuser import no_superuser
 from tests.support.processes import wait_for
 from tests.support.terminal import Terminal
 
@@ -198,6 +200,53 @@ def test_no_sessions_are_no_traceback(tmp_path: Path) -> None:
     assert query("SELECT 1", tmp_path / "nowhere").returncode == 1
     (tmp_path / "empty").mkdir()
     assert query("SELECT count(*) FROM sensor_range", tmp_path / "empty").stdout.split()[-1] == "0"
+
+
+def find(place: Path) -> "subprocess.CompletedProcess[str]":
+    return in_process.fleet("find", "range_m < 5", place)
+
+
+def named(done: "subprocess.CompletedProcess[str]", sessions: Path) -> set[str]:
+    """Return the sessions that stderr names."""
+    return {line.partition(":")[0] for line in done.stderr.splitlines()} & {each.name for each in sessions.iterdir()}
+
+
+def test_the_exit_code_is_that_of_find(sessions: Path) -> None:
+    file = sessions / "two" / "0001.mcap"
+    whole = file.read_bytes()
+    (sessions / "broken").mkdir()
+    (sessions / "broken" / "0001.mcap").write_bytes(b"no MCAP at all")
+    for damaged, bad in ((whole[: len(whole) * 2 // 3], {"two", "broken"}), (b"", {"two", "broken"})):
+        file.write_bytes(damaged)
+        for done in (query("FROM sensor_range", sessions), find(sessions)):
+            assert (done.returncode, named(done, sessions)) == (0, bad)
+            assert done.stdout
+    (sessions / "one" / "0001.mcap").write_bytes(b"")
+    for done in (query("FROM sensor_range", sessions), find(sessions)):
+        assert (done.returncode, named(done, sessions)) == (1, {"one", "two", "broken"}), "nothing could be read"
+
+
+@pytest.mark.parametrize("closed", [".", ".."])
+@pytest.mark.parametrize(
+    "arguments", [("query", "FROM sensor_range"), ("find", "range_m < 5"), ("sessions",), ("sessions", "at", "14:05")]
+)
+def test_a_directory_that_cannot_be_listed_is_one_line(sessions: Path, arguments: tuple[str, ...], closed: str) -> None:
+    in_process.fleet(*arguments, sessions)  # without rights, Python could perhaps not import what this imports
+    place, locked = sessions, sessions
+    if closed == "..":
+        place = sessions / "of" / "mia"
+        place.mkdir(parents=True)
+        locked = place.parent
+    locked.chmod(0o311 if closed == "." else 0)
+    try:
+        with no_superuser(sessions.parent):
+            done = in_process.fleet(*arguments, place)
+    finally:
+        locked.chmod(0o755)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert str(place) in line
+    assert os.strerror(errno.EACCES) in line
 
 
 def no_tables(place: Path) -> bool:

@@ -8,13 +8,18 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fleet.recording.reading.session import Session
+from fleet.recording.session_dir import SESSION_FILE
+from fleet.recording.time_spec import iso_ns
 from schemas.bus import Bus
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.words import PinCause
 from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
+from tests.support import in_process
 
 RECORD = "from fleet.commands.record import record; record()"
 
@@ -122,3 +127,59 @@ def test_bad_input_is_one_line(arguments: list[str], code: int, words: str, endp
     assert process.returncode == code
     assert words in errors
     assert "Traceback" not in errors
+
+
+def test_a_condition_of_the_fleet_file_pins_its_time_while_it_records(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    rules = tmp_path / "fleet.yaml"
+    rules.write_text(
+        "cars: {red: {link: sim, platform: arduino}}\n"
+        "pin: [{when: range_m < 0.1, before: 20s, after: 10s}, {when: \"mode.verdict == 'contradicted'\"}]\n"
+    )
+    place = tmp_path / "sessions"
+    process = start(RECORD, "--sessions", str(place), "--connect", endpoint, "--json", "--fleet-file", str(rules))
+    session = ready(process)
+
+    def pins() -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = json.loads((session / SESSION_FILE).read_text())["pins"]
+        return found
+
+    distance, mode = publisher(bus, "red", "sensor/range"), publisher(bus, "red", "state/mode")
+    distance.put(pb.Range(range_m=1.0), time.time_ns())
+    mode.put(pb.Mode(asked="tracking", verdict="confirmed"), time.time_ns())
+    heard(bus._session)
+    assert pins() == []
+    before_ns = time.time_ns()
+    distance.put(pb.Range(range_m=0.05), before_ns)
+    wait_for(pins, "the pin, while it records")
+    after_ns = time.time_ns()
+    mode.put(pb.Mode(asked="tracking", verdict="contradicted"), time.time_ns())
+    wait_for(lambda: len(pins()) == 2, "the pin of the other condition")
+    heard(bus._session)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    near, other = pins()
+    assert (near["cause"], near["words"], near["cars"]) == (PinCause.CONDITION, "range_m < 0.1", ["red"])
+    assert (other["cause"], other["cars"]) == (PinCause.CONDITION, ["red"])
+    # session.json has milliseconds: the begin is cut, and the end rounded up.
+    moment_ns = iso_ns(near["from"]) + 20 * 10**9
+    assert before_ns - 10**6 < moment_ns < after_ns
+    assert 0 <= iso_ns(near["to"]) - 10 * 10**9 - moment_ns <= 2 * 10**6
+    info = in_process.fleet("sessions", "info", session, "--json")
+    assert (info.returncode, json.loads(info.stdout)["pins"]) == (0, [near, other])
+
+
+def test_a_mistake_in_the_fleet_file_costs_its_pins_and_no_recording(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    rules = tmp_path / "fleet.yaml"
+    rules.write_text("cars: {red: {link: sim, platform: arduino}}\npin: [{when: rnage_m < 0.1}]\n")
+    place = tmp_path / "sessions"
+    process = start(RECORD, "--sessions", str(place), "--connect", endpoint, "--json", "--fleet-file", str(rules))
+    session = ready(process)
+    publisher(bus, "red", "sensor/range").put(pb.Range(range_m=0.05), time.time_ns())
+    heard(bus._session)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert str(rules) in errors
+    assert "rnage_m" in errors
+    assert [each.key for each in Session(session).messages() if each.key == "fleet/red/sensor/range"]

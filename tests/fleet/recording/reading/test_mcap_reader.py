@@ -5,8 +5,7 @@ import os
 import random
 import struct
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -22,6 +21,7 @@ from fleet.recording.writing.recorder import MAX_QUEUED_BYTES
 from fleet.recording.writing.segment_writer import Segment
 from schemas.local_time import exact
 from tests.fleet.recording.damaged import CHUNKS, PER_CHUNK, Original, judge, places, put, written
+from tests.support.no_superuser import no_superuser
 
 ABSURD = (0, 1, 21, 2**16, MAX_RECORD_BYTES, MAX_RECORD_BYTES + 1, 2**31 - 1, 2**32, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 
@@ -390,22 +390,6 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / name)
     with pytest.raises(NoSession, match=r"0001\.mcap is not a regular file; .*0002\.mcap is not"):
         Session(tmp_path)
-
-
-@contextmanager
-def no_superuser(seen: Path) -> Iterator[None]:
-    """Run as a user without all rights, who may read `seen`."""
-    if os.geteuid():
-        yield
-        return
-    for path in (seen, *seen.parents):
-        if not path.stat().st_mode & 0o001:
-            path.chmod(path.stat().st_mode | 0o001)
-    os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(0)
 
 
 def test_what_must_not_be_read_is_said(original: Original, tmp_path: Path) -> None:
