@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections import Counter
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
 from fleet.recording.writing.recorder import AnotherRecorder, Recorder
-from schemas import keys
-from schemas.bus import Bus, Sample
+from schemas import keys, messages
+from schemas.bus import Bus, Sample, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.fleet.recording.conftest import heard, publisher, wait_for
+from tests.support.ports import free_endpoint
 
 
 def stock(segment: Path) -> list[Any]:
@@ -282,3 +284,48 @@ def test_a_wall_clock_that_is_set_leaves_the_order_of_the_messages(endpoint: str
     description = json.loads((session / "session.json").read_text())
     assert description["closed"]
     assert description["ended"] >= description["started"]
+
+
+def test_what_is_had_again_has_the_key_under_which_it_was_published(tmp_path: Path) -> None:
+    from fleet.recording.reading.session import Session
+
+    topics = {
+        "fleet/@supervisor/status": "@supervisor/status",
+        "fleet/@coordinator/assignment": "@coordinator/assignment",
+        "fleet/@sim/world": "@sim/world",
+        "fleet/red/state/mode": "state/mode",
+        "fleet/status/state/mode": "state/mode",
+    }
+    where = free_endpoint()
+    hub = zenoh.open(router_config(where))
+    with Bus.open(where) as own, Bus.open(where) as one, Bus.open(where) as other:
+        recorder = Recorder(own, "fleet", tmp_path)
+        session = recorder.start()
+        outs = [
+            (bus.publisher(key, TOPICS[topic], key), messages.message_class(TOPICS[topic].message)())
+            for (key, topic), bus in zip(topics.items(), cycle((one, other)), strict=False)
+        ]
+
+        def put(count: int) -> None:
+            for _ in range(count):
+                for out, message in outs:
+                    out.put(message, time.time_ns())
+
+        def lacking() -> set[tuple[str, int]]:
+            numbers = {(each.key, each.sequence) for each in Session(session).messages()}
+            return {(out.key, number) for out, _ in outs for number in range(1, out.sequence + 1)} - numbers
+
+        put(10)
+        wait_for(lambda: not lacking(), "what was published with a hub")
+        hub.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        wait_for(lambda: not (own.connected or one.connected or other.connected), "no link is left")
+        put(20)  # the bus loses all of these
+        with zenoh.open(router_config(where)):
+            wait_for(lambda: not lacking(), "the backfill has what was lost")
+            recorder.close()
+    said = Counter(
+        (channel.topic, getattr(messages.message_class(schema.name).FromString(message.data), "car", None))
+        for schema, channel, message in stock(session / "0001.mcap")
+        if "/@recorder/" not in channel.topic
+    )
+    assert said == {(key, key): 30 for key in topics}
