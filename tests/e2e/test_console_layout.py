@@ -281,7 +281,8 @@ def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
     tile = page.locator("[data-car=red]")
     expect(tile).to_contain_text("standing")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
-    expect(tile).to_contain_text("forward · mia")
+    expect(tile.locator(".tile-motion")).to_have_text("forward")
+    expect(tile).to_contain_text("mia drives")
     expect(tile).to_have_attribute("data-direction", "forward")
     playing = "document.getAnimations().map((each) => [each.animationName, each.effect.target.textContent])"
     assert page.evaluate(playing) == [["up", "↑"]]

@@ -210,7 +210,7 @@ class App extends Component {
       <main id="content" tabindex="-1" class=${here === "#/" ? "filled" : ""}>
         ${isReady() ? html`<${Page} key=${here} cars=${carsInPlace()} />` : html`<h1>${t.title}</h1><p>${t.connecting}</p>`}
       </main>
-      <div class="notices">
+      <div class="messages"><div class="notices">
         ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
         ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
@@ -218,7 +218,7 @@ class App extends Component {
         ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
         ${isReady() && html`<${Paused} cars=${state.cars} />`}
       </div>
-      <${Report} report=${state?.stop ?? null} />
+      <${Report} report=${state?.stop ?? null} /></div>
       <${StopBar} />
     `;
   }

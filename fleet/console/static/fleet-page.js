@@ -78,10 +78,16 @@ const isMoving = (car) => car.motors.state === "on";
 
 // The direction for the eye, which moves as the car does; the word beside it is for all.
 const directionOf = (car) => (isMoving(car) ? (car.motion.motion in arrows ? car.motion.motion : "some") : "none");
-function Motion({ car }) {
-  if (!isMoving(car)) return html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`;
-  const { motion, owner } = car.motion;
-  return html`<strong>${motion in arrows ? arrows[motion][1] : t.isMoving}</strong>${owner ? ` · ${who(owner)}` : ""}`;
+const Motion = ({ car }) =>
+  isMoving(car)
+    ? html`<strong>${car.motion.motion in arrows ? arrows[car.motion.motion][1] : t.isMoving}</strong>`
+    : html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`;
+
+// What keeps a car, or who has it.
+function markOf(car) {
+  const driver = (isMoving(car) && car.motion.owner) || car.lease?.holder;
+  const kept = car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : "";
+  return [driver ? t.drivenMark(who(driver)) : "", kept].filter(Boolean).join(", ");
 }
 
 // What is wrong with a car, the worst first, each with its class and short words.
@@ -113,8 +119,6 @@ function filterBy(key) {
 
 function Tile({ car }) {
   const troubles = troublesOf(car);
-  const mark =
-    car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : car.lease ? t.drivenMark(who(car.lease.holder)) : "";
   const direction = directionOf(car);
   return html`<button class=${`tile car ${direction === "none" ? "" : "moving"} ${troubles[0]?.level ?? ""}`} style=${{ "--car": car.color }}
     data-car=${car.name} data-direction=${direction} aria-pressed=${chosen === car.name} onClick=${() => choose(car.name)}>
@@ -124,8 +128,8 @@ function Tile({ car }) {
     <span class="tile-mode">${(modes[car.mode.asked] ?? modes.unknown)[0]}</span><${Battery} battery=${car.battery} />
     <span class="tile-trouble">
       ${troubles.length > 0
-        ? html`<span class="bad" data-old=${troubles.some((each) => each.name === "old") ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>`
-        : mark}
+        ? html`<span class="bad" data-old=${troubles.some((each) => each.name === "old") ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>${" "}`
+        : ""}${markOf(car)}
     </span>
   </button>`;
 }
