@@ -75,7 +75,7 @@ def _other(sender: str, ours: str) -> str:
 
 
 class LeasingFleet(Protocol):
-    """What a lease needs of a `Fleet`."""
+    """The part of a `Fleet` that a lease uses."""
 
     name: str
     sender: str

@@ -8,6 +8,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo
 from schemas import messages
 
@@ -91,3 +92,11 @@ def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = fro
 def message_of(info: ChannelInfo) -> str:
     """Return the full protobuf name of the messages of a channel; empty if the file has no schema for it."""
     return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""
+
+
+def why_not_decoded(decoder: MessageDecoder, info: ChannelInfo) -> LeftOutCause:
+    """Return why the decoder has no message for a payload of this channel."""
+    if decoder.class_of(info) is not None:
+        return LeftOutCause.UNREADABLE
+    is_protobuf = info.channel.message_encoding == "protobuf" and message_of(info)
+    return LeftOutCause.BAD_SCHEMA if is_protobuf else LeftOutCause.NOT_PROTOBUF

@@ -17,11 +17,11 @@ from mcap.records import Metadata
 
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
-from fleet.recording.left_out import LeftOut, LeftOutCause
+from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.mcap_copy import SESSION_METADATA, McapCopy
 from fleet.recording.reading.mcap_index import Index
-from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, McapReader, NotMcap, Row
-from fleet.recording.reading.message_decoder import MessageDecoder, message_of
+from fleet.recording.reading.mcap_reader import Extra, McapReader, NotMcap, Row
+from fleet.recording.reading.message_decoder import MessageDecoder, message_of, why_not_decoded
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
 from fleet.recording.tools.analysis import (
@@ -282,7 +282,7 @@ class Session:
             if value is not None:
                 yield Reading.of(info.channel.topic, value, publish_ns)
             else:
-                self.left_out.add(info.channel.topic, _why_not_decoded(decoder, info))
+                self.left_out.add(info.channel.topic, why_not_decoded(decoder, info))
 
     def to_arrow(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pa.Table":
         """Return the messages of one type as a pyarrow.Table, one row for each message, in the order of publish_time.
@@ -403,13 +403,6 @@ class Session:
         if reader.damage:
             self.damage[reader.path] = reader.words
             (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
-
-
-def _why_not_decoded(decoder: MessageDecoder, info: ChannelInfo) -> LeftOutCause:
-    if decoder.class_of(info) is not None:
-        return LeftOutCause.UNREADABLE
-    is_protobuf = info.channel.message_encoding == "protobuf" and message_of(info)
-    return LeftOutCause.BAD_SCHEMA if is_protobuf else LeftOutCause.NOT_PROTOBUF
 
 
 def _recorded(row: Row) -> Recorded:

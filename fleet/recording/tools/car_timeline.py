@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.client.claims import link_claim, mode_claim, motors_claim
-from fleet.recording.tools.stop_findings import StopFindings, UnshownStop
+from fleet.recording.tools.stop_findings import StopFindings, UnshownStop, asked_by
 from schemas import keys, messages
 from schemas.local_time import clock
 
@@ -58,7 +58,7 @@ class CarTimeline:
             basis = f" ({message.basis})" if message.basis else ""
             self._changed(
                 message.id,
-                f"{message.verb} by {keys.name_of(message.sender) or 'somebody'} {message.phase}{basis}{words}",
+                f"{asked_by(message)} {message.phase}{basis}{words}",
                 "",
                 at_ns,
             )

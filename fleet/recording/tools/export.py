@@ -1,5 +1,6 @@
 """Exports a session to tables, one per message type: files, or Arrow in memory. tables.py defines their columns."""
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -182,7 +183,7 @@ class _Export:
         stem = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
         stem = f"{STRAY_PREFIX}{stem}" if stray else stem
         taken = {table.name.lower() for table in self.tables.values()}
-        name = next(one for one in _table_names(re.sub(r"[^A-Za-z0-9._-]", "_", stem)) if one.lower() not in taken)
+        name = next(one for one in numbered(re.sub(r"[^A-Za-z0-9._-]", "_", stem), "-") if one.lower() not in taken)
         layout = tables.Layout(message_class.DESCRIPTOR) if message_class is not None else None
         sink = self._open_sink(name, layout.columns if layout is not None else tables.OTHER_COLUMNS)
         return _Table(sink, layout, message_class, name, stray)
@@ -242,12 +243,10 @@ def _export(rows: Iterable[Row], open_sink: Callable[[str, Sequence[tables.Colum
     return Exported({table.name: table.rows for table in tables}, writing.undecoded, writing.left_out, undated)
 
 
-def _table_names(stem: str) -> Iterator[str]:
-    yield stem
-    number = 2
-    while True:
-        yield f"{stem}-{number}"
-        number += 1
+def numbered(name: str, joint: str) -> Iterator[str]:
+    """Yield a name, then the name with a number from 2 on, for the first one that is free."""
+    yield name
+    yield from (f"{name}{joint}{number}" for number in itertools.count(2))
 
 
 def _text(payload: bytes) -> str | None:

@@ -18,6 +18,7 @@ from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.car_timeline import message_time_ns
+from fleet.recording.tools.stop_findings import asked_by
 from schemas import keys
 from schemas.topics import TOPICS
 from schemas.words import Phase
@@ -102,7 +103,7 @@ def find_in(
         run = runs.setdefault(car, ConditionRun(expression, car, for_s))
         # The schema is that of the recording, and may lack a field.
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
-            run.command(f"{message.verb} by {keys.name_of(message.sender) or 'somebody'}")
+            run.command(asked_by(message))
         if topic == MODE.name:
             run.mode(getattr(message, "asked", ""))
         if topic in topics and at_ns >= since_ns:

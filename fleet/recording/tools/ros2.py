@@ -18,10 +18,11 @@ from typing import Any, Final
 
 from google.protobuf.message import Message
 
-from fleet.recording.left_out import LeftOut, LeftOutCause
-from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.left_out import LeftOut
+from fleet.recording.reading.mcap_reader import Row
+from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
 from fleet.recording.tools.car_timeline import message_time_ns
+from fleet.recording.tools.export import numbered
 from fleet.recording.tools.table_formats import FormatMissing
 from fleet.recording.tools.tables import plain
 from schemas import keys
@@ -229,7 +230,7 @@ def topic_name(key: str) -> str:
 
 @dataclass(slots=True)
 class Bag:
-    """What was written."""
+    """Counts and topics of a written bag."""
 
     messages: int = 0
     topics: dict[str, str] = field(default_factory=dict)
@@ -245,7 +246,7 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
     def connection_of(key: str, kind: str, writer: Writer) -> Any:
         if (key, kind) not in connections:
             name = topic_name(key)
-            free = next(each for each in _numbered(name) if each not in bag.topics)
+            free = next(each for each in numbered(name, "_") if each not in bag.topics)
             bag.topics[free] = kind
             connections[key, kind] = writer.add_connection(free, kind, typestore=_STORE)
         return connections[key, kind]
@@ -255,7 +256,7 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
             key = info.channel.topic
             message = decoder.message(info, payload)
             if message is None:
-                bag.left_out.add(key, _cause(info))
+                bag.left_out.add(key, why_not_decoded(decoder, info))
                 continue
             kind, converted = _convert(message, key, publish_ns)
             writer.write(connection_of(key, kind, writer), log_ns, _STORE.serialize_cdr(converted, kind))
@@ -275,17 +276,3 @@ def _convert(message: Message, key: str, publish_ns: int) -> tuple[str, Any]:
 @cache
 def _frame(key: str) -> str:
     return topic_name(key)[1:]
-
-
-def _cause(info: ChannelInfo) -> LeftOutCause:
-    if info.channel.message_encoding != "protobuf":
-        return LeftOutCause.NOT_PROTOBUF
-    return LeftOutCause.UNREADABLE
-
-
-def _numbered(name: str) -> Iterable[str]:
-    yield name
-    number = 2
-    while True:
-        yield f"{name}_{number}"
-        number += 1

@@ -76,8 +76,8 @@ class StopFindings:
         elif topic == "event/log":
             self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
         else:
-            asked = f"{message.verb} by {name_of(message.sender) or 'somebody'}"
-            self._note(car, messages.stamp_ns(message.stamp) or at_ns, code, asked, message.words or message.reason)
+            at_ns = messages.stamp_ns(message.stamp) or at_ns
+            self._note(car, at_ns, code, asked_by(message), message.words or message.reason)
 
     def of(self, code: str) -> list[UnshownStop]:
         """Return the stops with this code."""
@@ -115,6 +115,11 @@ def failed_stop_code(topic: str, message: Any) -> str:
     if message.verb not in STOPPING_VERBS or message.phase not in _FAILED:
         return ""
     return NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
+
+
+def asked_by(event: Any) -> str:
+    """Return verb and person of a fleet.v1.CommandEvent: `stop by mia`."""
+    return f"{event.verb} by {name_of(event.sender) or 'somebody'}"
 
 
 def log_code(record: Any) -> str:

@@ -4,16 +4,17 @@ Conditions have the meaning of `fleet find`: the same evaluator gets the same re
 on the recorder's clock, as its files are: so it lies around the moment at which the reading came. A backfilled
 reading came late, and its file is that of its coming: its pin lies around its own time, and lasts until it came.
 
-A STOP of all cars is one command with one id, of which each gateway tells. So it is known by its second car, or by its
+A STOP of all cars is one command with one id, reported by each gateway. So it is known by its second car, or by its
 only one if there are no others.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
+from fleet.client.wait import CLOCK_STEP_S
 from fleet.conditions.functions import KEPT_READINGS
 from fleet.conditions.holding import Holding
 from fleet.fleetfile.fleet_file import PinRule
@@ -22,15 +23,14 @@ from fleet.policy.snapshot import topic_of, value_of
 from fleet.recording.pins import Pin, minute_of
 from fleet.recording.stop_count import MAX_RECENT_IDS
 from fleet.recording.tools.car_timeline import message_time_ns
-from fleet.recording.tools.stop_findings import failed_stop_code
+from fleet.recording.tools.stop_findings import asked_by, failed_stop_code
 from schemas import keys, messages
 from schemas.commands import STOPPING_VERBS
 from schemas.messages import Observation
 from schemas.topics import TOPICS
 from schemas.words import PinCause, Verb
 
-CLOCK_STEP_NS: Final = 60_000_000_000
-"""Minimum step back of a car's times that is a step of its clock, and no delay of a network: as `fleet wait` has it."""
+CLOCK_STEP_NS: Final = round(CLOCK_STEP_S * 1e9)
 _EVENTS: Final = ("event/command", "event/log")
 
 
@@ -90,7 +90,6 @@ class PinWatch:
     def __init__(self, rules: Sequence[PinRule] = ()) -> None:
         self._rules = rules
         self._conditions = ConditionPins(rules)
-        self._late: ConditionPins | None = None
         self._keys: dict[str, tuple[str, str] | None] = {}
         """Car and topic of each key; None if it is of no use here."""
         self._cars: set[str] = set()
@@ -110,19 +109,19 @@ class PinWatch:
             self._keys[key] = (parsed.car, parsed.topic) if parsed is not None and wanted else None
             return wanted
 
-    def begin_late(self) -> None:
-        """Begin a batch of backfilled messages, in the order of their times. Conditions see them without the others."""
-        self._late = ConditionPins(self._rules)
-
     def add(self, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int) -> list[Pin]:
         """Take in a message that came just now, and return what it pins."""
         return self._add(self._conditions, key, encoding, payload, published_ns, came_ns)
 
-    def add_late(self, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int) -> list[Pin]:
-        """Take in a backfilled message of the batch, and return what it pins."""
-        assert self._late is not None
-        found = self._add(self._late, key, encoding, payload, published_ns, published_ns)
-        return [replace(pin, end_ns=max(pin.end_ns, came_ns)) for pin in found]
+    def add_late(self, batch: Iterable[tuple[int, str, str, bytes]], came_ns: int) -> Iterator[Pin]:
+        """Take in backfilled messages (time, key, encoding, payload), and yield what they pin.
+
+        Conditions see them by themselves, in the order of their times.
+        """
+        late = ConditionPins(self._rules)
+        for published_ns, key, encoding, payload in sorted(batch):
+            for pin in self._add(late, key, encoding, payload, published_ns, published_ns):
+                yield replace(pin, end_ns=max(pin.end_ns, came_ns))
 
     def _add(
         self, conditions: ConditionPins, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int
@@ -146,7 +145,7 @@ class PinWatch:
             yield PinCause.NOT_SHOWN, words, (car,)
         if topic != "event/command" or message.verb not in STOPPING_VERBS:
             return
-        words = f"{message.verb} by {keys.name_of(message.sender) or 'somebody'}"
+        words = asked_by(message)
         if message.verb == Verb.ESTOP:
             yield PinCause.ESTOP, words, (car,)
         elif message.id:

@@ -65,7 +65,7 @@ class StoredSession:
 
 @dataclass(slots=True)
 class Taking:
-    """What the quota takes, in this order."""
+    """Segments, tables and whole sessions that go for the quota, in this order."""
 
     segments: list[StoredSegment] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)

@@ -319,17 +319,14 @@ class Recorder:
                     self._session.pin(pin)
 
     def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
-        late: list[tuple[int, zenoh.Sample]] = []
+        late: list[tuple[int, str, str, bytes]] = []
         for sample in samples:
-            new = self._session.add_backfilled(sample, self._now())
-            if new and sample.timestamp is not None and self._pin_watch.is_watched(str(sample.key_expr)):
-                late.append((sample.timestamp.get_time_as_ntp64().as_nanos(), sample))
-        if not late:
-            return
-        self._pin_watch.begin_late()
-        for published_ns, sample in sorted(late, key=lambda each: each[0]):
-            key, encoding, payload = str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes()
-            for pin in self._pin_watch.add_late(key, encoding, payload, published_ns, self._now()):
+            new, key = self._session.add_backfilled(sample, self._now()), str(sample.key_expr)
+            if new and sample.timestamp is not None and self._pin_watch.is_watched(key):
+                published_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
+                late.append((published_ns, key, str(sample.encoding), sample.payload.to_bytes()))
+        if late:
+            for pin in self._pin_watch.add_late(late, self._now()):
                 self._session.pin(pin)
 
     def _tick(self) -> None:

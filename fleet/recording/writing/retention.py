@@ -10,7 +10,6 @@ import shutil
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,12 +33,12 @@ _UNCLOSED_IN_USE_S: Final = 60.0
 
 @dataclass(slots=True)
 class Enforced:
-    """What the quota has done."""
+    """Result of one enforcement of the quota."""
 
     removed: list[Path] = field(default_factory=list)
     """Sessions of which nothing is left."""
     news: list[str] = field(default_factory=list)
-    """What a person should know: each session that is removed, and the first of its minutes that goes."""
+    """News for a person: each removed session, and the first minutes that a session loses."""
     warning: str = ""
     """Why the sessions are still too large together."""
 
@@ -116,7 +115,6 @@ def _stored(path: Path, info: SessionInfo, spans: Spans) -> StoredSession:
     for file in sorted(path.glob(session_dir.SEGMENTS)):
         with contextlib.suppress(OSError):  # another recorder removes it now
             found = _segment(file, indexed.get(file.name), before_ns)
-            # A file without an index ends when it was written last.
             segments.append(replace(found, pinned=spans.touch(found.begin_ns, found.end_ns)))
             before_ns = found.end_ns
     tables = sum(_size(each) for each in path.glob(f"{session_dir.TABLES_PREFIX}*"))
@@ -135,6 +133,7 @@ def _segment(file: Path, entry: Mapping[str, Any] | None, before_ns: int) -> Sto
     state = file.stat()
     first_ns, last_ns, messages = ((entry or {}).get(name) for name in ("first_ns", "last_ns", "messages"))
     if not (isinstance(first_ns, int) and isinstance(last_ns, int) and isinstance(messages, int)):
+        # A file without an index ends when it was written last.
         first_ns, last_ns, messages = before_ns, max(state.st_mtime_ns, before_ns), None
         with contextlib.suppress(NotMcap):
             index = McapReader(file).index()
@@ -208,7 +207,7 @@ def _list_removed(session: Path, info: SessionInfo, segments: Iterable[StoredSeg
         "to": max((end for _, end in times), default=info.started),
         "messages": info.messages,
         "pins": len(info.pins),
-        "removed": iso(int(datetime.now(UTC).timestamp() * 1e9)),
+        "removed": iso(time.time_ns()),
     }
     place = session.parent
     listed = [*session_dir.removed_sessions(place), entry]

@@ -93,7 +93,7 @@ class SessionWriter:
         """Losses at the end of the session because the disk was full."""
         self.warning = ""
         self.quota_news: list[str] = []
-        """What the quota took, for a person. The recorder reports and clears it."""
+        """News of the quota for a person. The recorder reports and clears them."""
         self._pins = PinList()
         self._pins_unwritten = False
         self._index: list[dict[str, Any]] = []

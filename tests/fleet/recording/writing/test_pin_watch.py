@@ -74,10 +74,10 @@ def test_what_came_late_pins_its_time_and_its_coming() -> None:
     of = watch("range_m < 0.3")
     message = pb.Range(range_m=0.2)
     message.stamp.FromNanoseconds(START_NS)
-    of.begin_late()
     encoding = messages.encoding_of("fleet.v1.Range")
     came_ns = START_NS + 40 * S
-    (pin,) = of.add_late("fleet/red/sensor/range", encoding, message.SerializeToString(), START_NS, came_ns)
+    late = (START_NS, "fleet/red/sensor/range", encoding, message.SerializeToString())
+    (pin,) = of.add_late([late], came_ns)
     assert (pin.begin_ns, pin.end_ns) == (START_NS - 10 * S, came_ns)
 
 
