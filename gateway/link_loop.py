@@ -87,7 +87,7 @@ class LinkLoop:
                     looked_again = True  # the other gateway, which had the port, may have ended since
                 else:
                     self.lost(str(error))
-                await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+                await self._pause()
                 continue
             may_fail = True
             now = self._loop.time()
@@ -105,7 +105,11 @@ class LinkLoop:
                 if self.link is link:
                     self.lost(str(error))
             await link.close()
-            await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+            await self._pause()
+
+    async def _pause(self) -> None:
+        """Wait before the next attempt to open the link."""
+        await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
 
     @property
     def _may_move(self) -> bool:

@@ -115,7 +115,7 @@ _SIDES: Final[Mapping[Motion, tuple[float, float]]] = {
 """Shares of the left and the right wheel."""
 _BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]")
 """Text of the ESP32's own boot program."""
-_OWN: Final = re.compile(rb'\{"T":(1|11|13[012]|136|14[23]|900|1005)[,}]')  # a late echo, or an error of a servo
+_OWN: Final = re.compile(rf'\{{"T":({"|".join(map(str, {*ALLOWED, 1005}))})[,}}]'.encode())  # late echo, servo error
 
 
 class Setup(Enum):

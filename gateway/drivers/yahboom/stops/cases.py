@@ -41,11 +41,11 @@ class StopFacts:
     """The car shows a stop, or may."""
 
 
-def _never(facts: StopFacts) -> "StopCase | None":  # noqa: ARG001 - the default of `StopCase.ends`
+def _never(_: "StopCase", _facts: StopFacts) -> "StopCase | None":
     return None
 
 
-def _no(facts: StopFacts) -> bool:  # noqa: ARG001 - the default of `StopCase.probes`
+def _no(_: StopFacts) -> bool:
     return False
 
 
@@ -62,8 +62,8 @@ class StopCase:
     """What happens if it is not shown."""
     words: str = ""
     """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
-    ends: Callable[[StopFacts], "StopCase | None"] = _never
-    """Returns as which case a stop that began as this one ends without evidence; None if it goes on."""
+    rule: Callable[["StopCase", StopFacts], "StopCase | None"] = _never
+    """The rule of `ends`, with this case as its first argument."""
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
@@ -75,40 +75,33 @@ class StopCase:
     clears: bool = False
     """True if the first renewals are `MODE00`, which clears half a named frame."""
 
+    def ends(self, facts: StopFacts) -> "StopCase | None":
+        """Return as which case a stop that began as this one ends without evidence; None if it goes on."""
+        return self.rule(self, facts)
+
     def why(self, car: str) -> str:
         """Return why the stop of this car ends as `sent`."""
         return self.words.format(car=car)
 
 
-def _ends_soft(facts: StopFacts) -> StopCase | None:
-    return SOFT if facts.is_time_up else None
+def _ends_in_time(case: StopCase, facts: StopFacts) -> StopCase | None:
+    return case if facts.is_time_up else None
 
 
-def _ends_without_readings(facts: StopFacts) -> StopCase | None:
-    return NO_READINGS if facts.is_time_up else None
+def _ends_on_report(case: StopCase, facts: StopFacts) -> StopCase | None:
+    had_report = facts.reported_in_try or facts.is_soft
+    return case if facts.is_time_up and had_report else _by_fan(facts)
 
 
-def _ends_on_raspberry_pi(facts: StopFacts) -> StopCase | None:
-    return RASPBERRY_PI if _had_report(facts) else _by_fan(facts)
-
-
-def _ends_on_unknown(facts: StopFacts) -> StopCase | None:
-    return UNKNOWN_PLATFORM if _had_report(facts) else _by_fan(facts)
-
-
-def _ends_on_wrong(facts: StopFacts) -> StopCase | None:
+def _ends_on_probes(case: StopCase, facts: StopFacts) -> StopCase | None:
     if facts.reported and facts.probes >= DOUBTED_PROBES:
-        return WRONG_PLATFORM
+        return case
     return _by_fan(facts) or _by_echo(facts)
 
 
-def _ends_in_mode_0(facts: StopFacts) -> StopCase | None:
+def _ends_in_mode_0(_: StopCase, facts: StopFacts) -> StopCase | None:
     mute = NO_REACTION if facts.reported_in_try and not facts.can_show else None
     return _by_fan(facts) or _by_echo(facts) or mute
-
-
-def _had_report(facts: StopFacts) -> bool:
-    return facts.is_time_up and (facts.reported_in_try or facts.is_soft)
 
 
 def _by_fan(facts: StopFacts) -> StopCase | None:
@@ -151,7 +144,7 @@ MANUAL: Final = StopCase(
     "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
     "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
     "the stop goes on, and a command may take its place",
-    ends=_ends_in_mode_0,
+    rule=_ends_in_mode_0,
     probes=_probes_in_mode_0,
 )
 NO_REACTION: Final = StopCase(
@@ -160,7 +153,7 @@ NO_REACTION: Final = StopCase(
     "",
     "`sent` after a report; a general stop every 6 s",
     "{car}'s reports do not react to frames: nothing shows that a stop arrived",
-    ends=_ends_in_mode_0,
+    rule=_ends_in_mode_0,
 )
 NO_READINGS: Final = StopCase(
     "no_readings",
@@ -168,7 +161,7 @@ NO_READINGS: Final = StopCase(
     "",
     "`sent`; a general stop every 6 s",
     "{car} sends no readings: nothing shows that a stop arrived",
-    ends=_ends_without_readings,
+    rule=_ends_in_time,
 )
 NO_ECHO: Final = StopCase(
     "no_echo",
@@ -192,7 +185,7 @@ SOFT: Final = StopCase(
     "",
     "`sent`; a general stop every 6 s",
     "readings do not show the end of a drive; `fleet stop {car}` checks it",
-    ends=_ends_soft,
+    rule=_ends_in_time,
     is_sure=False,
 )
 ACTED: Final = StopCase(
@@ -208,7 +201,7 @@ RASPBERRY_PI: Final = StopCase(
     "",
     "`sent` after a report; a general stop every 6 s",
     "a Raspberry Pi car never confirms a stop",
-    ends=_ends_on_raspberry_pi,
+    rule=_ends_on_report,
 )
 UNKNOWN_PLATFORM: Final = StopCase(
     "unknown_platform",
@@ -216,7 +209,7 @@ UNKNOWN_PLATFORM: Final = StopCase(
     "",
     "`sent` after a report; a general stop every 6 s",
     "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
-    ends=_ends_on_unknown,
+    rule=_ends_on_report,
 )
 WRONG_PLATFORM: Final = StopCase(
     "wrong_platform",
@@ -224,7 +217,7 @@ WRONG_PLATFORM: Final = StopCase(
     "as in mode 0",
     "`sent` if it reports on in mode 0; then as without an echo",
     "the readings of {car} contradict its platform, and nothing in them shows the stop",
-    ends=_ends_on_wrong,
+    rule=_ends_on_probes,
     probes=_probes_wrong,
     repeats_lost=False,
     clears=True,
