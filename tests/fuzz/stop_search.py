@@ -20,12 +20,13 @@ from gateway.control.events import CommandRecord
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from gateway.drivers.yahboom.stops.stopping import evidence_s
+from gateway.drivers.yahboom.stops.stopping import EVIDENCE_INTERVALS, evidence_s
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
 from schemas.authority import Sender
+from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.controls import control
@@ -788,14 +789,14 @@ class Episode:
 
     @property
     def _ends_s(self) -> float:
-        """Return the maximum time from the request of a stop to its end.
+        """Return the maximum time from the request of a stop to its end, as docs/reference/protocol.md has it.
 
-        The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block. On a link that loses
-        reports it learns a slower rhythm than the car has.
+        The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block, which may be after the
+        stop began. On a link that loses reports it learns a slower rhythm than the car has.
         """
         traits, model = self.plan.traits, self.control.driver.model
-        true_s = 4 * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1)
-        return 5.5 + max(true_s, evidence_s(model.profile, model.learned))
+        true_s = EVIDENCE_INTERVALS * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1)
+        return 5.5 + max(min(true_s, MAX_EVIDENCE_TIMEOUT_S), evidence_s(model.profile, model.learned))
 
     @property
     def _shows(self) -> bool:
