@@ -303,7 +303,7 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
 
 @sessions.command(
     epilog="\b\nexamples:\n  fleet sessions export --csv tables\n  fleet sessions export --parquet tables\n"
-    "  fleet sessions export --ros2 bag\n",
+    "  fleet sessions export --ros2 bag\n  fleet sessions export --foxglove foxglove\n",
 )
 @session_argument
 @click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV here.")
@@ -313,58 +313,45 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
 @click.option(
     "--ros2", "ros2", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write a ROS 2 bag here."
 )
+@click.option(
+    "--foxglove",
+    "foxglove",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Write one MCAP file with one schema per topic here, and a layout for its cars.",
+)
 @click.option("--nanoseconds", is_flag=True, help="Write the times of Parquet in nanoseconds (default microseconds).")
-def export(session: Path, csv: Path | None, parquet: Path | None, ros2: Path | None, *, nanoseconds: bool) -> None:
-    """Write a session as tidy tables, one file for each type of message, or as a ROS 2 bag, into a new directory.
+def export(
+    session: Path,
+    csv: Path | None,
+    parquet: Path | None,
+    ros2: Path | None,
+    foxglove: Path | None,
+    *,
+    nanoseconds: bool,
+) -> None:
+    """Write a session as tidy tables, one file for each type of message, or for ROS 2 or Foxglove, to a new directory.
 
     Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC, in Parquet in microseconds.
     Units are in the columns' names, in Parquet also in the fields' metadata. Messages that are not protobuf are in
     `other`. A bag has standard messages only (docs/how-to/look-at-a-recording.md).
     """
-    from fleet.recording.tools.export import export as write
-    from fleet.recording.tools.summary import total
-    from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
-    from fleet.recording.tools.transform import atomic_directory
+    from fleet.commands.session_export import export_foxglove, export_ros2, export_tables
 
-    outputs = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
-    places = [each for each in (csv, parquet, ros2) if each is not None]
+    places = [each for each in (csv, parquet, ros2, foxglove) if each is not None]
     if not places or len(set(places)) < len(places):
-        raise click.UsageError("say where to, and as what: --csv DIR, --parquet DIR, --ros2 DIR (different ones)")
+        raise click.UsageError("say where to, and as what: --csv, --parquet, --ros2, --foxglove, each with its own DIR")
     if nanoseconds and parquet is None:
         raise click.UsageError("--nanoseconds is about Parquet, and CSV has them always: give --parquet DIR, too")
-    for name, out in outputs.items():
-        sink = ParquetNsSink if nanoseconds and name == "parquet" else FORMATS[name]
-        with _session_errors(out), atomic_directory(out) as new:
-            found = _open(session)
-            done = write(watched(f"export {name}", total(found))(found.rows()), new, sink)
-            if not done.rows:
-                why = found.damage_words or "it is empty"
-                raise click.ClickException(f"{found.path} has no intact message: {why}")
-        click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
-        if done.undecoded:
-            click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
-        for line in done.left_out.words():
-            echo_safely(f"not in the table of its key: {line}", err=True)
-        for table, count in done.undated.items():
-            echo_safely(f"{table}: {count} times are beyond what {name} can hold: they are empty", err=True)
-        _say_damage(found)
-    if ros2 is None:
-        return
-    with _session_errors(ros2), atomic_directory(ros2) as new:
-        from fleet.recording.tools.ros2 import write_bag
-
-        found = _open(session)
-        new.rmdir()  # the writer makes it
-        bag = write_bag(watched("export ros2", total(found))(found.rows()), new)
-        if not bag.messages:
-            why = found.damage_words or "it is empty, or nothing in it is protobuf"
-            raise click.ClickException(f"{found.path} has no message for a bag: {why}")
-    click.echo(f"{ros2}: {bag.messages} messages on {len(bag.topics)} topics")
-    for line in bag.left_out.words():
-        echo_safely(f"not in the bag: {line}", err=True)
-    _say_damage(found)
-
-
-def _say_damage(found: "Session") -> None:
-    if found.damage:
-        echo_safely(f"only the intact part was exported: {found.damage_words}", err=True)
+    if csv is not None:
+        with _session_errors(csv):
+            export_tables(_open(session), csv, "csv")
+    if parquet is not None:
+        with _session_errors(parquet):
+            export_tables(_open(session), parquet, "parquet", nanoseconds=nanoseconds)
+    if ros2 is not None:
+        with _session_errors(ros2):
+            export_ros2(_open(session), ros2)
+    if foxglove is not None:
+        with _session_errors(foxglove):
+            export_foxglove(_open(session), foxglove)

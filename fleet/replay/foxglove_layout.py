@@ -110,6 +110,11 @@ def layout(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> 
     }
 
 
+def layout_text(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> str:
+    """Return the file of the layout of a fleet."""
+    return json.dumps(layout(cars, fleet), indent=1) + "\n"
+
+
 def plain(part: Curve | StateTrack) -> bool:
     """Return True if Foxglove can draw the part from a field of the message."""
     return part.derivation in (None, Derivation.TEXT_OR_NOTHING) and not (isinstance(part, StateTrack) and part.drawn)
@@ -133,4 +138,4 @@ def _split(direction: str, parts: Sequence[Any]) -> Any:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(layout(sys.argv[1:] or DEMO_CARS), indent=1) + "\n")
+    sys.stdout.write(layout_text(sys.argv[1:] or DEMO_CARS))
