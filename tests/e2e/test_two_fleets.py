@@ -45,7 +45,8 @@ def test_a_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, 
     with Bus.open(environment["FLEET_ENDPOINT"]) as bus:
 
         def safety(fleet: str) -> pb.Safety:
-            (answer,) = bus.query(f"{fleet}/red/state/safety", timeout_s=10.0)
+            key = f"{fleet}/red/state/safety"
+            (answer,) = wait_for(lambda: list(bus.query(key, timeout_s=10.0)), f"{key} is answered")
             assert isinstance(answer, Sample)
             message = answer.message()
             assert isinstance(message, pb.Safety)

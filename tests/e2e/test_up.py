@@ -89,7 +89,9 @@ def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) 
         up.ready(car)
 
 
-@pytest.mark.parametrize("name", ["green", "@simulator", "@recorder", "@console"])
+@pytest.mark.parametrize(
+    "name", ["green", "@simulator", *(pytest.param(each, marks=pytest.mark.soak) for each in ("@recorder", "@console"))]
+)
 def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     pid = up.running(name)
     freeze(pid)
