@@ -73,8 +73,8 @@ class ConditionWait:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
-        # What was published just now is not old, even if the clock of its sender is ahead.
-        if holding is not None and reading.stale(now) and (arrived_s is None or reading.time < now):
+        # What was published just now counts from when it came, as in `CarState`: two clocks differ, and a replay is old.
+        if holding is not None and arrived_s is None and reading.stale(now):
             holding.end()
         span = holding.span if holding is not None else None
         return span is not None and span.length_s >= self._for_s

@@ -95,3 +95,16 @@ def test_a_sender_whose_clock_is_ahead_is_heard() -> None:
     wait = SteppedWait()
     value = Reading("fleet/red/sensor/range", wait.clock + timedelta(seconds=HOUR_S), pb.Range(range_m=0.2))
     assert wait._wait.ends(value, wait.clock, wait.now_s)
+
+
+def test_a_replay_is_old_and_published_now() -> None:
+    wait = SteppedWait(for_s=2.0)
+    assert not any(wait.query(-HOUR_S + at) for at in range(4)), "an answer may have waited for an hour"
+    wait.wall_s = -7 * HOUR_S
+    value = pb.Range(range_m=0.2)
+    ended = []
+    for _ in range(4):
+        wait.now_s += 1.0
+        wait.wall_s += 1.0
+        ended.append(wait._wait.ends(Reading(wait._key, wait.clock, value), EPOCH, wait.now_s))
+    assert ended == [False, False, True, True]

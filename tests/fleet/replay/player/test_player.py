@@ -154,6 +154,9 @@ def test_it_looks_like_a_fleet_and_takes_no_command(fleet: FleetProcesses, sessi
     assert {json.loads(row)["replay"] for row in listed.lines()} == {"made"}
     assert "fleet-replay is a replay of made" in listed.stderr
 
+    waited = fleet.start("-m", "fleet.cli", "wait", "red/sensor/range", "range_m >= 0", "--fleet", "fleet-replay")
+    assert waited.wait() == 0, "it is old, and published now"
+
     key, words = "fleet-replay/*/@cmd/stop", "fleet fleet-replay is a replay of made: nothing in it takes commands"
     found = fleet.bus.query(key, timeout_s=PATIENCE_S)
     answers = [json.loads(each.payload) for each in found if isinstance(each, bus.Sample)]
