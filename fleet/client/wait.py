@@ -73,7 +73,7 @@ class ConditionWait:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
-        # What was published just now counts from when it came, as in `CarState`: two clocks differ, and a replay is old.
+        # What was published just now counts from when it came, as in `CarState`: clocks differ, and a replay is old.
         if holding is not None and arrived_s is None and reading.stale(now):
             holding.end()
         span = holding.span if holding is not None else None

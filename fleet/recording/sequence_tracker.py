@@ -93,6 +93,16 @@ class SequenceTracker:
         self._begin(sender, number)
         return True
 
+    def add_dropped(self, sender: Hashable, number: int, count: int) -> None:
+        """Add a gap of messages that came and were not kept: `count` of them, the last one with this number."""
+        if sender not in self.last:
+            self._begin(sender, (number - count) % _MODULO)
+            self._first[sender] = (number - count + 1) % _MODULO
+        ahead = (number - self.last[sender]) % _MODULO
+        if 0 < ahead < _BACKWARD:
+            self._skip(sender, self.last[sender], ahead + 1)
+            self.last[sender] = number
+
     def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a backfilled message. Return False if it is a duplicate."""
         last = self.last.get(sender)

@@ -11,7 +11,7 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,7 @@ from fleet.recording.writing.pin_watch import PinWatch
 from fleet.recording.writing.receive_clock import ReceiveClock
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
-from schemas.bus import Bus, messages_of, reply_value
+from schemas.bus import Bus, messages_of, reply_value, sequence_of
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 from schemas.words import Level, RecorderState, RecorderVerb
@@ -141,7 +141,8 @@ class Recorder:
         for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, SUBSCRIBER_QUEUE_SIZE))
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
-        self._drops = self._session.drops
+        self._overflow: dict[tuple[str, Hashable], tuple[int, int]] = {}
+        """Messages that did not fit the queue: their count and the last number, by key and sender."""
         session = self._session.path
         key = keys.topic_key(self._fleet, keys.RECORDER, STATUS_TOPIC.name.partition("/")[2])
         self._publisher = self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER)
@@ -237,6 +238,7 @@ class Recorder:
         with self._lock:
             messages, size = self._queued_messages, self._queued_bytes
         batch: list[_Item] = []
+        overflow: list[tuple[str, zenoh.SourceInfo | None]] = []
         more = False
         for subscriber in self._subscribers:
             receive = subscriber.try_recv
@@ -248,19 +250,23 @@ class Recorder:
                 payload = sample.payload.to_bytes()
                 key = str(sample.key_expr)
                 if messages >= self._max_messages or size + len(payload) > self._max_bytes:
-                    self._drops[key] = self._drops.get(key, 0) + 1
+                    overflow.append((key, sample.source_info))
                     continue
                 messages += 1
                 size += len(payload)
                 batch.append((key, payload, sample.encoding, sample.timestamp, sample.source_info, self._now()))
             else:
                 more = True
-        if batch:
+        if batch or overflow:
             taken = sum(len(item[1]) for item in batch)
             with self._lock:
                 self._queued_messages += len(batch)
                 self._queued_bytes += taken
                 self._queue += batch
+                for key, source in overflow:
+                    sender = None if source is None else (source.source_id.zid, source.source_id.eid)
+                    count, _ = self._overflow.get((key, sender), (0, 0))
+                    self._overflow[key, sender] = (count + 1, 0 if source is None else sequence_of(source))
         return more
 
     # ------------------------------------------------------------------ the writer's thread
@@ -292,6 +298,8 @@ class Recorder:
     def _drain(self) -> None:
         with self._lock:
             batch, self._queue = self._queue, []
+            overflow, self._overflow = self._overflow, {}
+            has_room = self._queued_messages <= self._max_messages / 2 and self._queued_bytes <= self._max_bytes / 2
         backfilled = self._backfill.take_answers()
         if self._recording:
             add = self._session.add
@@ -300,9 +308,10 @@ class Recorder:
                 add(*item)
             self._pin(batch)
             self._add_backfilled(backfilled)
-            if self._session.gaps:
-                # Do not request keys that the full queue dropped: their backfill would be dropped, too.
-                self._backfill.request(self._session.gaps.difference(self._drops))
+            for (key, sender), (count, number) in overflow.items():
+                self._session.drop_received(key, sender, number, count)
+            if self._session.gaps and has_room:  # a writer that is behind would only fall behind further
+                self._backfill.request(self._session.gaps)
                 self._session.gaps.clear()
         # Only now: messages count against the limit until they are written.
         with self._lock:
@@ -342,7 +351,6 @@ class Recorder:
     def _begin_session(self) -> None:
         """Begin the next session; raises OSError if it cannot be created."""
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
-        self._drops = self._session.drops
         if not self._session.full:
             self._notify(f"recording {keys.describe_fleet(self._fleet)} to {self._session.path}")
 

@@ -5,7 +5,7 @@ All methods are called from one thread. The module knows no bus and starts no th
 
 import contextlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -83,8 +83,10 @@ class SessionWriter:
         """Keys whose sequence numbers were not always consecutive."""
         self.gaps: set[str] = set()
         """Keys with new gaps. The recorder requests a backfill and clears them."""
-        self.drops: dict[str, int] = {}
-        """Messages by key that a full disk or queue cost. The reader thread of the recorder counts here too."""
+        self._drops: dict[str, int] = {}
+        """Messages by key that a full disk cost, or a full queue if they had no number."""
+        self._overflows: dict[str, int] = {}
+        """Numbered messages by key that did not fit the recorder's queue: gaps that a backfill may close."""
         self.recovered: dict[str, int] = {}
         """Messages by key that a backfill restored."""
         self.full = ""
@@ -211,9 +213,21 @@ class SessionWriter:
         return shutil.disk_usage(self.path).free if self._made else free_bytes(self._root)
 
     @property
+    def drops(self) -> dict[str, int]:
+        """Return the messages by key that a full disk or queue cost, without those that a backfill restored."""
+        counts = {key: self._drops.get(key, 0) + self._unrestored(key) for key in (*self._drops, *self._overflows)}
+        return {key: count for key, count in counts.items() if count}
+
+    def _unrestored(self, key: str) -> int:
+        """Return how many of the messages that did not fit the queue are missing."""
+        overflows = self._overflows.get(key, 0)
+        return min(overflows, self._trackers[key].missing) if overflows else 0
+
+    @property
     def missed(self) -> dict[str, int]:
-        """Return the missing publications by key, from gaps in their sequence numbers."""
-        return {key: missing for key in sorted(self._irregular_keys) if (missing := self._trackers[key].missing)}
+        """Return the publications by key that never came, from gaps in their sequence numbers."""
+        counts = {key: self._trackers[key].missing - self._unrestored(key) for key in sorted(self._irregular_keys)}
+        return {key: count for key, count in counts.items() if count}
 
     @property
     def over(self) -> bool:
@@ -298,7 +312,7 @@ class SessionWriter:
         if self._segment is not None:
             self._segment.cut()
         self._drop_buffered()
-        dropped = sum(self.drops.values())
+        dropped = sum(self._drops.values())
         words = f"{why}. The {self._written} messages before are intact; {dropped} are lost"
         self.description.error = words
         with contextlib.suppress(OSError):  # the failed disk, which `words` already names
@@ -378,7 +392,7 @@ class SessionWriter:
 
     def _finish_segment(self) -> None:
         assert self._segment is not None
-        lost = {"drops": dict(self.drops), "missed": self.missed, "recovered": self.recovered}
+        lost = {"drops": self.drops, "missed": self.missed, "recovered": self.recovered}
         self._segment.finish({"messages": self._written, **lost}, sync=self._options.sync is not Sync.NEVER)
         self._add_to_index()
 
@@ -436,7 +450,19 @@ class SessionWriter:
 
     def drop(self, key: str) -> None:
         """Count a dropped message."""
-        self.drops[key] = self.drops.get(key, 0) + 1
+        self._drops[key] = self._drops.get(key, 0) + 1
+
+    def drop_received(self, key: str, sender: Hashable, number: int, count: int) -> None:
+        """Count messages that did not fit the queue. number: of the last one. sender: None if they have no numbers."""
+        if sender is None:
+            self._drops[key] = self._drops.get(key, 0) + count
+            return
+        tracker = self._trackers.setdefault(key, SequenceTracker())
+        tracker.add_dropped(sender, number, count)
+        self._overflows[key] = self._overflows.get(key, 0) + count
+        self._irregular_keys.add(key)
+        if tracker.has_gaps:
+            self.gaps.add(key)
 
     def _drop_buffered(self) -> int:
         """Drop the buffer, and return the number of its messages."""
@@ -518,7 +544,7 @@ class SessionWriter:
         if now_ns is not None:
             description.ended, description.closed = format_utc(_utc(now_ns)), closed
         description.messages, description.stops = self._written, self._stops.count
-        description.drops, description.missed = dict(self.drops), self.missed
+        description.drops, description.missed = self.drops, self.missed
         description.recovered = dict(self.recovered)
         self._describe_pins()
         description.write(self.path)

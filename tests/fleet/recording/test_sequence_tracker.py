@@ -103,3 +103,29 @@ def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: 
     taken += [old for old in range(1, 61) if numbers.add_backfilled("a", old, old)]
     assert sorted(taken) == list(range(1, 61))
     assert numbers.missing == 0
+
+
+@given(st.sets(st.integers(2, 60)), st.integers(0, 2**32))
+def test_whatever_does_not_fit_the_queue_is_missing_also_the_last(dropped: set[int], seed: int) -> None:
+    """The recorder reports what it dropped now and then, also after later ones came."""
+    chance, numbers, count, last, kept = random.Random(seed), SequenceTracker(), 0, 0, 0
+    for number in range(1, 61):
+        if number in dropped:
+            count, last = count + 1, number
+        else:
+            kept += all(live(numbers, number))
+        if count and (number == 60 or chance.random() < 0.3):
+            numbers.add_dropped("a", last, count)
+            count = 0
+    assert kept == 60 - len(dropped)
+    assert numbers.missing == len(dropped)
+    assert sum(numbers.add_backfilled("a", number, number) for number in range(1, 61)) == len(dropped)
+    assert numbers.missing == 0
+
+
+def test_of_a_sender_that_was_only_dropped_all_are_missing() -> None:
+    numbers = SequenceTracker()
+    numbers.add_dropped("a", 7, 3)
+    assert numbers.missing == 3
+    assert [numbers.add_backfilled("a", number, number) for number in (5, 6, 7)] == [True] * 3
+    assert numbers.missing == 0
