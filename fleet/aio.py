@@ -51,8 +51,18 @@ class Fleet:
         sender: str | None = None,
         kind: str = Rank.SCRIPT.value,
         start_hub: bool = False,
+        identity: str = "",
     ) -> None:
-        self._open = lambda: client.Fleet(endpoint, name, person=person, sender=sender, kind=kind, start_hub=start_hub)
+        self._open = partial(
+            client.Fleet,
+            endpoint,
+            name,
+            person=person,
+            sender=sender,
+            kind=kind,
+            start_hub=start_hub,
+            identity=identity,
+        )
         self._client: client.Fleet | None = None
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="fleet-aio")

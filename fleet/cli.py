@@ -51,6 +51,11 @@ COMMANDS: Final = {
         "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),
         "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),
     },
+    "Several computers": {
+        "hub": ("fleet.commands.hub:hub", "Let other computers join, with certificates: invite, show, revoke."),
+        "join": ("fleet.commands.hub:join_hub", "Join the hub on another computer, with its code."),
+        "leave": ("fleet.commands.hub:leave", "Leave that hub."),
+    },
     "Drive": {
         "drive": (
             "fleet.commands.drive:drive",
@@ -120,7 +125,8 @@ _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (whe
 _EXTRAS: Final = {
     **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
     **dict.fromkeys(("duckdb", "pyarrow", "pandas", "matplotlib", "rosbags"), "analysis"),
-    **dict.fromkeys(("starlette", "uvicorn", "cryptography", "segno", "ifaddr"), "console"),
+    **dict.fromkeys(("starlette", "uvicorn", "segno"), "console"),
+    **dict.fromkeys(("cryptography", "ifaddr"), "secure"),
     "bleak": "ble",
 }
 """The extra that installs a module."""

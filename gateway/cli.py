@@ -210,7 +210,7 @@ def _run(arguments: argparse.Namespace) -> int:
         )
         return _failed(message, 2)
     try:
-        with Bus.open(arguments.connect, start_hub=True) as opened:
+        with Bus.open(arguments.connect, start_hub=True, identity=f"car.{car}") as opened:
             service = CarService(opened, fleet, car)
             # The car is on the bus now. The following imports take as long again.
             import asyncio

@@ -13,6 +13,8 @@ RECORDER: Final = "@recorder"
 SUPERVISOR: Final = "@supervisor"
 SIMULATOR: Final = "@sim"
 OPERATOR: Final = "@operator"
+BY: Final = "@by"
+"""Part of a command's key before the identity that the rules of the hub have checked."""
 REPLAY: Final = "@replay"
 """`<fleet>/@replay/<session>` is the token of a fleet that is a replay."""
 
@@ -74,9 +76,21 @@ def topic_key(fleet: str, car: str, topic: str) -> str:
     return f"{fleet}/{car}/{topic}"
 
 
-def command_key(fleet: str, car: str, verb: str) -> str:
-    """Return the key of a car's command."""
-    return f"{fleet}/{car}/@cmd/{verb}"
+def command_key(fleet: str, car: str, verb: str, identity: str = "") -> str:
+    """Return the key of a car's command. identity: whose certificate it carries, on a hub with rules."""
+    by = f"{BY}/{identity}/" if identity else ""
+    return f"{fleet}/{car}/@cmd/{by}{verb}"
+
+
+def command_keys(fleet: str, car: str, verb: str = "*") -> tuple[str, str]:
+    """Return the key expressions of a car's commands, without and with an identity."""
+    return command_key(fleet, car, verb), command_key(fleet, car, verb, "*")
+
+
+def identity_of(key: str) -> str:
+    """Return the identity in the key of a command; empty if it has none."""
+    before, by, rest = key.rpartition(f"/@cmd/{BY}/")
+    return rest.partition("/")[0] if before and by else ""
 
 
 def car_token(fleet: str, car: str) -> str:
@@ -94,7 +108,7 @@ def operator_token(fleet: str, sender: str) -> str:
 def recorded_keys(fleet: str) -> tuple[str, ...]:
     """Return the key expressions of a recorder's subscriptions. `**` does not match chunks that begin with @."""
     services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR, SIMULATOR))
-    return (f"{fleet}/**", *services, f"{fleet}/*/@cmd/drive")
+    return (f"{fleet}/**", *services, *command_keys(fleet, "*", "drive"))
 
 
 def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:

@@ -7,13 +7,22 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from schemas.bus import DEFAULT_ENDPOINT
-
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 STATE_VARIABLE: Final = "FLEET_STATE_DIR"
+JOINED_FILE: Final = "endpoint"
+"""File in the state directory that names the joined hub."""
 _LOCALHOST: Final = re.compile(r"(?<=/)localhost(?=:)")
 _NO_NAME: Final = re.compile(r"[^a-z0-9.]+")
 _NAME_LENGTH: Final = 64
 _HASH_LENGTH: Final = 8
+
+
+def joined_endpoint() -> str:
+    """Return the endpoint of the hub that this user has joined (`fleet join`, `fleet up --secure`); empty if none."""
+    try:
+        return (default_directory() / JOINED_FILE).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 def default_directory() -> Path:

@@ -50,6 +50,8 @@ from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
 from schemas.bus import Bus, BusError, Failure, NoFleet, Sample, canon
 from schemas.commands import COMMANDS
+from schemas.identity import IdentityRole
+from schemas.identity import parse as parse_identity
 from schemas.topics import Qos
 from schemas.words import ProcessKind, Rank, RunState, Scope, Verb
 
@@ -77,6 +79,20 @@ def default_sender(person: str | None = None) -> str:
     return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
 
 
+def certified_sender(identity: str, sender: str | None = None, person: str | None = None) -> str:
+    """Return the sender. Raises keys.BadKey for another name than that of a person's certificate."""
+    known = parse_identity(identity)
+    if known is None or known[0] is not IdentityRole.PERSON:
+        return sender or default_sender(person)
+    asked = keys.person_of(sender) if sender else person or os.environ.get("FLEET_AS") or known[1]
+    if asked != known[1]:
+        raise keys.BadKey(
+            f"you are {known[1]} here, by the certificate of this computer, and not {asked}: leave out --as and "
+            f"FLEET_AS. For {asked}, `fleet hub invite {asked}` makes another certificate."
+        )
+    return sender or default_sender(known[1])
+
+
 class Fleet:
     """One operator on the bus. Use it with `with`. Its methods may be called from several threads.
 
@@ -84,6 +100,8 @@ class Fleet:
     name: the fleet's name. person: who drives, such as `group_a` (default: FLEET_AS, else the user's login).
     sender: the name shown to others, person@host-pid by default.
     kind: `script`, `person` (outranks scripts) or `coordinator`.
+    identity: whose certificate it uses, such as `service.coordinator` (default: the user's). On a hub with certificates
+    the owner of the certificate drives, and another `person` or `sender` raises keys.BadKey.
 
     While it is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars that
     it drives. A script that does not close it ends with a ResourceWarning.
@@ -99,15 +117,21 @@ class Fleet:
         sender: str | None = None,
         kind: str = Rank.SCRIPT.value,
         start_hub: bool = False,
+        identity: str = "",
     ) -> None:
         self.name = keys.check_name(name, "fleet name")
-        self.sender = sender or default_sender(person)
         self.kind = kind
-        token = keys.operator_token(self.name, self.sender)
+        keys.operator_token(self.name, sender or default_sender(person))
         try:
-            self.bus = Bus.open(endpoint, start_hub=start_hub)
+            self.bus = Bus.open(endpoint, start_hub=start_hub, identity=identity)
         except NoFleet as error:
             raise explained(error) from None
+        try:
+            self.sender = certified_sender(self.bus.identity, sender, person)
+        except keys.BadKey:
+            self.bus.close()
+            raise
+        token = keys.operator_token(self.name, self.sender)
         self._closed = False
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
@@ -333,7 +357,7 @@ class Fleet:
         words = f"{target} may or may not do it: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(
-                keys.command_key(self.name, target, verb),
+                keys.command_key(self.name, target, verb, self.bus.identity),
                 payload=payload,
                 encoding=messages.encoding_of(COMMANDS[verb].message),
                 timeout_s=OVERLOAD_ANSWER_TIMEOUT_S,

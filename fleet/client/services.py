@@ -17,7 +17,7 @@ NO_PLAN: Final = "No plan is running. Start one: `fleet plan run FILE`"
 
 def send_command(bus: Bus, fleet: str, service: str, verb: str, command: Any, timeout_s: float) -> Iterator[Any]:
     """Send a command to a service such as `@supervisor`. Yield each answer: a fleet.v1.Result, or a Failure."""
-    key = keys.command_key(fleet, service, verb)
+    key = keys.command_key(fleet, service, verb, bus.identity)
     payload, encoding = command.SerializeToString(), messages.encoding_of(command.DESCRIPTOR.full_name)
     for answer in bus.query(key, payload=payload, encoding=encoding, timeout_s=timeout_s):
         yield answer if isinstance(answer, Failure) else messages.parse(topics.RESULT, answer.payload, answer.encoding)
@@ -25,7 +25,7 @@ def send_command(bus: Bus, fleet: str, service: str, verb: str, command: Any, ti
 
 def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     """Send a command to the recorder. Return its fleet.v1.Recording or a Failure, None if there is no recorder."""
-    key, payload = keys.command_key(fleet, keys.RECORDER, verb), json.dumps(fields).encode()
+    key, payload = keys.command_key(fleet, keys.RECORDER, verb, bus.identity), json.dumps(fields).encode()
     for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=RECORDER_TIMEOUT_S):
         return answer if isinstance(answer, Failure) else answer.message()
     return None

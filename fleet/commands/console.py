@@ -39,6 +39,7 @@ from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.authority import NO_PEOPLE, People, PersonRole
 from schemas.bus import resolve_endpoint
+from schemas.identity import Service, service
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import Rank
 
@@ -171,7 +172,9 @@ def serve_console(
                 webbrowser.open(address)
 
         async def run() -> Any:
-            async with Fleet(connect, fleet, kind=Rank.PERSON, person=chosen_person()) as client:
+            async with Fleet(
+                connect, fleet, kind=Rank.PERSON, person=chosen_person(), identity=service(Service.CONSOLE)
+            ) as client:
                 heartbeats = None if parent is None else asyncio.ensure_future(_send_heartbeats(parent, address))
                 await serve(client, listener, on_ready, sessions or sessions_place(), fleet_file, lan)
                 if heartbeats is not None:

@@ -12,7 +12,7 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client.claims import is_bad_rest
-from fleet.client.client import default_sender
+from fleet.client.client import certified_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.fleets import client_in, the_fleet
 from fleet.commands.group import chosen_person, say
@@ -91,7 +91,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         received: list[Any] = []
         fleet = the_fleet(bus, fleet)
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
-        sender = default_sender(chosen_person())
+        sender = certified_sender(bus.identity, person=chosen_person())
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
             raise not_running(fleet, connect)
         if answer.status == Phase.REJECTED:
@@ -146,7 +146,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
-        answer = ask_service(bus, fleet, "reload", default_sender(chosen_person()))
+        answer = ask_service(bus, fleet, "reload", certified_sender(bus.identity, person=chosen_person()))
         if answer is None:
             raise not_running(fleet, connect)
     if as_json:

@@ -16,6 +16,7 @@ from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
 from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
+from schemas.identity import Service, service
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import Rank
@@ -81,7 +82,14 @@ def run(
     def on_decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else line(decision))
 
-    with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind=Rank.COORDINATOR, start_hub=True) as client:
+    with Fleet(
+        connect,
+        fleet,
+        sender=f"{SENDER}{default_sender()}",
+        kind=Rank.COORDINATOR,
+        start_hub=True,
+        identity=service(Service.COORDINATOR),
+    ) as client:
         try:
             Coordinator(
                 client,

@@ -19,6 +19,7 @@ from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from fleet.recording.writing.disk_space import Reserve
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
+from schemas.identity import Service, service
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import RecorderState, RecorderVerb
@@ -168,7 +169,7 @@ def run(
     stop = threading.Event()
     signals.calls(stop.set)
     try:
-        with Bus.open(connect, start_hub=True) as bus:
+        with Bus.open(connect, start_hub=True, identity=service(Service.RECORDER)) as bus:
             recorder = Recorder(bus, fleet, place, options, pins=_pins(fleet_file), notify=_warn)
             session = recorder.start()
             if full := recorder.full:

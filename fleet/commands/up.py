@@ -29,7 +29,7 @@ from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
 from schemas import keys
-from schemas.bus import accepts, check_listening, resolve_endpoint
+from schemas.bus import accepts, check_listening, is_secure, resolve_endpoint
 from schemas.local_time import clock
 from schemas.process import signals, startup, stdio
 from schemas.yaml_document.document import read_text
@@ -79,6 +79,7 @@ recorded, 2 wrong use."""
 @connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
 @fleet_option(default=None)
 @click.option("--insecure-lan", is_flag=True, help="Open the bus to a network: everyone there can drive the cars.")
+@click.option("--secure", is_flag=True, help="Give everybody a certificate: nobody else on this computer gets in.")
 @click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
 @click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")
 def up(
@@ -95,6 +96,7 @@ def up(
     connect: str | None,
     fleet: str | None,
     insecure_lan: bool,
+    secure: bool,
     detach: bool,
     detached: bool,
 ) -> None:
@@ -108,7 +110,7 @@ def up(
     if detach:
         raise SystemExit(_run_detached(_own_arguments(), as_json=as_json))
     options = UpOptions(
-        simulated or 0, plan, world, record, out, connect, fleet, insecure_lan, console, console_port or 0
+        simulated or 0, plan, world, record, out, connect, fleet, insecure_lan, console, console_port or 0, secure
     )
     with cli_errors():
         if fleet is not None:
@@ -143,6 +145,7 @@ def up(
 def read(file: Path | None, options: UpOptions) -> FleetSpec:
     """Return the spec of the fleet file and the options, with a checked plan. Raises ValueError."""
     spec = build_spec(None if file is None else read_fleet(file, unbound=options.simulated > 0), options)
+    spec = _with_certificates(spec, secure=options.secure)
     for path in (spec.plan, spec.world):
         if path is None:
             continue
@@ -150,6 +153,23 @@ def read(file: Path | None, options: UpOptions) -> FleetSpec:
         if path is spec.plan:
             spec = _with_plan(spec, text)
     return spec
+
+
+def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
+    """Return the spec with the endpoint of a hub with certificates, if there is one here, or if there shall be one."""
+    endpoint = resolve_endpoint(spec.endpoint)
+    if not secure and not is_secure(endpoint):
+        return spec
+    from fleet.hub import local_hub  # needs an extra
+
+    if secure and not is_secure(endpoint):
+        endpoint = local_hub.SECURE_ENDPOINT
+    if secure or local_hub.is_hub_here(endpoint):
+        try:
+            local_hub.ensure_hub_here(endpoint, spec.cars)
+        except OSError as error:
+            raise click.ClickException(f"no certificates can be made: {error}") from None
+    return replace(spec, endpoint=endpoint)
 
 
 def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:

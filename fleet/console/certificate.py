@@ -4,8 +4,6 @@ import fcntl
 import hashlib
 import ipaddress
 import os
-import re
-import socket
 import ssl
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,7 +11,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
-import ifaddr
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -27,7 +24,6 @@ LIFETIME: Final = timedelta(days=397)
 RENEWAL_BEFORE: Final = timedelta(days=30)
 MAX_NAMES: Final = 24
 """Maximum number of names and addresses in a certificate."""
-_HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?(\.[A-Za-z0-9-]{1,63})*")
 
 
 class BadKeyFile(OSError):
@@ -49,29 +45,6 @@ class Certificate:
     def load_into(self, context: ssl.SSLContext) -> None:
         """Use it for new connections."""
         context.load_cert_chain(self.path, self.key_path)
-
-
-def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this computer in its networks. The one of the default route is the first."""
-    listed = [str(each.ip) for adapter in ifaddr.get_adapters() for each in adapter.ips if each.is_IPv4]
-    found = [each for each in listed if not ipaddress.ip_address(each).is_loopback]
-    first = _default_address()
-    return sorted(dict.fromkeys(found), key=lambda address: (address != first, address))
-
-
-def _default_address() -> str:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # an address for documentation; connecting UDP sends nothing
-        except OSError:
-            return ""
-        return str(probe.getsockname()[0])
-
-
-def own_names() -> list[str]:
-    """Return the host names of this computer."""
-    name = socket.gethostname().lower()
-    return [name, f"{name.partition('.')[0]}.local"] if _HOST_NAME.fullmatch(name) else []
 
 
 def names_to_certify(current: Iterable[str], certified: Iterable[str]) -> tuple[str, ...]:

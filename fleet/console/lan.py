@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import segno
 
-from fleet.console.certificate import Certificate, ensure_certificate, own_addresses, own_names
+from fleet.console.certificate import Certificate, ensure_certificate
 from fleet.console.connection_limit import ConnectionLimit, LogLimit
 from fleet.console.guard import DEVICE, PAIR_PATH, Scope
 from fleet.console.pairing import (
@@ -31,6 +31,7 @@ from fleet.console.pairing import (
     new_code,
 )
 from fleet.console.people_file import PeopleFile
+from fleet.hub.addresses import own_addresses, own_names
 from schemas.authority import NO_PEOPLE, People
 
 REVOCATION_INTERVAL_S: Final = 0.25

@@ -87,10 +87,10 @@ class ConsoleOperator:
             message.ttl_s = ttl_s
         payload = message.SerializeToString()
         encoding = messages.encoding_of(COMMANDS[Verb.DRIVE].message)
+        fleet, bus = self._fleet.sync.name, self._fleet.sync.bus
         for car in cars:
-            self._fleet.sync.bus.put_command(
-                keys.command_key(self._fleet.sync.name, car, Verb.DRIVE), payload, encoding, sequence
-            )
+            key = keys.command_key(fleet, car, Verb.DRIVE, bus.identity)
+            bus.put_command(key, payload, encoding, sequence)
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
         # A stream is rejected without words from the second time on, a query never.

@@ -80,7 +80,7 @@ class Operators:
         self._clients += 1
         client = self._fleet.sync
         sender = f"{default_sender(person)}.{self._clients}"
-        fleet = Fleet(client.bus.endpoint, client.name, sender=sender, kind=Rank.PERSON)
+        fleet = Fleet(client.bus.endpoint, client.name, sender=sender, kind=Rank.PERSON, identity=client.bus.identity)
         await fleet.__aenter__()
         return fleet, ConsoleOperator(fleet)
 

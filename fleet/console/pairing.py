@@ -10,14 +10,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal, Self
 
+from fleet.hub.join_code import CODE_ALPHABET
 from schemas import keys
 from schemas.backoff import backoff_s
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.words import Rank
 
-CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
-"""Letters and digits that nobody confuses."""
 CODE_LENGTH: Final = 8
 """40 random bits. At 1,000 guesses per second a code is found in its two minutes once in nine million times."""
 CODE_LIFETIME_S: Final = 120.0

@@ -90,7 +90,8 @@ class Coordinator:
         self._put_in_force(self.plan)
         bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._inbox.on_query)
         for verb in (PLAN_VERB, *PlanRequest):
-            bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._inbox.on_query)
+            for expression in keys.command_keys(fleet, keys.COORDINATOR, verb):
+                bus.queryable(expression, self._inbox.on_query)
         recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
         hubs, hub_keeper = bus.hubs, HubKeeper(bus.endpoint, HUB_OUTAGE_S, self.on_failure)
         with ThreadPoolExecutor(max_workers=32) as pool:

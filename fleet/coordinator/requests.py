@@ -8,7 +8,8 @@ from fleet.policy.requests import RequestRefused
 from schemas import keys, messages, topics
 from schemas.bus import reply_message
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Phase, Reason
+from schemas.identity import speaks_for
+from schemas.words import Phase, Rank, Reason
 
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
@@ -40,13 +41,26 @@ def plan_command(query: zenoh.Query) -> tuple[str, str]:
     """Return the text of the plan in a query (protobuf, JSON or plain text) and its sender. Raises BadPayload."""
     payload, encoding = _payload(query)
     if not encoding.startswith((topics.PROTOBUF, messages.JSON)):
-        return payload.decode(), _ANONYMOUS
+        return payload.decode(), _proven(query, "")
     message: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
-    return str(message.text), str(message.set_by) or _ANONYMOUS
+    return str(message.text), _proven(query, str(message.set_by))
 
 
 def sender_of(query: zenoh.Query, message_type: str) -> str:
     """Return the sender of a command with or without a payload. Raises BadPayload."""
     payload, encoding = _payload(query)
     command: Any = messages.parse(message_type, payload, encoding) if payload else None
-    return str(command.sender if command is not None else "") or _ANONYMOUS
+    return _proven(query, str(command.sender if command is not None else ""))
+
+
+def _proven(query: zenoh.Query, sender: str) -> str:
+    """Return the sender, or the owner of the certificate if none is named. Raises RequestRefused for another's name."""
+    key = str(query.key_expr)
+    identity, verb = keys.identity_of(key), key.rpartition("/")[2]
+    if not identity:
+        return sender or _ANONYMOUS
+    sender = sender or identity.partition(".")[2]
+    if not speaks_for(identity, sender, Rank.PERSON, verb):
+        words = f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only."
+        raise RequestRefused(words, Reason.NOT_ALLOWED)
+    return sender

@@ -25,6 +25,7 @@ from schemas.bus import (
 )
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.identity import speaks_for
 from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason, Verb
 
@@ -110,7 +111,8 @@ class SupervisorService:
 
         commands: Handover[zenoh.Query] = Handover(loop, command, limit=MAX_SUPERVISOR_QUERIES)
         self.bus.queryable(self._key("status"), questions)
-        self.bus.queryable(self._key("@cmd/*"), commands)
+        for expression in keys.command_keys(self.fleet, keys.SUPERVISOR):
+            self.bus.queryable(expression, commands)
         self.bus.token(keys.car_token(self.fleet, keys.SUPERVISOR))
         for expression in SUBSCRIPTIONS:
             self.bus.subscribe(f"{self.fleet}/{expression}", samples)
@@ -142,19 +144,21 @@ class SupervisorService:
         """Stop every car with one query. Call it on a thread."""
         # As a coordinator: the stop of a person or a script would put the cars on hold, also after the next start.
         command = pb.StopCommand(sender="supervisor", kind=Rank.COORDINATOR, id=uuid.uuid4().hex)
-        key, encoding = keys.command_key(self.fleet, "*", Verb.STOP), messages.encoding_of(COMMANDS[Verb.STOP].message)
+        key = keys.command_key(self.fleet, "*", Verb.STOP, self.bus.identity)
+        encoding = messages.encoding_of(COMMANDS[Verb.STOP].message)
         for _ in self.bus.query(key, payload=command.SerializeToString(), encoding=encoding):
             pass
 
     async def _on_command(self, query: zenoh.Query, services: Mapping[str, Service]) -> None:
         """Carry out a command and reply in the encoding of the query."""
-        verb = str(query.key_expr).rpartition("/")[2]
+        key = str(query.key_expr)
+        verb, identity = key.rpartition("/")[2], keys.identity_of(key)
         encoding = str(query.encoding) if query.encoding is not None else ""
         result = pb.Result(car=keys.SUPERVISOR, status=Phase.SENT)
         try:
             command = self._command(query, verb, encoding)
             result.id = command.id
-            result.words = await services[verb](command.sender or "anonymous")
+            result.words = await services[verb](_proven(identity, command.sender, verb))
         except (ReloadRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = Phase.REJECTED, Reason.BAD_VALUE, str(error)
         except RestartNeeded as error:
@@ -162,8 +166,9 @@ class SupervisorService:
         except Exception as error:  # noqa: BLE001 - reply to every query, whatever the error
             result.status, result.words = Phase.REJECTED, f"internal error: {type(error).__name__}: {error}"
             _log.exception("%s went wrong", verb)
+        key = keys.command_key(self.fleet, keys.SUPERVISOR, verb, identity)
         with query:
-            reply_message(query, self._key(f"@cmd/{verb}"), result, as_json=is_json_wanted(query))
+            reply_message(query, key, result, as_json=is_json_wanted(query))
 
     def _command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
         if verb not in SUPERVISOR_COMMANDS:
@@ -177,6 +182,14 @@ class SupervisorService:
             f"{keys.describe_fleet(self.fleet).capitalize()} is up already: process {other.pid} on {other.host} "
             f"({other.fleet_file or 'simulated cars'}). End it first: `fleet down`. Or name this one with --fleet."
         )
+
+
+def _proven(identity: str, sender: str, verb: str) -> str:
+    """Return the sender of a command. Raises ReloadRefused if a certificate names another one."""
+    sender = sender or identity.partition(".")[2] or "anonymous"
+    if identity and not speaks_for(identity, sender, Rank.PERSON, verb):
+        raise ReloadRefused(f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only.")
+    return sender
 
 
 def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float = 30.0) -> Any:

@@ -123,6 +123,8 @@ class UpOptions:
     insecure_lan: bool = False
     console: bool = False
     console_port: int = 0
+    secure: bool = False
+    """True to make this computer a hub with certificates."""
 
 
 def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, Final
@@ -38,6 +39,7 @@ from fleet.supervisor.spec import (
 )
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.identity import Service, service
 from schemas.keys import name_of
 from schemas.words import LinkState, Motors, ProcessKind, RecorderState, RunState
 from schemas.yaml_document.document import BadFile
@@ -228,7 +230,7 @@ class Supervisor:
         while not self._shutdown_requested.is_set():
             await self._turn()
             if await asyncio.to_thread(accepts, self.endpoint):
-                return await asyncio.to_thread(Bus.open, self.endpoint)
+                return await asyncio.to_thread(partial(Bus.open, self.endpoint, identity=service(Service.SUPERVISOR)))
             hub = self.processes.get(HUB)
             if self.processes.now > deadline:
                 words = hub.status.words if hub is not None else ""

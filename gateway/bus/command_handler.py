@@ -94,6 +94,7 @@ class CommandHandler:
             car=self._car,
             by_wildcard="*" in expression,
             unread=unread,
+            identity=keys.identity_of(expression),
         )
         before = self._control.safety.persisted
         command, answer = self._carry_out(request)
@@ -105,7 +106,7 @@ class CommandHandler:
             or (isinstance(command.what, Resume) and answer.reason is Reason.ESTOPPED)
         ):
             self._estop_sync.sync_soon()  # this gateway may have missed an e-stop or a pause, or its end
-        key = keys.command_key(self._fleet, self._car, verb)
+        key = keys.command_key(self._fleet, self._car, verb, request.identity)
         self._pending_queries.append(_PendingQuery(query, key, command.id, answer, as_json))
         self._wake()
 
@@ -122,6 +123,7 @@ class CommandHandler:
                 car=self._car,
                 by_wildcard="*" in sample.key,
                 unread=sample.unread,
+                identity=keys.identity_of(sample.key),
             )
             self._carry_out(request)
             self._wake()

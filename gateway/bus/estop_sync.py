@@ -95,7 +95,7 @@ class EstopSync:
         if isinstance(command.what, Resume | Unpause):
             # Under the same id it would be refused as a duplicate, or the sender's own command, if that comes later.
             payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
-        key = keys.command_key(self._fleet, "*", command.verb)
+        key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)
         task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, payload.SerializeToString(), encoding))
         self._forwarding.add(task)

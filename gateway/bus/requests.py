@@ -35,6 +35,7 @@ from gateway.control.commands import (
 from schemas import messages
 from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS
+from schemas.identity import speaks_for
 from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
@@ -74,6 +75,8 @@ class RawRequest:
     """True if one key expression addressed several cars."""
     unread: str = ""
     """Why the payload was not read; empty if it was."""
+    identity: str = ""
+    """Who sent it, proven by a certificate; empty on a bus without certificates."""
 
     @property
     def streamed(self) -> bool:
@@ -109,11 +112,25 @@ def parse(request: RawRequest) -> Command:
         words = f"{verb} without a payload: give {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
-        return _parse_payload(blank, request)
+        command = _parse_payload(blank, request)
     except BadRequest as error:
         if verb not in STOPS:
             raise
-        return _stop_anyway(error.command, error.words, request)
+        command = _stop_anyway(error.command, error.words, request)
+    return _proven(command, request.identity)
+
+
+def _proven(command: Command, identity: str) -> Command:
+    """Return a command whose sender is the owner of the certificate. Raises BadRequest if it is in another's name."""
+    sender = command.sender
+    if not identity or speaks_for(identity, sender.name, sender.kind, command.verb):
+        return command
+    words = f"{identity} sends it in the name of {sender.name} ({sender.kind})"
+    own = Sender(identity.partition(".")[2] or identity)
+    if command.verb in STOPS:  # whoever it was: the car stops, and holds for nobody else
+        return replace(command, sender=own, note=f"the gateway stops the car in spite of an error: {words}")
+    words = f"{command.verb}: {words}. Each certificate speaks for its owner only."
+    raise BadRequest(Reason.NOT_ALLOWED, words, replace(command, sender=own))
 
 
 def _stop_anyway(command: Command, words: str, request: RawRequest) -> Command:

@@ -64,8 +64,10 @@ class CarService:
         for family in FAMILIES:
             # A query on `fleet/**` reaches both: each answers for its own family only.
             opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._on_query, family))
-        opened.queryable(keys.command_key(fleet, car, "*"), self._on_command, too_large=self._on_oversized)
-        opened.subscribe(keys.command_key(fleet, car, Verb.DRIVE), self._stream, largest=bus.LARGEST_PAYLOAD)
+        for expression in keys.command_keys(fleet, car):
+            opened.queryable(expression, self._on_command, too_large=self._on_oversized)
+        for expression in keys.command_keys(fleet, car, Verb.DRIVE):
+            opened.subscribe(expression, self._stream, largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
         opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)

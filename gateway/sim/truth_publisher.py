@@ -18,6 +18,7 @@ from schemas import keys
 from schemas.bus import Bus, BusError, Publisher
 from schemas.gen import fleet_v1_pb2
 from schemas.geometry import Point
+from schemas.identity import Service, service
 from schemas.topics import TOPICS
 
 TRUTH_INTERVAL_S: Final = 0.1
@@ -115,7 +116,7 @@ class TruthPublisher:
 
     def _try(self, loop: asyncio.AbstractEventLoop, opened: "asyncio.Future[Bus | None]") -> None:
         try:
-            bus = Bus.open(self._endpoint, timeout_s=HUB_OPEN_TIMEOUT_S)
+            bus = Bus.open(self._endpoint, timeout_s=HUB_OPEN_TIMEOUT_S, identity=service(Service.SIMULATOR))
         except BusError:
             bus = None
 

@@ -5,13 +5,14 @@ Read `session` first: `Bus` is one Zenoh session. `endpoint` finds or starts the
 `hub_keeper` restarts a lost hub, `singleton` makes sure that there is only one service of a kind.
 """
 
+from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.bus.endpoint import (
-    DEFAULT_ENDPOINT,
     ENDPOINT_VARIABLE,
     accepts,
     check_listening,
     ensure_hub,
     is_loopback,
+    is_secure,
     resolve_endpoint,
     router_config,
 )
@@ -33,6 +34,7 @@ from schemas.bus.sample import (
 )
 from schemas.bus.session import Bus
 from schemas.bus.singleton import Singleton
+from schemas.state_dir import DEFAULT_ENDPOINT
 
 __all__ = [
     "BUSY",
@@ -44,10 +46,12 @@ __all__ = [
     "BadEndpoint",
     "Bus",
     "BusError",
+    "Credentials",
     "Failure",
     "Handover",
     "HubKeeper",
     "Latest",
+    "NoCredentials",
     "NoFleet",
     "Publisher",
     "Sample",
@@ -59,6 +63,7 @@ __all__ = [
     "intersects",
     "is_json_wanted",
     "is_loopback",
+    "is_secure",
     "messages_of",
     "refuse",
     "reply",

@@ -7,13 +7,15 @@ import re
 import socket
 import sys
 import time
+from collections.abc import Mapping
 from typing import Any, Final
 
 import zenoh
 
+from schemas.bus.credentials import Credentials
 from schemas.bus.errors import BadEndpoint, BusError, NoFleet
+from schemas.state_dir import DEFAULT_ENDPOINT, joined_endpoint
 
-DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
@@ -21,13 +23,13 @@ _LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
 def resolve_endpoint(argument: str | None = None) -> str:
-    """Return the endpoint: the argument, else FLEET_ENDPOINT, else loopback port 7447. Raises BadEndpoint."""
+    """Return the endpoint: the argument, FLEET_ENDPOINT, the joined hub, or loopback port 7447. Raises BadEndpoint."""
     if argument:
         _host_and_port(argument)
         return argument
     given = os.environ.get(ENDPOINT_VARIABLE)
     if not given:
-        return DEFAULT_ENDPOINT
+        return joined_endpoint() or DEFAULT_ENDPOINT
     try:
         _host_and_port(given)
     except BadEndpoint as error:
@@ -63,29 +65,41 @@ def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
 
 # The cost of each default that this replaces is in docs/explanation/measurements.md#one-hub; the reason for the
 # lease is in docs/explanation/measurements.md#cut-links.
-_COMMON: Final[dict[str, Any]] = {
-    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
-    "timestamping": {"enabled": True},
-    "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 2000}}},
-}
+def _common(link: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "timestamping": {"enabled": True},
+        "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 2000}, **link}},
+    }
+
+
+def is_secure(endpoint: str) -> bool:
+    """Return True if links to the endpoint have certificates."""
+    return endpoint.startswith(("tls/", "quic/"))
 
 
 def router_config(endpoint: str) -> zenoh.Config:
-    """Return the configuration of the hub. All other sessions are its clients."""
+    """Return the configuration of the hub. All other sessions are its clients. Raises BadEndpoint, BusError."""
     _host_and_port(endpoint)
-    listen = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
-    return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_COMMON}))
+    listen: dict[str, Any] = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
+    if not is_secure(endpoint):
+        return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_common({})}))
+    credentials = Credentials.of(endpoint)
+    listen["endpoints"] = credentials.listens or [endpoint]
+    own = {"mode": "router", "listen": listen, "access_control": credentials.access_control}
+    return zenoh.Config.from_json5(json.dumps({**own, **_common(credentials.of_hub())}))
 
 
-def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
-    """Return the configuration of a client of the hub, which retries for `timeout_s`."""
+def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.Config:
+    """Return the configuration of a client of the hub, which retries for `timeout_s`. Raises BusError."""
     connect = {
         "endpoints": [endpoint],
         "timeout_ms": int(timeout_s * 1000),
         "exit_on_failure": True,
         "retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
     }
-    return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_COMMON}))
+    link = Credentials.of(endpoint).of_client(identity) if is_secure(endpoint) else {}
+    return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_common(link)}))
 
 
 def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:

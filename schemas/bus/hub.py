@@ -5,6 +5,8 @@ The listening port is the mutex: a second hub on it fails at once. `bus.ensure_h
 """
 
 import argparse
+import contextlib
+import json
 import sys
 import threading
 import time
@@ -12,24 +14,66 @@ from typing import Final
 
 import zenoh
 
-from schemas.bus import DEFAULT_ENDPOINT, BusError, check_listening, router_config
+from schemas.atomic_file import write_atomically
+from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
+from schemas.bus.credentials import HUB, HUB_FILE
 from schemas.process import signals
 
 IDLE_S: Final = 10.0
 """Time from the last link until the hub exits."""
 _POLL_S: Final = 0.5
+LINKS_FILE: Final = "links.json"
+"""File with the addresses from which each identity is connected."""
 
 
 def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
-    """Route until `stop` is set or there was no link for `idle_s`. Raises zenoh.ZError if the port is in use."""
-    with zenoh.open(router_config(endpoint)) as session:
-        last_link = time.monotonic()
-        while not stop.wait(_POLL_S):
-            now = time.monotonic()
-            if session.info.transports():
-                last_link = now
-            elif now - last_link > idle_s:
-                return
+    """Route until `stop` is set or there was no link for `idle_s`. Raises zenoh.ZError if the port is in use, BusError.
+
+    A hub with rules opens a new session when they change, as Zenoh reads them only then. Clients are back soon.
+    """
+    last_link = time.monotonic()
+    links: _Links | None = None
+    while not stop.is_set():
+        rules = _rules_changed_at(endpoint)
+        with zenoh.open(router_config(endpoint)) as session:
+            while not stop.wait(_POLL_S) and _rules_changed_at(endpoint) == rules:
+                links = _tell_links(endpoint, session, links)
+                now = time.monotonic()
+                if session.info.transports():
+                    last_link = now
+                elif now - last_link > idle_s:
+                    return
+
+
+def _rules_changed_at(endpoint: str) -> tuple[int, ...]:
+    """Return when the rules and the certificate of a hub were written, ns since the epoch. Empty without them."""
+    if not is_secure(endpoint):
+        return ()
+    directory = Credentials.of(endpoint).directory
+    try:
+        return tuple((directory / name).stat().st_mtime_ns for name in (HUB_FILE, f"{HUB}.pem"))
+    except FileNotFoundError:
+        return ()
+
+
+_Links = dict[str, list[str]]
+"""Addresses by common name."""
+
+
+def _tell_links(endpoint: str, session: zenoh.Session, before: _Links | None) -> _Links | None:
+    """Write who is connected, by common name, if that changed. `fleet hub show` reads it."""
+    if not is_secure(endpoint):
+        return None
+    links: _Links = {}
+    for link in session.info.links():
+        if link.auth_identifier:
+            links.setdefault(link.auth_identifier, []).append(link.dst.partition("/")[2])
+    links = {name: sorted(addresses) for name, addresses in sorted(links.items())}
+    if links != before:
+        with contextlib.suppress(OSError):  # it only informs
+            path = Credentials.of(endpoint).directory / LINKS_FILE
+            write_atomically(path, json.dumps(links).encode(), private=True)
+    return links
 
 
 def main() -> int:

@@ -9,7 +9,8 @@ from typing import Any, Final, Self, TypeVar
 
 import zenoh
 
-from schemas.bus.endpoint import accepts, client_config, ensure_hub, resolve_endpoint
+from schemas.bus.credentials import Credentials
+from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_secure, resolve_endpoint
 from schemas.bus.errors import BusError, NoFleet
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
@@ -34,8 +35,10 @@ _MAX_QUEUED_ANSWERS: Final = 1 << 16
 class Bus:
     """One Zenoh session. Close it (`with`). The interpreter closes open ones when it exits, with a ResourceWarning."""
 
-    def __init__(self, session: zenoh.Session, endpoint: str) -> None:
+    def __init__(self, session: zenoh.Session, endpoint: str, identity: str = "") -> None:
         self._session = session
+        self.identity = identity
+        """Whose certificate this session has, such as `person.mia`. Empty on a bus without certificates."""
         self._declarations: list[Any] = []
         self._lock = threading.Lock()
         self._threads: set[threading.Thread] = set()
@@ -48,12 +51,17 @@ class Bus:
         atexit.register(self._close_at_exit)
 
     @classmethod
-    def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 5.0) -> Self:
+    def open(
+        cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 5.0, identity: str = ""
+    ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
         start_hub: True to start a hub if there is none. Otherwise a missing hub raises NoFleet.
+        identity: the one to connect as, such as `car.red`, if this computer has its certificate. By default, and
+        otherwise, it is that of the user. It matters only to a hub with certificates. Raises NoCredentials.
         """
         where = resolve_endpoint(endpoint)
+        identity = Credentials.of(where).identity(identity) if is_secure(where) else ""
         if start_hub:
             ensure_hub(where)
         elif not accepts(where):
@@ -64,12 +72,13 @@ class Bus:
             )
         with signals.held_back():
             try:
-                session = zenoh.open(client_config(where, timeout_s))
+                session = zenoh.open(client_config(where, timeout_s, identity))
             except zenoh.ZError as error:
+                may_be = f", or refuses the certificate of {identity}" if identity else ""
                 raise BusError(
-                    f"{where} does not answer, or is no Zenoh router. Name the fleet's address with --connect."
+                    f"{where} does not answer, or is no Zenoh router{may_be}. Name the fleet's address with --connect."
                 ) from error
-            return cls(session, where)
+            return cls(session, where, identity)
 
     def __enter__(self) -> Self:
         return self

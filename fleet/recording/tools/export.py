@@ -211,7 +211,7 @@ def own_type(key: str) -> str:
     if topic is not None:
         return topic.message
     parsed = keys.parse(key)
-    command = COMMANDS.get(parsed.topic.removeprefix("@cmd/")) if parsed is not None else None
+    command = COMMANDS.get(parsed.topic.rpartition("/")[2]) if parsed is not None else None
     return command.message if command is not None and parsed is not None and parsed.topic.startswith("@cmd/") else ""
 
 

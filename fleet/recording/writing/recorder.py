@@ -158,7 +158,8 @@ class Recorder:
         self._writer.start()
         self._backfill.start()
         self._bus.queryable(key, self._on_query)
-        self._bus.queryable(keys.command_key(self._fleet, keys.RECORDER, "*"), self._on_query)
+        for expression in keys.command_keys(self._fleet, keys.RECORDER):
+            self._bus.queryable(expression, self._on_query)
         token = keys.car_token(self._fleet, keys.RECORDER)
         self._bus.token(token)
         # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.

@@ -16,9 +16,10 @@ from fleet.console.connection_limit import (
     LogLimit,
 )
 from fleet.console.pairing import BadBook, GuessLimit, PagePerson, PeopleBook, UnknownPerson, code_words, new_code
+from fleet.hub.join_code import CODE_ALPHABET
 
 MIA = PagePerson("mia")
-CODES = st.text(pairing.CODE_ALPHABET, min_size=pairing.CODE_LENGTH, max_size=pairing.CODE_LENGTH)
+CODES = st.text(CODE_ALPHABET, min_size=pairing.CODE_LENGTH, max_size=pairing.CODE_LENGTH)
 NOW = 1.8e9
 
 
@@ -162,7 +163,7 @@ def test_the_memory_of_guesses_is_bounded() -> None:
 
 def test_codes_have_no_letters_that_are_confused() -> None:
     assert new_code(lambda letters: letters[0]) == "22222222"
-    assert not {*"01IO"} & {*pairing.CODE_ALPHABET}
+    assert not {*"01IO"} & {*CODE_ALPHABET}
 
 
 # ---------------------------------------------------------------- connections

@@ -1,0 +1,187 @@
+"""`fleet hub`, `fleet join`, `fleet leave`: a bus with certificates and rules, on one computer or on several."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.commands.group import CommandGroup
+from fleet.commands.options import cli_errors, json_option
+from fleet.commands.output import show_table
+from fleet.hub import local_hub
+from fleet.hub.addresses import own_addresses
+from fleet.hub.hub_store import HubStore, KnownIdentity
+from fleet.hub.invitation import JOIN_PORT, Invitation, join
+from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
+from schemas import identity, keys
+from schemas.bus import Bus, is_secure, resolve_endpoint
+from schemas.bus.hub import LINKS_FILE
+from schemas.printable import printable
+
+DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
+
+
+@click.group(
+    cls=CommandGroup,
+    epilog="""\b
+examples:
+  fleet hub init
+  fleet hub invite mia
+  fleet hub invite --car red
+  fleet hub show
+""",
+)
+def hub() -> None:
+    """Make this computer the hub of several: with certificates, so that everybody is who they say."""
+
+
+@hub.command(epilog="\b\nexample:\n  fleet hub init")
+def init() -> None:
+    """Make this computer the hub that other computers may join.
+
+    It gets an authority, and a certificate for you, for each car and each service. It listens on the network, with TLS:
+    who has no certificate gets nothing. `fleet up` starts it. On one computer alone, `fleet up --secure` does the same,
+    and listens on loopback only.
+    """
+    with cli_errors(), _disk_errors():
+        store = local_hub.ensure_hub_here(local_hub.SECURE_ENDPOINT, listens=(local_hub.EVERYWHERE,))
+    name = store.credentials.me.partition(".")[2]
+    click.echo(
+        f"This computer is a hub now, and you are {name} there. Its authority is in {store.directory}: keep a copy of "
+        "ca.key and ca.pem in a safe place.\n`fleet up` starts it. `fleet hub invite NAME` lets the computer of a "
+        "person join, and `fleet hub invite --car NAME` one with a car."
+    )
+
+
+@hub.command(epilog="\b\nexamples:\n  fleet hub invite mia\n  fleet hub invite --car red")
+@click.argument("person", required=False)
+@click.option("--car", help="Invite a computer that runs the gateway of this car.")
+@click.option("--port", type=click.IntRange(1, 65535), default=JOIN_PORT, show_default=True, help="Listen here.")
+@click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
+@json_option
+def invite(person: str | None, car: str | None, port: int, host: str | None, *, as_json: bool) -> None:
+    """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
+
+    The hub restarts first, since it gets another rule: drives end, modes go on, and all are back after a second.
+    """
+    if (person is None) == (car is None):
+        raise click.UsageError("say who is invited: fleet hub invite NAME, or fleet hub invite --car NAME")
+    with cli_errors(), _disk_errors():
+        name = keys.check_name(person or car or "", "person" if person else "car name")
+        invited = identity.person(name) if person else identity.car(name)
+        endpoint = resolve_endpoint()
+        store = _own_store(endpoint)
+        store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed
+        store.reserve(invited)
+        text = DEFAULT_FLEET_FILE.read_text(encoding="utf-8") if DEFAULT_FLEET_FILE.is_file() else ""
+        hub_port = int(endpoint.rpartition(":")[2])
+        invitation = Invitation(store, invited, hub_port=hub_port, port=port, fleet_file=text)
+    try:
+        here = host or next(iter(own_addresses()), "127.0.0.1")
+        if port != JOIN_PORT:
+            here = f"{here}:{port}"
+        if as_json:
+            click.echo(json.dumps({"identity": invited, "host": here, "code": str(invitation.code)}))
+        else:
+            click.echo(f"On the other computer, within ten minutes:\n  fleet join {here} {invitation.code}")
+        why = invitation.wait(JOIN_CODE_LIFETIME_S)
+    finally:
+        invitation.close()
+    if why:
+        raise click.ClickException(f"{name}: {why}")
+    click.echo(f"{name} has joined from {invitation.joined_from}")
+
+
+@hub.command(epilog="\b\nexamples:\n  fleet hub show\n  fleet hub show --json")
+@json_option
+def show(*, as_json: bool) -> None:
+    """Show who may connect, who is connected now and from where, and when certificates end."""
+    with cli_errors():
+        store = _own_store(resolve_endpoint())
+    links = _links(store)
+    rows = [_row(name, each, links) for name, each in sorted(store.known.items())]
+    if as_json:
+        for row in rows:
+            click.echo(json.dumps(row))
+        return
+    show_table(("identity", "state", "from", "until"), rows)
+
+
+@hub.command(epilog="\b\nexamples:\n  fleet hub revoke person.mia\n  fleet hub revoke car.red")
+@click.argument("who", metavar="IDENTITY")
+def revoke(who: str) -> None:
+    """Deny everything to an identity, from now on. The hub restarts; all others are back after a second."""
+    with cli_errors(), _disk_errors():
+        store = _own_store(resolve_endpoint())
+        if who == store.credentials.me:
+            raise click.UsageError(f"{who} is you, on the hub's own computer: nobody could undo it")
+        if not store.revoke(who):
+            there = ", ".join(name for name, each in sorted(store.known.items()) if not each.revoked)
+            raise click.UsageError(f"{printable(who)} has no certificate. There are: {there}")
+    click.echo(f"{who} is revoked. Its cars may still move: stop them with `fleet stop`.")
+
+
+@click.command("join", epilog="\b\nexample:\n  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ")
+@click.argument("host")
+@click.argument("code")
+def join_hub(host: str, code: str) -> None:
+    """Join the hub on another computer, with the code that `fleet hub invite` shows there.
+
+    From then on every program of yours uses that hub, until `fleet leave`.
+    """
+    with cli_errors(), _disk_errors():
+        parsed = JoinCode.parse(code)
+        name, _, port = host.rpartition(":") if host.rpartition(":")[2].isdigit() else (host, "", "")
+        joined = join(name or host, parsed, int(port or JOIN_PORT))
+        endpoint = local_hub.store_joined(name or host, joined)
+        with Bus.open(endpoint) as bus:
+            cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
+    click.echo(f"You are {joined.identity} at {endpoint} now. Cars: {', '.join(cars) or 'none is on'}.")
+    if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
+        DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
+        click.echo(f"{DEFAULT_FLEET_FILE} is a copy of the hub's.")
+
+
+@click.command(epilog="\b\nexample:\n  fleet leave")
+def leave() -> None:
+    """Leave the hub that this computer has joined. Its certificate here is deleted."""
+    with cli_errors(), _disk_errors():
+        endpoint, kept = local_hub.leave()
+    if not endpoint:
+        raise click.ClickException("this computer has joined no hub")
+    words = f"; its authority stays in {kept}, for the next `fleet up --secure`" if kept else ""
+    click.echo(f"{endpoint} is no longer used{words}")
+
+
+def _own_store(endpoint: str) -> HubStore:
+    if not is_secure(endpoint) or not (store := HubStore.of(endpoint)).is_hub:
+        raise click.ClickException(
+            f"This computer is no hub ({endpoint}). `fleet hub init` makes it one. These commands are for its computer."
+        )
+    return store
+
+
+def _links(store: HubStore) -> dict[str, list[str]]:
+    """Return the addresses from which each common name is connected."""
+    try:
+        found = json.loads((store.directory / LINKS_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {str(name): [str(each) for each in addresses] for name, addresses in found.items()}
+
+
+def _row(name: str, known: KnownIdentity, links: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    there = links.get(known.common_name(name), ())
+    state = "revoked" if known.revoked else "connected" if there else "not connected"
+    return {"identity": name, "state": state, "from": ", ".join(there) or "-", "until": known.until[:10]}
+
+
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise click.ClickException(f"{error.filename or 'the network'}: {error.strerror or error}") from None

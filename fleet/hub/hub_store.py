@@ -1,0 +1,187 @@
+"""The files of a hub on its own computer: its authority, its identities, its rules. See schemas/bus/credentials.py.
+
+`identities.json` lists who has a certificate. Whoever is revoked and joins again gets another common name, so that the
+earlier certificate stays worthless.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, Self
+
+from fleet.hub import authority
+from fleet.hub.authority import KeyPair
+from fleet.hub.rules import access_control
+from schemas.atomic_file import write_atomically
+from schemas.bus import BusError, Credentials
+from schemas.bus.credentials import CA_FILE, HUB, HUB_FILE, ME_FILE
+from schemas.identity import parse
+
+CA_KEY_FILE: Final = "ca.key"
+IDENTITIES_FILE: Final = "identities.json"
+
+
+class BrokenHub(BusError):
+    """The files of the hub are damaged. The text says which, and what to do."""
+
+
+@dataclass(slots=True)
+class KnownIdentity:
+    """One identity that has a certificate."""
+
+    until: str
+    """When its certificate ends, ISO 8601, UTC."""
+    generation: int = 1
+    """Number of its common name."""
+    revoked: bool = False
+    local: bool = False
+    """True if its key is on this computer."""
+
+    def common_name(self, identity: str) -> str:
+        """Return the common name of its certificate."""
+        return identity if self.generation == 1 else f"{identity}.{self.generation}"
+
+
+@dataclass(slots=True)
+class HubStore:
+    """The files of one hub."""
+
+    credentials: Credentials
+    known: dict[str, KnownIdentity] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, endpoint: str) -> Self:
+        """Return the files of the hub at an endpoint. Raises BrokenHub."""
+        return cls.load(Credentials.of(endpoint))
+
+    @classmethod
+    def load(cls, credentials: Credentials) -> Self:
+        """Return the files of a hub. Raises BrokenHub."""
+        store = cls(credentials)
+        path = store.directory / IDENTITIES_FILE
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            store.known = {name: KnownIdentity(**each) for name, each in found.items()}
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise BrokenHub(
+                f"{path} is damaged: {error}. Restore it from a copy, or begin anew: move {store.directory} away, "
+                "`fleet hub init`, and let everyone join again."
+            ) from None
+        return store
+
+    @property
+    def directory(self) -> Path:
+        """Return the directory of the files."""
+        return self.credentials.directory
+
+    @property
+    def is_hub(self) -> bool:
+        """Return True if this computer has the authority of the hub."""
+        return (self.directory / CA_KEY_FILE).is_file()
+
+    def ensure(
+        self,
+        identities: Iterable[str],
+        me: str,
+        *,
+        addresses: Iterable[str],
+        listens: Iterable[str] = (),
+        now: datetime | None = None,
+    ) -> None:
+        """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
+
+        addresses: IP addresses and names under which others reach the hub. listens: its endpoints; empty: as before.
+        Raises OSError, BrokenHub.
+        """
+        now = datetime.now(UTC) if now is None else now
+        self.directory.mkdir(parents=True, exist_ok=True)
+        os.chmod(self.directory, 0o700)  # noqa: PTH101 - it has keys
+        if not self.is_hub:
+            if self.credentials.exist:
+                raise BrokenHub(
+                    f"{self.directory} has the certificate of the hub's authority, and not its key: this computer has "
+                    "joined another one's hub (`fleet leave` ends that), or the key is lost. Then restore it from a "
+                    "copy, or move the directory away, and let everyone join again."
+                )
+            self._write_pair("ca", authority.make_authority(now))
+        names = tuple(dict.fromkeys(("localhost", "127.0.0.1", *addresses)))
+        if authority.is_due(self._read(HUB), now, names):
+            self._write_pair(HUB, authority.issue(self._authority(), HUB, now, names))
+        for identity in dict.fromkeys((*identities, me)):
+            self._ensure_local(identity, now)
+        write_atomically(self.directory / ME_FILE, me.encode(), private=True)
+        self._save(listens)
+
+    def reserve(self, identity: str, now: datetime | None = None) -> None:
+        """Write the rules for an identity of another computer, which has no certificate yet. Raises OSError.
+
+        Its earlier certificate, if it had one, is worthless from now on.
+        """
+        self.known[identity] = self._next(identity, datetime.now(UTC) if now is None else now)
+        self._save()
+
+    def sign(self, request: bytes, identity: str, now: datetime) -> bytes:
+        """Return the certificate of a reserved identity, PEM. Raises BadRequestForCertificate, OSError."""
+        entry = self.known[identity]
+        certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
+        entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+        self._save()
+        return certificate
+
+    def revoke(self, identity: str) -> bool:
+        """Deny everything to an identity. Return False if it has no certificate. Raises OSError."""
+        entry = self.known.get(identity)
+        if entry is None or entry.revoked:
+            return False
+        entry.revoked = True
+        for ending in (".pem", ".key"):
+            (self.directory / f"{identity}{ending}").unlink(missing_ok=True)
+        self._save()
+        return True
+
+    def _ensure_local(self, identity: str, now: datetime) -> None:
+        assert parse(identity) is not None, identity
+        entry = self.known.get(identity)
+        if entry is not None and entry.local and not entry.revoked and not authority.is_due(self._read(identity), now):
+            return
+        if entry is None or entry.revoked or not entry.local:
+            entry = self._next(identity, now)
+        entry.local = True
+        entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+        self._write_pair(identity, authority.issue(self._authority(), entry.common_name(identity), now))
+        self.known[identity] = entry
+
+    def _next(self, identity: str, now: datetime) -> KnownIdentity:
+        """Return the entry of a new certificate. An earlier certificate of this identity is worthless then."""
+        before = self.known.get(identity)
+        until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+        return KnownIdentity(until, 1 if before is None else before.generation + 1)
+
+    def _save(self, listens: Iterable[str] = ()) -> None:
+        """Write the identities, and the rules if they changed: the hub restarts then."""
+        stored: Mapping[str, object] = {name: asdict(each) for name, each in sorted(self.known.items())}
+        write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)
+        path = self.directory / HUB_FILE
+        chosen = list(listens) or (self.credentials.listens if path.exists() else [])
+        allowed = [(name, each.common_name(name)) for name, each in self.known.items() if not each.revoked]
+        made = json.dumps({"listen": chosen, "access_control": access_control(sorted(allowed))}, indent=1).encode()
+        if not path.exists() or path.read_bytes() != made:
+            write_atomically(path, made, private=True)
+
+    def _authority(self) -> KeyPair:
+        return KeyPair((self.directory / CA_FILE).read_bytes(), (self.directory / CA_KEY_FILE).read_bytes())
+
+    def _read(self, name: str) -> bytes:
+        try:
+            return (self.directory / f"{name}.pem").read_bytes()
+        except FileNotFoundError:
+            return b""
+
+    def _write_pair(self, name: str, pair: KeyPair) -> None:
+        write_atomically(self.directory / f"{name}.key", pair.key, private=True)
+        write_atomically(self.directory / f"{name}.pem", pair.certificate, private=True)

@@ -1,0 +1,203 @@
+"""Lets one other computer join the hub, once, within ten minutes: the server on the hub's side, and the client.
+
+The client makes its key itself; the key never leaves it. It sends a request for a certificate with the secret half of
+the code. The hub decides which identity the certificate has.
+"""
+
+import base64
+import http.client
+import json
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Final
+
+from fleet.hub import authority
+from fleet.hub.authority import BadRequestForCertificate
+from fleet.hub.hub_store import HubStore
+from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
+from schemas.bus import BusError
+from schemas.bus.credentials import CA_FILE, HUB
+
+JOIN_PORT: Final = 7448
+MAX_JOIN_REQUEST_BYTES: Final = 16_384
+SOCKET_TIMEOUT_S: Final = 10.0
+"""Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
+
+
+class NotJoined(BusError):
+    """The hub did not let this computer join. The text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """What a computer gets that joins."""
+
+    identity: str
+    port: int
+    """Port of the hub."""
+    ca: bytes
+    certificate: bytes
+    key: bytes
+    fleet_file: str = ""
+
+
+class Invitation:
+    """The server for one invitation. `wait` returns when somebody has joined, or nobody may any more."""
+
+    def __init__(
+        self,
+        store: HubStore,
+        identity: str,
+        *,
+        hub_port: int,
+        address: str = "",
+        port: int = JOIN_PORT,
+        fleet_file: str = "",
+    ) -> None:
+        """Listen. Raises OSError if the port is in use."""
+        ca = (store.directory / CA_FILE).read_bytes()
+        self.code = JoinCode.new(authority.fingerprint(ca))
+        self.joined_from = ""
+        """Address of the computer that has joined; empty before."""
+        self._answer = {"port": hub_port, "fleet_file": fleet_file, "identity": identity}
+        self._store = store
+        self._identity = identity
+        self._ca = ca
+        self._wrong = 0
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._server = ThreadingHTTPServer((address, port), self._handler())
+        self._server.daemon_threads = True
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(store.directory / f"{HUB}.pem", store.directory / f"{HUB}.key")
+        # The handshake is left to the thread of the connection: a stranger who sends nothing then holds up nobody.
+        self._server.socket = context.wrap_socket(self._server.socket, server_side=True, do_handshake_on_connect=False)
+        self._thread = threading.Thread(target=self._server.serve_forever, name="invitation", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """Return the port it listens on."""
+        return int(self._server.server_address[1])
+
+    def wait(self, timeout_s: float = JOIN_CODE_LIFETIME_S) -> str:
+        """Wait until somebody has joined. Return an empty text then, else why nobody can join any more."""
+        if not self._over.wait(timeout_s):
+            return f"nobody has joined within {timeout_s / 60:g} minutes"
+        return "" if self.joined_from else f"{MAX_GUESSES} wrong codes came: this code is over"
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def _take(self, guess: str, request: bytes, source: str) -> tuple[int, dict[str, Any]]:
+        """Return the answer to a request to join: HTTP status and fields."""
+        with self._lock:
+            if self._over.is_set():
+                return 410, {"error": "this code is used or over: `fleet hub invite` makes another one"}
+            if not self.code.is_secret(guess):
+                self._wrong += 1
+                if self._wrong >= MAX_GUESSES:
+                    self._over.set()
+                return 403, {"error": "the code is wrong"}
+            try:
+                certificate = self._store.sign(request, self._identity, datetime.now(UTC))
+            except BadRequestForCertificate as error:
+                return 400, {"error": str(error)}
+            except OSError as error:
+                return 500, {"error": f"the hub cannot store it: {error.strerror or error}"}
+            self.joined_from = source
+            self._over.set()
+            return 200, {**self._answer, "certificate": certificate.decode(), "ca": self._ca.decode()}
+
+    def _handler(self) -> type[BaseHTTPRequestHandler]:
+        invitation = self
+
+        class Handler(BaseHTTPRequestHandler):
+            timeout = SOCKET_TIMEOUT_S
+
+            def do_GET(self) -> None:
+                """Return the certificate of the authority, which is no secret."""
+                self._send(200, {"ca": invitation._ca.decode()})
+
+            def do_POST(self) -> None:
+                try:
+                    length = int(self.headers.get("Content-Length", "0"))
+                    if not 0 < length <= MAX_JOIN_REQUEST_BYTES:
+                        self._send(413, {"error": f"a request has 1 to {MAX_JOIN_REQUEST_BYTES} bytes"})
+                        return
+                    asked = json.loads(self.rfile.read(length))
+                    guess, request = str(asked["secret"]), base64.b64decode(asked["request"], validate=True)
+                except (ValueError, KeyError, TypeError):
+                    self._send(400, {"error": "it is no request to join"})
+                    return
+                self._send(*invitation._take(guess, request, str(self.client_address[0])))
+
+            def log_message(self, *_: object) -> None:
+                """Log nothing: strangers would fill the terminal."""
+
+            def _send(self, status: int, fields: dict[str, Any]) -> None:
+                body = json.dumps(fields).encode()
+                self.send_response(status)
+                self.send_header("Content-Type", "application/json")
+                self.send_header("Content-Length", str(len(body)))
+                self.send_header("Connection", "close")
+                self.end_headers()
+                self.wfile.write(body)
+
+        return Handler
+
+
+def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], float] = time.time) -> Joined:
+    """Join the hub on another computer. Raises NotJoined."""
+    where = f"{host}:{port}"
+    anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code says whether it is the right one
+    ca = str(_ask(where, anyone, "GET", None)["ca"]).encode()
+    try:
+        fits = code.fits(authority.fingerprint(ca))
+    except ValueError:
+        fits = False
+    if not fits:
+        raise NotJoined(
+            f"{where} is not the hub that made this code, or the code is mistyped. Nothing was sent. If the code is "
+            "right, somebody in this network pretends to be the hub."
+        )
+    known = ssl.create_default_context(cadata=ca.decode())
+    key, request = authority.new_request("joins")
+    asked = {"secret": code.secret, "request": base64.b64encode(request).decode()}
+    found = _ask(where, known, "POST", json.dumps(asked).encode())
+    try:
+        certificate = str(found["certificate"]).encode()
+        if authority.expires(certificate).timestamp() <= clock():
+            raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")
+        return Joined(str(found["identity"]), int(found["port"]), ca, certificate, key, str(found["fleet_file"]))
+    except (KeyError, ValueError):
+        raise NotJoined(f"{where} gave no certificate") from None
+
+
+def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -> dict[str, Any]:
+    """Send a request and return the fields of the answer. Raises NotJoined."""
+    connection = http.client.HTTPSConnection(where, timeout=SOCKET_TIMEOUT_S, context=context)
+    try:
+        connection.request(method, "/join", body)
+        answer = connection.getresponse()
+        found = json.loads(answer.read(4 * MAX_JOIN_REQUEST_BYTES))
+        if answer.status != 200:
+            raise NotJoined(f"{where}: {found['error']}")
+        return dict(found)
+    except ssl.SSLCertVerificationError as error:
+        raise NotJoined(f"{where} has a certificate for other addresses: {error.verify_message}") from None
+    except (OSError, http.client.HTTPException) as error:
+        raise NotJoined(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
+    except (ValueError, KeyError, TypeError):
+        raise NotJoined(f"{where} is no hub: its answer is not understood") from None
+    finally:
+        connection.close()

@@ -1,0 +1,66 @@
+"""The code with which a computer joins a hub: a secret, and what tells the right hub from another. Pure.
+
+Who joins connects to a computer whose certificate it does not know. The second half of the code is the begin of the
+fingerprint of the hub's authority, so nobody between the two can pretend to be the hub.
+"""
+
+import base64
+import hmac
+import secrets
+from dataclasses import dataclass
+from typing import Final, Self
+
+CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
+"""Letters and digits that nobody confuses."""
+_BASE32: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ234567"
+_HALF: Final = 12
+"""Length of each half: 60 bits. The hub takes five guesses; a false authority with this begin costs 10^18 tries."""
+_GROUP: Final = 4
+JOIN_CODE_LIFETIME_S: Final = 600.0
+MAX_GUESSES: Final = 5
+"""Wrong codes after which an invitation ends."""
+
+
+class BadCode(ValueError):
+    """A text that is no code."""
+
+
+@dataclass(frozen=True, slots=True)
+class JoinCode:
+    """A code of 24 characters."""
+
+    secret: str
+    pin: str
+
+    @classmethod
+    def new(cls, fingerprint: bytes) -> Self:
+        """Return a new code for the authority with this SHA-256."""
+        return cls("".join(secrets.choice(CODE_ALPHABET) for _ in range(_HALF)), pin_of(fingerprint))
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the code in a text as a person types it. Raises BadCode."""
+        letters = "".join(each for each in text.upper() if not (each in "-_." or each.isspace()))
+        if len(letters) != 2 * _HALF or set(letters) - set(CODE_ALPHABET):
+            raise BadCode(
+                f"{text!r} is not a code: it has {2 * _HALF} characters of {CODE_ALPHABET}, in groups of {_GROUP}"
+            )
+        return cls(letters[:_HALF], letters[_HALF:])
+
+    def __str__(self) -> str:
+        letters = self.secret + self.pin
+        return "-".join(letters[at : at + _GROUP] for at in range(0, len(letters), _GROUP))
+
+    def fits(self, fingerprint: bytes) -> bool:
+        """Return True if the authority with this SHA-256 made the code."""
+        return hmac.compare_digest(self.pin, pin_of(fingerprint))
+
+    def is_secret(self, guess: str) -> bool:
+        """Return True for the secret half. Takes as long for any guess."""
+        return hmac.compare_digest(self.secret.encode(), guess.encode())
+
+
+def pin_of(fingerprint: bytes) -> str:
+    """Return the half of a code that names an authority."""
+    letters = base64.b32encode(fingerprint).decode()[:_HALF]
+    return letters.translate(str.maketrans(_BASE32, CODE_ALPHABET))

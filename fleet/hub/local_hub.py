@@ -1,0 +1,98 @@
+"""Makes this computer the hub, lets it join another one's, and ends that."""
+
+import getpass
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from fleet.hub.addresses import own_addresses, own_names
+from fleet.hub.hub_store import HubStore
+from fleet.hub.invitation import Joined
+from schemas import identity
+from schemas.atomic_file import write_atomically
+from schemas.bus import Credentials, is_secure
+from schemas.bus.credentials import CA_FILE, ME_FILE
+from schemas.identity import Service
+from schemas.keys import is_name
+from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
+
+SECURE_ENDPOINT: Final = "tls/127.0.0.1:7447"
+"""Where the programs of the hub's own computer find it."""
+EVERYWHERE: Final = "tls/0.0.0.0:7447"
+"""Where a hub listens that other computers may join."""
+SOMEBODY: Final = "operator"
+"""The name of a user whose login is no name of a person."""
+
+
+def local_person() -> str:
+    """Return the name of whoever uses this computer: FLEET_AS, else the login."""
+    given = os.environ.get("FLEET_AS", "")
+    try:
+        name = given or getpass.getuser()
+    except (KeyError, OSError, ImportError):  # no entry for this user id, as in some containers
+        name = SOMEBODY
+    name = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-_")[:32]
+    return name if is_name(name) else SOMEBODY
+
+
+def ensure_hub_here(endpoint: str, cars: Iterable[str] = (), *, listens: Iterable[str] = ()) -> HubStore:
+    """Make this computer the hub at `endpoint`, or bring its certificates up to date. Raises BusError, OSError.
+
+    cars: those whose gateways run on this computer.
+    """
+    store = HubStore.of(endpoint)
+    name = identity.parse(store.credentials.me)
+    me = store.credentials.me if name is not None else identity.person(local_person())
+    wanted = [*map(identity.car, cars), *map(identity.service, Service)]
+    store.ensure(wanted, me, addresses=(*own_addresses(), *own_names()), listens=listens)
+    use(endpoint)
+    return store
+
+
+def is_hub_here(endpoint: str) -> bool:
+    """Return True if this computer is the hub with certificates at `endpoint`."""
+    return is_secure(endpoint) and HubStore.of(endpoint).is_hub
+
+
+def use(endpoint: str) -> None:
+    """Make `endpoint` the one of every program of this user, unless it is told another one. Raises OSError."""
+    directory = default_directory()
+    directory.mkdir(parents=True, exist_ok=True)
+    write_atomically(directory / JOINED_FILE, f"{endpoint}\n".encode())
+
+
+def store_joined(host: str, joined: Joined) -> str:
+    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError."""
+    endpoint = f"tls/{host}:{joined.port}"
+    directory = Credentials.of(endpoint).directory
+    directory.mkdir(parents=True, exist_ok=True)
+    os.chmod(directory, 0o700)  # noqa: PTH101 - it has a key
+    files = {
+        CA_FILE: joined.ca,
+        f"{joined.identity}.key": joined.key,
+        f"{joined.identity}.pem": joined.certificate,
+        ME_FILE: joined.identity.encode(),
+    }
+    for name, data in files.items():
+        write_atomically(directory / name, data, sync=True, private=True)
+    use(endpoint)
+    return endpoint
+
+
+def leave() -> tuple[str, Path | None]:
+    """End the use of a joined hub. Return its endpoint, empty if there is none, and what was kept: a hub's authority.
+
+    Raises OSError.
+    """
+    endpoint = joined_endpoint()
+    if not endpoint:
+        return "", None
+    (default_directory() / JOINED_FILE).unlink(missing_ok=True)
+    directory = Credentials.of(endpoint).directory
+    if is_hub_here(endpoint):
+        return endpoint, directory
+    shutil.rmtree(directory, ignore_errors=True)
+    return endpoint, None

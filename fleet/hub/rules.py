@@ -1,0 +1,118 @@
+"""The rules of a hub: which identity may use which keys, in the form of Zenoh's access control. Pure.
+
+Everything is denied that no rule allows. Everyone with a certificate may read everything and stop every car. Beyond
+that, an identity speaks only as itself:
+
+- The gateway of a car publishes and answers under the keys of its car.
+- A service publishes and answers under its own keys, such as `@recorder/**`. The simulator also publishes the true
+  state of its cars.
+- A command has the identity of its sender in its key: `fleet/red/@cmd/@by/person.mia/drive`. Only `person.mia` may send
+  under it. What Mia may do is decided by the gateway, from `people:` of the fleet file, as on a hub without rules. So a
+  change of `people:` needs no other rules.
+
+A rule of Zenoh matches a message if one of its key expressions includes that of the message. So whoever answers the
+questions of others needs their wildcards in its rules, and `**` does not include parts that begin with @
+(docs/explanation/measurements.md#access-control).
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+from schemas import keys
+from schemas.identity import IdentityRole, Service, parse
+
+_READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+"""Messages that ask for something."""
+_TELLS: Final = ("put", "delete", "reply", "liveliness_token", "declare_queryable")
+"""Messages that tell something, or offer to."""
+
+_SERVICES: Final = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR, keys.SIMULATOR, keys.OPERATOR, keys.REPLAY)
+_PUBLIC: Final = (
+    "**",
+    "*/*/**/@adv/**",
+    *(each for name in _SERVICES for each in (f"*/{name}", f"*/{name}/**", f"*/{name}/**/@adv/**")),
+)
+"""What everyone may read."""
+_COMMANDS: Final = (
+    "*/*/@cmd/**",
+    "*/*/@cmd/@by/**",
+    *(each for name in _SERVICES for each in (f"*/{name}/@cmd/**", f"*/{name}/@cmd/@by/**")),
+)
+"""The keys of all commands. Everyone may see who answers them, and that somebody drives; sending is another matter."""
+_OWN_SERVICE: Final = {
+    Service.SUPERVISOR: keys.SUPERVISOR,
+    Service.COORDINATOR: keys.COORDINATOR,
+    Service.RECORDER: keys.RECORDER,
+    Service.SIMULATOR: keys.SIMULATOR,
+}
+
+
+def access_control(names: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Return the rules for identities, each with the common name of its certificate."""
+    rules = [
+        _rule("read", "ingress", _READS, _PUBLIC),
+        _rule("see drives", "ingress", ("declare_subscriber",), _COMMANDS),
+        _rule("answers", "egress", _TELLS, (*_PUBLIC, *_COMMANDS)),
+    ]
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for identity, common_name in names:
+        own = [*_speaks(identity), *_answers(identity)]
+        rules += own
+        subjects.append({"id": identity, "cert_common_names": [common_name]})
+        policies.append(
+            {"subjects": [identity], "rules": ["read", "see drives", "answers", *(each["id"] for each in own)]}
+        )
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _speaks(identity: str) -> list[dict[str, Any]]:
+    """Return the rules for what an identity sends."""
+    known = parse(identity)
+    if known is None:
+        return []
+    role, name = known
+    tokens = f"*/{keys.OPERATOR}/*" if role is IdentityRole.SERVICE else f"*/{keys.OPERATOR}/{name}@$*"
+    services = [f"*/{each}/@cmd/@by/{identity}/*" for each in _SERVICES]
+    return [
+        _rule(f"{identity} commands", "ingress", ("query", "put"), (f"*/*/@cmd/@by/{identity}/*", *services)),
+        _rule(f"{identity} is there", "ingress", ("liveliness_token",), (tokens,)),
+    ]
+
+
+def _answers(identity: str) -> list[dict[str, Any]]:
+    """Return the rules for what an identity publishes and answers."""
+    known = parse(identity)
+    if known is None:
+        return []
+    role, name = known
+    if role is IdentityRole.PERSON or (role is IdentityRole.SERVICE and name not in _OWN_SERVICE):
+        return []
+    chunk = name if role is IdentityRole.CAR else _OWN_SERVICE[Service(name)]
+    own = [f"*/{chunk}", f"*/{chunk}/**", f"*/{chunk}/**/@adv/**"]
+    if name == Service.SIMULATOR:
+        own += ["*/*/sim/**", "*/*/sim/**/@adv/**"]
+    commands = [f"*/{chunk}/@cmd/**", f"*/{chunk}/@cmd/@by/**"]
+    return [
+        _rule(f"{identity} tells", "ingress", _TELLS, own),
+        _rule(f"{identity} answers", "ingress", ("reply", "declare_queryable"), commands),
+        # Others ask with wildcards: what a rule does not include never arrives.
+        _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS)),
+        _rule(f"{identity} is driven", "egress", ("put",), commands),
+    ]
+
+
+def _rule(name: str, flow: str, messages: Sequence[str], expressions: Sequence[str]) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(dict.fromkeys(expressions)),
+    }

@@ -1,0 +1,108 @@
+"""The certificates and rules of a hub with TLS, as files in the state directory. `fleet.hub` makes them.
+
+Each process of ours connects with a certificate. Its common name is an identity such as `person.mia`, `car.red` or
+`service.recorder` (schemas/identity.py). The rules of the hub say which keys an identity may use. A command has the
+identity of its sender in its key, so a gateway knows who sent it.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+from schemas.bus.errors import BusError
+from schemas.state_dir import directory_of
+
+DIRECTORY: Final = "tls"
+"""Directory in the state directory of a bus."""
+CA_FILE: Final = "ca.pem"
+ME_FILE: Final = "me"
+"""File with the identity of whoever uses this computer."""
+HUB: Final = "hub"
+"""Name of the hub's certificate."""
+HUB_FILE: Final = "hub.json"
+"""File with the addresses that the hub listens on, and its rules."""
+
+
+class NoCredentials(BusError):
+    """This computer has no certificate for a hub. The text says how to get one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """The files for one hub."""
+
+    directory: Path
+    endpoint: str
+
+    @classmethod
+    def of(cls, endpoint: str) -> Self:
+        """Return the files for a hub, which may not exist."""
+        return cls(directory_of(endpoint) / DIRECTORY, endpoint)
+
+    @property
+    def exist(self) -> bool:
+        """Return True if the certificate of the hub's authority is here."""
+        return (self.directory / CA_FILE).is_file()
+
+    @property
+    def me(self) -> str:
+        """Return the identity of whoever uses this computer; empty if there is none."""
+        try:
+            return (self.directory / ME_FILE).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError):
+            return ""
+
+    def identity(self, wanted: str = "") -> str:
+        """Return the wanted identity if its certificate is here, else that of the user. Raises NoCredentials."""
+        for name in (wanted, self.me):
+            if name and (self.directory / f"{name}.pem").is_file():
+                return name
+        raise NoCredentials(
+            f"This computer has no certificate for the hub at {self.endpoint}. On the hub's computer, "
+            "`fleet hub invite NAME` prints a code; here, `fleet join HOST CODE` takes it."
+        )
+
+    def of_client(self, wanted: str = "") -> dict[str, Any]:
+        """Return Zenoh's settings of the link of a client. Raises NoCredentials."""
+        name = self.identity(wanted)
+        return self._link({"connect_certificate": self._path(name), "connect_private_key": self._path(name, ".key")})
+
+    def of_hub(self) -> dict[str, Any]:
+        """Return Zenoh's settings of the links of the hub. Raises NoCredentials."""
+        if not (self.directory / f"{HUB}.key").is_file():
+            raise NoCredentials(
+                f"This computer has no certificate to be the hub at {self.endpoint}. `fleet up --secure` or "
+                "`fleet hub init` makes one."
+            )
+        return self._link({"listen_certificate": self._path(HUB), "listen_private_key": self._path(HUB, ".key")})
+
+    @property
+    def listens(self) -> list[str]:
+        """Return the endpoints that the hub listens on. Raises NoCredentials."""
+        return list(self._hub()["listen"])
+
+    @property
+    def access_control(self) -> dict[str, Any]:
+        """Return the rules of the hub, in Zenoh's form. Raises NoCredentials."""
+        return dict(self._hub()["access_control"])
+
+    def _hub(self) -> dict[str, Any]:
+        path = self.directory / HUB_FILE
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            return {"listen": list(found["listen"]), "access_control": dict(found["access_control"])}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise NoCredentials(f"{path} has no rules of a hub: {error!r}. `fleet hub init` writes them.") from None
+
+    def _path(self, name: str, ending: str = ".pem") -> str:
+        return str(self.directory / f"{name}{ending}")
+
+    def _link(self, own: dict[str, str]) -> dict[str, Any]:
+        tls = {
+            "root_ca_certificate": self._path("ca"),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+        return {"protocols": [self.endpoint.partition("/")[0]], "tls": {**tls, **own}}

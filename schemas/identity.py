@@ -1,0 +1,81 @@
+"""Identities: whose certificate a program has on a hub with rules, and for whom it may speak. Pure.
+
+An identity is `person.mia`, `car.red` or `service.recorder`. It is the common name of a certificate, and a part of the
+keys of its commands (`keys.command_key`). The hub's rules let nobody use another's. The name of a sender in a command
+is only text, so whoever carries out a command asks `speaks_for`.
+"""
+
+from enum import StrEnum
+from typing import Final
+
+from schemas.keys import is_name, person_of
+from schemas.words import Rank, Verb
+
+
+class IdentityRole(StrEnum):
+    """What an identity is."""
+
+    PERSON = "person"
+    CAR = "car"
+    """The gateway of a car."""
+    SERVICE = "service"
+
+
+class Service(StrEnum):
+    """The services that have an identity."""
+
+    SUPERVISOR = "supervisor"
+    COORDINATOR = "coordinator"
+    RECORDER = "recorder"
+    CONSOLE = "console"
+    SIMULATOR = "sim"
+
+
+_FORWARDED: Final = frozenset({Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE})
+"""What gateways tell one another in the name of whoever told one of them."""
+
+
+def person(name: str) -> str:
+    """Return the identity of a person."""
+    return f"{IdentityRole.PERSON}.{name}"
+
+
+def car(name: str) -> str:
+    """Return the identity of a car's gateway."""
+    return f"{IdentityRole.CAR}.{name}"
+
+
+def service(name: Service) -> str:
+    """Return the identity of a service."""
+    return f"{IdentityRole.SERVICE}.{name}"
+
+
+def parse(identity: str) -> tuple[IdentityRole, str] | None:
+    """Return the role and the name of an identity; None if it is none."""
+    role, _, name = identity.partition(".")
+    if role not in tuple(IdentityRole) or not is_name(name):
+        return None
+    if role == IdentityRole.SERVICE and name not in tuple(Service):
+        return None
+    return IdentityRole(role), name
+
+
+def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
+    """Return True if an identity may send this command in the name of a sender of this kind.
+
+    The console holds its people to their pairing, so it speaks for any person. The supervisor stops cars at the end.
+    """
+    known = parse(identity)
+    if known is None:
+        return False
+    role, name = known
+    match role:
+        case IdentityRole.PERSON:
+            return person_of(sender) == name and kind != Rank.COORDINATOR
+        case IdentityRole.CAR:
+            return verb in _FORWARDED
+        case IdentityRole.SERVICE:
+            is_coordinator = kind == Rank.COORDINATOR
+            if name == Service.COORDINATOR:
+                return is_coordinator
+            return name == Service.SUPERVISOR or (name == Service.CONSOLE and not is_coordinator)

@@ -1,0 +1,86 @@
+"""Certificates, as OpenSSL judges them."""
+
+import ssl
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from fleet.hub import authority
+from fleet.hub.authority import BadRequestForCertificate
+
+NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def ca() -> authority.KeyPair:
+    return authority.make_authority(NOW)
+
+
+def usage_of(certificate: bytes) -> list[x509.ObjectIdentifier]:
+    found = x509.load_pem_x509_certificate(certificate)
+    return list(found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
+
+
+def test_a_certificate_is_signed_by_its_authority_and_by_no_other(ca: authority.KeyPair) -> None:
+    made = x509.load_pem_x509_certificate(authority.issue(ca, "person.mia", NOW).certificate)
+    made.verify_directly_issued_by(x509.load_pem_x509_certificate(ca.certificate))
+    other = x509.load_pem_x509_certificate(authority.make_authority(NOW).certificate)
+    with pytest.raises((ValueError, InvalidSignature)):
+        made.verify_directly_issued_by(other)
+
+
+def test_only_the_hub_may_be_a_server(ca: authority.KeyPair) -> None:
+    assert usage_of(authority.issue(ca, "hub", NOW, ["127.0.0.1"]).certificate) == [ExtendedKeyUsageOID.SERVER_AUTH]
+    assert usage_of(authority.issue(ca, "person.mia", NOW).certificate) == [ExtendedKeyUsageOID.CLIENT_AUTH]
+    _, request = authority.new_request("hub")
+    assert usage_of(authority.sign_request(ca, request, "car.red", NOW)) == [ExtendedKeyUsageOID.CLIENT_AUTH]
+
+
+def test_who_asks_does_not_choose_its_name(ca: authority.KeyPair, tmp_path: Path) -> None:
+    key, request = authority.new_request("service.supervisor")
+    made = authority.sign_request(ca, request, "person.mia", NOW)
+    (name,) = x509.load_pem_x509_certificate(made).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    assert name.value == "person.mia"
+    (tmp_path / "key").write_bytes(key)
+    (tmp_path / "pem").write_bytes(made)
+    ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(tmp_path / "pem", tmp_path / "key")
+
+
+@pytest.mark.parametrize("request_bytes", [b"", b"junk", b"-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n"])
+def test_what_is_no_request_is_refused(ca: authority.KeyPair, request_bytes: bytes) -> None:
+    with pytest.raises(BadRequestForCertificate):
+        authority.sign_request(ca, request_bytes, "person.mia", NOW)
+
+
+def test_a_request_with_another_ones_signature_is_refused(ca: authority.KeyPair) -> None:
+    _, request = authority.new_request("a")
+    lines = request.splitlines()
+    damaged = b"\n".join([*lines[:-2], lines[-2][::-1], lines[-1]])
+    with pytest.raises(BadRequestForCertificate):
+        authority.sign_request(ca, damaged, "person.mia", NOW)
+
+
+@pytest.mark.parametrize(
+    ("after", "names", "is_due"),
+    [
+        (timedelta(0), ["127.0.0.1"], False),
+        (authority.LIFETIME - authority.RENEWAL_BEFORE - timedelta(days=1), ["127.0.0.1"], False),
+        (authority.LIFETIME - authority.RENEWAL_BEFORE + timedelta(days=1), ["127.0.0.1"], True),
+        (timedelta(0), ["127.0.0.1", "192.0.2.7"], True),
+        (timedelta(0), [], False),
+    ],
+)
+def test_it_is_due_a_third_of_its_life_before_its_end_or_for_a_new_address(
+    ca: authority.KeyPair, after: timedelta, names: list[str], is_due: bool
+) -> None:
+    made = authority.issue(ca, "hub", NOW, ["127.0.0.1", "hall.local"]).certificate
+    assert authority.is_due(made, NOW + after, names) == is_due
+
+
+def test_none_and_a_damaged_one_are_due() -> None:
+    assert authority.is_due(b"", NOW)
+    assert authority.is_due(b"junk", NOW)

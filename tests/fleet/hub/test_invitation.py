@@ -1,0 +1,118 @@
+"""One computer joins, over a real TLS server. Strangers, guesses and a false hub do not."""
+
+import http.client
+import json
+import socket
+import ssl
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fleet.hub.hub_store import HubStore
+from fleet.hub.invitation import Invitation, NotJoined, join
+from fleet.hub.join_code import MAX_GUESSES, JoinCode
+from schemas.bus import Credentials
+from schemas.identity import car, person
+from tests.support.ports import free_port
+
+ME = person("ann")
+
+
+def made(directory: Path) -> HubStore:
+    store = HubStore(Credentials(directory, "tls/127.0.0.1:7447"))
+    store.ensure([car("red")], ME, addresses=["127.0.0.1"])
+    store.reserve(person("mia"))
+    return store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> HubStore:
+    return made(tmp_path / "hub")
+
+
+@pytest.fixture
+def invitation(store: HubStore) -> Iterator[Invitation]:
+    opened = Invitation(
+        store, person("mia"), hub_port=7447, address="127.0.0.1", port=free_port(), fleet_file="cars: {}"
+    )
+    yield opened
+    opened.close()
+
+
+def post(invitation: Invitation, body: bytes, **headers: str) -> tuple[int, dict[str, str]]:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    connection = http.client.HTTPSConnection("127.0.0.1", invitation.port, timeout=30, context=context)
+    connection.request("POST", "/join", body, headers)
+    answer = connection.getresponse()
+    found = answer.status, json.loads(answer.read())
+    connection.close()
+    return found
+
+
+def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> None:
+    joined = join("127.0.0.1", invitation.code, invitation.port)
+    assert (joined.identity, joined.port, joined.fleet_file) == (person("mia"), 7447, "cars: {}")
+    assert joined.ca == (store.directory / "ca.pem").read_bytes()
+    assert invitation.wait() == ""
+    assert invitation.joined_from == "127.0.0.1"
+    assert not (store.directory / "person.mia.key").exists(), "its key is on the other computer only"
+    with pytest.raises(NotJoined, match="used or over"):
+        join("127.0.0.1", invitation.code, invitation.port)
+
+
+def test_five_wrong_codes_end_it(invitation: Invitation) -> None:
+    wrong = JoinCode("2" * 12, invitation.code.pin)
+    for _ in range(MAX_GUESSES):
+        with pytest.raises(NotJoined, match="wrong"):
+            join("127.0.0.1", wrong, invitation.port)
+    with pytest.raises(NotJoined, match="used or over"):
+        join("127.0.0.1", invitation.code, invitation.port)
+    assert str(MAX_GUESSES) in invitation.wait()
+    assert invitation.joined_from == ""
+
+
+def test_a_thousand_guesses_at_once_are_five(invitation: Invitation) -> None:
+    answers = [invitation._take("2" * 12, b"", "192.0.2.1")[0] for _ in range(1000)]
+    assert answers == [403] * MAX_GUESSES + [410] * (1000 - MAX_GUESSES)
+
+
+def test_a_false_hub_gets_nothing(invitation: Invitation, tmp_path: Path) -> None:
+    false = Invitation(made(tmp_path / "false"), person("mia"), hub_port=7447, address="127.0.0.1", port=free_port())
+    try:
+        with pytest.raises(NotJoined, match="pretends"):
+            join("127.0.0.1", invitation.code, false.port)
+        assert false._wrong == 0, "the secret was not sent"
+    finally:
+        false.close()
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"junk", b"[]", b"{}", b'{"secret": 1}', b'{"secret": "x", "request": "?"}', b"x" * 20_000]
+)
+def test_what_is_no_request_is_refused_and_costs_no_guess(body: bytes, invitation: Invitation) -> None:
+    status, found = post(invitation, body)
+    assert status in (400, 413)
+    assert found["error"]
+    assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
+
+
+def test_a_request_that_is_none_uses_up_no_code(invitation: Invitation) -> None:
+    body = json.dumps({"secret": invitation.code.secret, "request": "anVuaw=="}).encode()
+    assert post(invitation, body)[0] == 400
+    assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
+
+
+def test_a_stranger_who_says_nothing_holds_up_nobody(invitation: Invitation) -> None:
+    silent = [socket.create_connection(("127.0.0.1", invitation.port)) for _ in range(20)]
+    try:
+        assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
+    finally:
+        for each in silent:
+            each.close()
+
+
+def test_where_nobody_listens(store: HubStore) -> None:
+    with pytest.raises(NotJoined, match="does not answer"):
+        join("127.0.0.1", JoinCode.new(bytes(32)), free_port())
