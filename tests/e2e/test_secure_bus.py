@@ -1,0 +1,276 @@
+"""A hub with certificates, real gateways, and plain Zenoh clients with every identity: what each may, and nothing else.
+
+The people table: ann is a lead, mia drives red, eve is in no table: she may watch and stop.
+"""
+
+import json
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from fleet.client.client import Fleet as Client
+from fleet.hub import authority
+from fleet.hub.hub_store import HubStore
+from schemas import keys
+from schemas.bus import Bus
+from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS
+from schemas.identity import Service, car, person, service
+from schemas.words import Rank, Verb
+from tests.support.ports import free_port
+from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
+from tests.support.secure import FIELDS, ask, client_of, secure_fleet, sender_of, shapes, stranger
+
+pytestmark = pytest.mark.xdist_group("secure-bus")
+
+ANN, MIA, EVE, RED, BLUE = person("ann"), person("mia"), person("eve"), car("red"), car("blue")
+PEOPLE = ("--people-only", "--person", "ann:lead", "--person")
+TARGETS = {"red": ["red"], "blue": ["blue"], "*": ["blue", "red"]}
+
+
+class SecureStage:
+    """Two simulated cars with gateways, and the files of their hub."""
+
+    def __init__(self, fleet: FleetProcesses, store: HubStore) -> None:
+        self.fleet, self.store = fleet, store
+        self.sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+        self.gateways: dict[str, GatewayProcess] = {
+            "red": fleet.gateway(red, *PEOPLE, "mia"),
+            "blue": fleet.gateway(blue, *PEOPLE, "mia:other", car="blue"),
+        }
+        for name in self.gateways:
+            self.fleet.ready(name)
+
+    def free(self) -> None:
+        """End e-stops, pauses, holds and loans, as a lead."""
+        with self.client(ANN) as ann:
+            for name in ("red", "blue"):
+                self.command(ann, ANN, name, Verb.RESUME, all=True)
+                self.command(ann, ANN, name, Verb.UNPAUSE)
+                self.command(ann, ANN, name, Verb.LEND, end=True)
+                wait_for(lambda name=name: not self.fleet.state("safety", name).estops, "free")
+
+    def client(self, identity: str) -> Any:
+        """Return a plain Zenoh client, to be used with `with`."""
+        return client_of(self.store.credentials, identity)
+
+    @staticmethod
+    def command(session: zenoh.Session, identity: str, target: str, verb: str, **fields: Any) -> list[dict[str, Any]]:
+        """Send a command under one's own identity."""
+        key = keys.command_key("fleet", target, verb, identity)
+        return ask(session, key, **{"sender": sender_of(identity), "kind": "person", **fields})
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureStage]:
+    with secure_fleet(tmp_path_factory.mktemp("secure"), ANN, [MIA, EVE, RED, BLUE]) as (fleet, store):
+        yield SecureStage(fleet, store)
+
+
+@pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED, BLUE, *map(service, Service)])
+def test_a_command_counts_under_ones_own_identity_only(identity: str, stage: SecureStage) -> None:
+    others = [each for each in (ANN, MIA, RED, *map(service, Service)) if each != identity]
+    got: list[str] = []
+    with stage.client(identity) as client:
+        for target in TARGETS:
+            for verb in COMMANDS:
+                for name, key in shapes(target, verb, identity, others).items():
+                    if name != "own":
+                        fields = {"sender": sender_of(ANN), "kind": "person", **FIELDS.get(verb, {})}
+                        got += [f"{key}: {each}" for each in ask(client, key, **fields)]
+    assert got == []
+
+
+def may(identity: str, verb: str, target: str) -> bool:
+    """Return True if the people table lets an identity do this, apart from stops."""
+    of_leads = (Verb.PAUSE, Verb.UNPAUSE, Verb.LEND)
+    return identity == ANN or (identity == MIA and target == "red" and verb not in of_leads)
+
+
+@pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED, BLUE, service(Service.RECORDER)])
+def test_what_the_people_table_says_is_what_happens(identity: str, stage: SecureStage) -> None:
+    """The verbs that stop come last, since they hold and e-stop the cars. `arm` is refused before anybody is asked."""
+    stage.free()
+    wrong: list[str] = []
+    asked = [each for each in COMMANDS if each not in (Verb.ARM, Verb.RESUME)]
+    verbs = sorted(asked, key=lambda verb: verb in STOPPING_VERBS)
+    with stage.client(identity) as client:
+        for verb in verbs:
+            for target, cars in TARGETS.items():
+                if target == "*" and not COMMANDS[verb].wildcard:
+                    continue
+                answers = stage.command(client, identity, target, verb, **FIELDS.get(verb, {}))
+                assert sorted(each["car"] for each in answers) == cars, (verb, target, answers)
+                for answer in answers:
+                    refused = answer["reason"] == "not_allowed"
+                    allowed = verb in STOPS or may(identity, verb, answer["car"])
+                    if refused == allowed or (verb in STOPS and answer["status"] not in TAKEN):
+                        wrong.append(f"{identity} {verb} {target}: {answer}")
+    assert wrong == []
+
+
+def test_another_ones_name_moves_nothing_and_a_stop_in_it_holds_for_ones_own(stage: SecureStage) -> None:
+    stage.free()
+    with stage.client(MIA) as mia:
+        for kind, sender in (("person", sender_of(ANN)), ("coordinator", sender_of(MIA)), ("script", "anonymous")):
+            fields = {"sender": sender, "kind": kind}
+            (answer,) = stage.command(mia, MIA, "red", Verb.DRIVE, **FIELDS["drive"], **fields)
+            assert (answer["status"], answer["reason"]) == ("rejected", "not_allowed")
+            (answer,) = stage.command(mia, MIA, "red", Verb.STOP, **fields)
+            assert answer["status"] in TAKEN
+            assert stage.fleet.state("safety").hold.by == "mia"
+
+
+def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -> None:
+    stage.free()
+    heard: list[str] = []
+    asked: list[str] = []
+    with stage.client(EVE) as eve, stage.client(BLUE) as blue, stage.client(MIA) as mia:
+
+        def hear(sample: zenoh.Sample) -> None:
+            heard.append(f"{sample.key_expr} {sample.payload.to_string()}")
+
+        eve.declare_subscriber("fleet/**", hear)
+        for session in (blue, mia):
+            for expression in keys.command_keys("fleet", "red"):
+                session.declare_queryable(expression, lambda query: asked.append(str(query.key_expr)))
+            session.liveliness().declare_token("fleet/green")
+            session.liveliness().declare_token(keys.operator_token("fleet", sender_of(ANN)))
+            session.put("fleet/red/sensor/range", b"false")
+            session.put("fleet/@supervisor/status", b"false")
+            session.put(keys.command_key("fleet", "red", Verb.DRIVE, RED), b"false")
+            session.delete("fleet/red/state/mode")
+        blue.put("fleet/blue/sensor/false", b"its own")
+        wait_for(lambda: any("its own" in each for each in heard), "what was published before is here")
+        assert not [each for each in heard if each.endswith(" false")]
+        (answer,) = stage.command(eve, EVE, "red", Verb.STOP)
+        assert answer["car"] == "red"
+        assert asked == []
+        found = [*eve.liveliness().get("fleet/**"), *eve.liveliness().get("fleet/@operator/*")]
+        tokens = [str(reply.ok.key_expr) for reply in found if reply.ok is not None]
+    assert "fleet/green" not in tokens
+    assert not [token for token in tokens if "/ann@" in token]
+
+
+def test_a_stream_drives_ones_own_car_and_no_other(stage: SecureStage) -> None:
+    stage.free()
+    with stage.client(MIA) as mia:
+
+        def drive(car_name: str, identity: str) -> None:
+            mia.put(
+                keys.command_key("fleet", car_name, Verb.DRIVE, identity),
+                f'{{"motion": "forward", "duration_s": 0.5, "sender": "{sender_of(MIA)}", "kind": "person"}}',
+                encoding="application/json",
+            )
+
+        def red_drives() -> bool:
+            drive("red", MIA)
+            drive("blue", MIA)
+            drive("blue", ANN)
+            return driving(stage.sim)
+
+        wait_for(red_drives, "red drives")
+        assert not driving(stage.sim, "blue")
+    wait_for(lambda: not driving(stage.sim), "its drive is over")
+
+
+def test_our_own_client_is_who_its_certificate_says(stage: SecureStage) -> None:
+    stage.free()
+    with Client(stage.fleet.endpoint, kind=Rank.PERSON) as ann:
+        assert ann.sender.startswith("ann@")
+        assert ann.bus.identity == ANN
+        assert ann.car("red").led(1, 2, 3).ok
+        assert all(each.ok for each in ann.stop())
+    with pytest.raises(keys.BadKey, match="by the certificate"):
+        Client(stage.fleet.endpoint, person="mia")
+    with pytest.raises(keys.BadKey, match="by the certificate"):
+        Client(stage.fleet.endpoint, sender="mia@here")
+    with Bus.open(stage.fleet.endpoint, identity=RED) as bus:
+        assert bus.identity == RED
+
+
+def foreign(directory: Path) -> dict[str, dict[str, Any]]:
+    """Return the settings of clients that the hub must refuse, and why."""
+    now = datetime.now(UTC)
+    own = {name: (directory / f"{name}.pem").read_bytes() for name in ("ca", EVE)}
+    ca = authority.KeyPair(own["ca"], (directory / "ca.key").read_bytes())
+    made = {
+        "another authority": authority.issue(authority.make_authority(now), ANN, now),
+        "expired": authority.issue(ca, ANN, now - authority.LIFETIME - timedelta(days=2)),
+        "not yet": authority.issue(ca, ANN, now + timedelta(days=30)),
+    }
+    found: dict[str, dict[str, Any]] = {"no certificate": {}}
+    for why, pair in made.items():
+        name = why.replace(" ", "-")
+        for ending, data in (("pem", pair.certificate), ("key", pair.key)):
+            (directory.parent / f"{name}.{ending}").write_bytes(data)
+        paths = {"certificate": f"{directory.parent / name}.pem", "private_key": f"{directory.parent / name}.key"}
+        found[why] = {f"connect_{each}": path for each, path in paths.items()}
+    ca_file = str(directory / "ca.pem")
+    return {why: {"root_ca_certificate": ca_file, "enable_mtls": bool(each), **each} for why, each in found.items()}
+
+
+@pytest.mark.parametrize("why", ["no certificate", "another authority", "expired", "not yet"])
+def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
+    settings = foreign(stage.store.directory)[why]
+    with pytest.raises(zenoh.ZError), stranger(stage.store.credentials, **settings):
+        pass
+
+
+def test_a_certificate_that_no_rule_knows_gets_nothing(stage: SecureStage) -> None:
+    """Somebody has the authority's key, or the hub's list was restored from an old copy."""
+    directory = stage.store.directory
+    ca = authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
+    pair = authority.issue(ca, "person.zoe", datetime.now(UTC))
+    (directory / "person.zoe.pem").write_bytes(pair.certificate)
+    (directory / "person.zoe.key").write_bytes(pair.key)
+    with stage.client("person.zoe") as zoe:
+        assert ask(zoe, "fleet/red/state/mode") == []
+        assert stage.command(zoe, "person.zoe", "*", Verb.STOP) == []
+
+
+def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
+    """Whoever has joined has a certificate of the same authority, and cannot be the hub with it."""
+    settings = stage.store.credentials.of_client(MIA)["tls"]
+    port = free_port()
+    listen = {
+        "mode": "router",
+        "listen": {"endpoints": [f"tls/127.0.0.1:{port}"]},
+        "transport": {
+            "link": {
+                "protocols": ["tls"],
+                "tls": {
+                    "root_ca_certificate": settings["root_ca_certificate"],
+                    "listen_certificate": settings["connect_certificate"],
+                    "listen_private_key": settings["connect_private_key"],
+                },
+            }
+        },
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(listen))):
+        elsewhere = type(stage.store.credentials)(stage.store.directory, f"tls/127.0.0.1:{port}")
+        with pytest.raises(zenoh.ZError), client_of(elsewhere, ANN):
+            pass
+
+
+def test_whoever_is_revoked_gets_nothing_and_all_others_are_back(stage: SecureStage) -> None:
+    """Last in this file: eve is gone after it."""
+    with stage.client(EVE) as eve, stage.client(MIA) as mia:
+        assert stage.command(eve, EVE, "red", Verb.STOP)
+        key, pem = ((stage.store.directory / f"{EVE}{ending}").read_bytes() for ending in (".key", ".pem"))
+        began = time.monotonic()
+        assert HubStore.load(stage.store.credentials).revoke(EVE)
+        wait_for(lambda: not stage.command(eve, EVE, "red", Verb.STOP), "eve gets nothing")
+        wait_for(lambda: stage.command(mia, MIA, "red", Verb.STOP), "mia is back")
+        assert time.monotonic() - began < 20
+        assert stage.command(eve, EVE, "*", Verb.STOP) == []
+        assert ask(eve, "fleet/red/state/mode") == []
+    for ending, data in ((".key", key), (".pem", pem)):
+        (stage.store.directory / f"{EVE}{ending}").write_bytes(data)
+    with stage.client(EVE) as eve:
+        assert stage.command(eve, EVE, "*", Verb.STOP) == [], "nor over a new link"
