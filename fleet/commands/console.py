@@ -33,11 +33,10 @@ from fleet.commands.params import Number
 from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
-from fleet.fleetfile.fleet_file import read_people
-from fleet.fleetfile.models import PersonRank
+from fleet.fleetfile.fleet_file import people_table, read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
-from schemas.authority import NO_PEOPLE, People, PersonRole
+from schemas.authority import People
 from schemas.bus import resolve_endpoint
 from schemas.identity import Service, service
 from schemas.process.parent import has_ended, watched_pid
@@ -275,11 +274,7 @@ def _network() -> Any:
 
 def _people_of(file: Path) -> People:
     """Return the people of a fleet file, none if it cannot be read."""
-    people = read_people(file)
-    if people is None:
-        return NO_PEOPLE
-    leads = {name for name, each in people.items() if each.rank is PersonRank.LEAD}
-    return People({name: PersonRole.LEAD if name in leads else PersonRole.DRIVER for name in people})
+    return people_table(read_people(file))
 
 
 def _open_lan(port: int, people: PeopleFile, listed: People) -> "Lan":

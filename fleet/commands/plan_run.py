@@ -10,9 +10,9 @@ from fleet.client.client import Fleet, default_sender
 from fleet.commands.group import starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.coordinator.coordinator import Coordinator
-from fleet.coordinator.observer import listed_cars, listed_people
+from fleet.coordinator.observer import listed_cars
 from fleet.coordinator.other_coordinators import SENDER, AnotherCoordinator
-from fleet.fleetfile.fleet_file import read_fleet
+from fleet.fleetfile.fleet_file import people_table, read_fleet
 from fleet.policy.decision import Decision
 from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
@@ -97,7 +97,7 @@ def run(
                 on_decided,
                 lambda words: click.echo(f"fleet: {words}", err=True),
                 listed,
-                None if file is None else listed_people(file),
+                None if file is None else people_table(file.people),
                 run_name,
             ).run(lambda: stop.is_set() or has_ended(parent))
         except AnotherCoordinator as error:

@@ -8,10 +8,9 @@ from typing import Any, Final
 from fleet.client.car_state import CarState
 from fleet.client.reading import age_of_answer_s
 from fleet.fleetfile.fleet_file import FleetFile
-from fleet.fleetfile.models import PersonRank
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from schemas import keys, messages, topics
-from schemas.authority import NO_PEOPLE, People, PersonRole, binding_pause
+from schemas.authority import People, binding_pause
 from schemas.bus import Sample
 from schemas.platform_name import AUTO
 
@@ -157,15 +156,6 @@ class FleetObserver:
 
 def _all_known(state: CarState) -> bool:
     return all(topic in state.newest_by_topic for topic in REQUIRED_TOPICS)
-
-
-def listed_people(file: FleetFile) -> People:
-    """Return the people of a fleet file as the policy knows them."""
-    people = file.people
-    if people is None:
-        return NO_PEOPLE
-    leads = {name: person.rank is PersonRank.LEAD for name, person in people.items()}
-    return People({name: PersonRole.LEAD if leads[name] else PersonRole.DRIVER for name in people})
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:

@@ -25,6 +25,7 @@ from fleet.fleetfile.models import (
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from fleet.policy.car_condition import parse_condition
 from gateway import drivers
+from schemas.authority import NO_PEOPLE, People, PersonRole
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.duration import parse_duration
 from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, LOW_V
@@ -140,6 +141,14 @@ def read_colors(path: Path) -> Mapping[str, Rgb]:
     except BadFile:
         return {}
     return {name: parse_color(car.color) for name, car in {**file.cars, **file.unlinked}.items()}
+
+
+def people_table(people: Mapping[str, FleetPerson] | None) -> People:
+    """Return the people of a fleet file as the rules know them. Whose cars they drive is for the gateways."""
+    if people is None:
+        return NO_PEOPLE
+    leads = {name for name, person in people.items() if person.rank is PersonRank.LEAD}
+    return People({name: PersonRole.LEAD if name in leads else PersonRole.DRIVER for name in people})
 
 
 def read_people(path: Path) -> Mapping[str, FleetPerson] | None:

@@ -29,7 +29,7 @@ _TELLS: Final = ("put", "delete", "reply", "liveliness_token", "declare_queryabl
 _SERVICES: Final = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR, keys.SIMULATOR, keys.OPERATOR, keys.REPLAY)
 _PUBLIC: Final = (
     "**",
-    "*/*/**/@adv/**",
+    "**/@adv/**",
     *(each for name in _SERVICES for each in (f"*/{name}", f"*/{name}/**", f"*/{name}/**/@adv/**")),
 )
 """What everyone may read."""

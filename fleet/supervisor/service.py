@@ -79,8 +79,13 @@ class SupervisorService:
         on_message: Callable[[str, str, Any], object],
         services: Mapping[str, Service],
         status: Callable[[], pb.Supervision],
+        refusal: Callable[[str], str],
     ) -> None:
-        """Declare everything. on_message: called with car, topic and message. Raises AnotherSupervisor."""
+        """Declare everything. Raises AnotherSupervisor.
+
+        on_message: called with car, topic and message. refusal: returns why a person with a certificate may not send a
+        command; empty if they may.
+        """
         loop = asyncio.get_running_loop()
         singleton = Singleton(self.bus, self._key("status"), self._another_supervisor)
         await asyncio.to_thread(singleton.check_alone)
@@ -105,7 +110,7 @@ class SupervisorService:
         work: set[asyncio.Task[None]] = set()
 
         def command(query: zenoh.Query) -> None:
-            task = loop.create_task(self._on_command(query, services))
+            task = loop.create_task(self._on_command(query, services, refusal))
             work.add(task)
             task.add_done_callback(work.discard)
 
@@ -149,7 +154,9 @@ class SupervisorService:
         for _ in self.bus.query(key, payload=command.SerializeToString(), encoding=encoding):
             pass
 
-    async def _on_command(self, query: zenoh.Query, services: Mapping[str, Service]) -> None:
+    async def _on_command(
+        self, query: zenoh.Query, services: Mapping[str, Service], refusal: Callable[[str], str]
+    ) -> None:
         """Carry out a command and reply in the encoding of the query."""
         key = str(query.key_expr)
         verb, identity = key.rpartition("/")[2], keys.identity_of(key)
@@ -158,7 +165,7 @@ class SupervisorService:
         try:
             command = self._command(query, verb, encoding)
             result.id = command.id
-            result.words = await services[verb](_proven(identity, command.sender, verb))
+            result.words = await services[verb](_proven(identity, command.sender, verb, refusal))
         except (ReloadRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = Phase.REJECTED, Reason.BAD_VALUE, str(error)
         except RestartNeeded as error:
@@ -184,11 +191,15 @@ class SupervisorService:
         )
 
 
-def _proven(identity: str, sender: str, verb: str) -> str:
-    """Return the sender of a command. Raises ReloadRefused if a certificate names another one."""
+def _proven(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
+    """Return the sender of a command. Raises ReloadRefused if a certificate names another one, or one who may not."""
     sender = sender or identity.partition(".")[2] or "anonymous"
-    if identity and not speaks_for(identity, sender, Rank.PERSON, verb):
+    if not identity:
+        return sender
+    if not speaks_for(identity, sender, Rank.PERSON, verb):
         raise ReloadRefused(f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only.")
+    if words := refusal(keys.person_of(sender)):
+        raise ReloadRefused(words)
     return sender
 
 

@@ -19,6 +19,8 @@ from typing import Any, Final
 
 from fleet.client.hints import complete_hints, fleet_options
 from fleet.client.services import why_unrecorded
+from fleet.fleetfile.fleet_file import people_table
+from fleet.policy.denials import fleet_refusal
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus, StartProgress, describe_old_stops, describe_start
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy
@@ -158,7 +160,8 @@ class Supervisor:
                 self._say("end", SELF, "no car had been started")
                 return True
             service = self._service = SupervisorService(bus, self._spec.fleet)
-            await service.open(self._on_message, {"down": self._down, "reload": self._reload}, self.status)
+            services = {"down": self._down, "reload": self._reload}
+            await service.open(self._on_message, services, self.status, self._refusal)
             if not self._shutdown_requested.is_set():
                 self._populate()
             self._state = RunState.RUNNING
@@ -573,6 +576,10 @@ class Supervisor:
             if process.child is not None and life.alive:
                 shown.pid = process.child.pid
         return message
+
+    def _refusal(self, person: str) -> str:
+        """Return why a person with a certificate may not end or reload the fleet; empty if they may."""
+        return fleet_refusal(people_table(self._spec.people), person) if self._spec.people is not None else ""
 
     async def _down(self, sender: str) -> str:
         self.end(f"fleet down by {name_of(sender)}", CAR_STOP_RETRY_S)

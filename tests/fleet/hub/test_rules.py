@@ -85,6 +85,11 @@ def test_everyone_reads_everything(identity: str) -> None:
     for expression in ("fleet/**", "fleet/*/sensor/*", "fleet/@supervisor/status"):
         assert allows(identity, "ingress", "query", expression)
         assert allows(identity, "egress", "reply", expression)
+    for expression in (each for each in keys.recorded_keys("fleet") if "@cmd" not in each):
+        caches = f"{expression}/@adv/pub/**"
+        assert allows(identity, "ingress", "query", caches), f"the recorder has again what it missed: {caches}"
+        assert allows(car("red"), "egress", "query", caches)
+        assert allows(service(Service.SUPERVISOR), "egress", "query", caches)
     for expression in ("*/*", "*/@supervisor", "fleet/@operator/*"):
         assert allows(identity, "ingress", "liveliness_query", expression)
         assert allows(identity, "ingress", "declare_liveliness_subscriber", expression)

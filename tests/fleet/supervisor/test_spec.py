@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from fleet.commands import record
-from fleet.coordinator.observer import listed_people
-from fleet.fleetfile.fleet_file import parse_fleet
+from fleet.fleetfile.fleet_file import parse_fleet, people_table
 from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
     SIMULATED,
@@ -76,7 +75,7 @@ def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> N
     assert _people(everyone.cars["ann"].arguments) == []
     # The coordinator knows the same people from its copy of the file.
     known = [
-        listed_people(parse_fleet(coordinator_fleet_file(each), tmp_path / "copy.yaml", unbound=True))
+        people_table(parse_fleet(coordinator_fleet_file(each), tmp_path / "copy.yaml", unbound=True).people)
         for each in (spec, nobody, everyone)
     ]
     assert known == [People.parse(["lee", "ana", "kim", "teacher:lead"]), People({}), NO_PEOPLE]
