@@ -8,6 +8,7 @@ is only text, so whoever carries out a command asks `speaks_for`.
 from enum import StrEnum
 from typing import Final
 
+from schemas.commands import COMMANDS, STOPS
 from schemas.keys import is_name, person_of
 from schemas.words import Rank, Verb
 
@@ -78,4 +79,6 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
             is_coordinator = kind == Rank.COORDINATOR
             if name == Service.COORDINATOR:
                 return is_coordinator
-            return name == Service.SUPERVISOR or (name == Service.CONSOLE and not is_coordinator)
+            if name == Service.SUPERVISOR:
+                return verb in STOPS or verb not in COMMANDS  # and the verbs of services, such as a new plan
+            return name == Service.CONSOLE and not is_coordinator

@@ -17,7 +17,7 @@ from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import Bus, is_secure, resolve_endpoint
+from schemas.bus import Bus, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
 from schemas.printable import printable
 
@@ -108,6 +108,18 @@ def show(*, as_json: bool) -> None:
             click.echo(json.dumps(row))
         return
     show_table(("identity", "state", "from", "until"), rows)
+
+
+@hub.command(epilog="\b\nexample:\n  fleet hub config > zenohd.json5 && zenohd -c zenohd.json5")
+def config() -> None:
+    """Print the configuration of a stock Zenoh router in the place of this hub, with its certificates and rules.
+
+    Print it again and restart the router after each `fleet hub invite` and `revoke`, and after a new car.
+    """
+    with cli_errors():
+        endpoint = resolve_endpoint()
+        _own_store(endpoint)
+        click.echo(json.dumps(router_settings(endpoint), indent=1))
 
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub revoke person.mia\n  fleet hub revoke car.red")

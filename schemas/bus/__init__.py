@@ -15,6 +15,7 @@ from schemas.bus.endpoint import (
     is_secure,
     resolve_endpoint,
     router_config,
+    router_settings,
 )
 from schemas.bus.errors import BadEndpoint, BusError, NoFleet
 from schemas.bus.handover import Backlog, Handover, Latest
@@ -71,6 +72,7 @@ __all__ = [
     "reply_value",
     "resolve_endpoint",
     "router_config",
+    "router_settings",
     "sample_of",
     "sequence_of",
     "unread",

@@ -78,16 +78,21 @@ def is_secure(endpoint: str) -> bool:
     return endpoint.startswith(("tls/", "quic/"))
 
 
-def router_config(endpoint: str) -> zenoh.Config:
-    """Return the configuration of the hub. All other sessions are its clients. Raises BadEndpoint, BusError."""
+def router_settings(endpoint: str) -> dict[str, Any]:
+    """Return the settings of the hub in Zenoh's form. All others are its clients. Raises BadEndpoint, BusError."""
     _host_and_port(endpoint)
     listen: dict[str, Any] = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
     if not is_secure(endpoint):
-        return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_common({})}))
+        return {"mode": "router", "listen": listen, **_common({})}
     credentials = Credentials.of(endpoint)
     listen["endpoints"] = credentials.listens or [endpoint]
     own = {"mode": "router", "listen": listen, "access_control": credentials.access_control}
-    return zenoh.Config.from_json5(json.dumps({**own, **_common(credentials.of_hub())}))
+    return {**own, **_common(credentials.of_hub())}
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """Return the configuration of the hub. Raises BadEndpoint, BusError."""
+    return zenoh.Config.from_json5(json.dumps(router_settings(endpoint)))
 
 
 def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.Config:

@@ -39,6 +39,7 @@ NOT_RUN: Final = {
     r"fleet replay|fleet replay (?!.*--save).*|fleet view( --web)?": "opens a window",
     r".*/media/disk.*": "needs a second disk",
     r"(gateway|fleet) .* tank( .*)?": "needs a tank; tests/e2e/test_second_family.py drives one",
+    r"fleet (hub|join|leave).*|.*--secure": "makes a hub of this computer; tests/e2e/test_secure_up.py runs it",
     r"eval .*": "is for a shell; tests/fleet/commands/test_shells.py runs it",
     r"fleet demo.*": "tests/fleet/test_demo.py runs it",
     r"fleet up.*": "stays or starts another fleet; tests/e2e/test_up.py and test_newcomer.py run it",
