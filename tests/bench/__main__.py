@@ -26,6 +26,7 @@ BENCHMARKS = {
     "fleet": "fleet",
     "plan": "planning",
     "cli": "command_line",
+    "secure": "securing",
 }
 
 
