@@ -12,7 +12,7 @@ import click
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import aligned, echo_safely, watched
-from fleet.commands.params import car_option, session_argument
+from fleet.commands.params import SessionPath, car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.commands.session_part import part_of
 from fleet.recording import time_spec
@@ -268,6 +268,37 @@ def recover(session: Path, out: Path | None) -> None:
     with _session_errors(out):
         count, words = make(found, out, watched("recover", total(found)))
     echo_safely(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
+
+
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions merge hall-a/latest hall-b/latest --out both
+""",
+)
+@click.argument("several", nargs=-1, required=True, type=SessionPath(), metavar="SESSION SESSION...")
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="The new session's directory.",
+)
+def merge(several: tuple[Path, ...], out: Path) -> None:
+    """Merge what several recorders of one fleet have recorded at the same time, such as on two sites.
+
+    A message that several have got is written once. The order is that of the recorders' clocks.
+    """
+    from fleet.recording.tools.transform import merge as make
+
+    if len({each.resolve() for each in several}) < 2:
+        raise click.UsageError("name several sessions: fleet sessions merge ONE OTHER --out DIR")
+    with _session_errors():
+        found = [_open(each) for each in several]
+    with _session_errors(out):
+        count, twice, lost = make(found, out, watched("merge", None))
+    echo_safely(f"{out}: {count} messages; {twice} more came again{f'; lost: {lost}' if lost else ''}")
 
 
 @sessions.command(

@@ -1,12 +1,13 @@
-"""Makes new sessions from old ones: recovers a damaged session, or cuts out a part. Never writes to the old session.
+"""Makes new sessions from old ones: recovers a damaged one, cuts out a part, merges several. Never writes to old ones.
 
 A new session is written to a temporary directory and renamed at the end, so an interruption leaves no partial session.
 """
 
+import heapq
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, Final
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_copy import McapCopy
-from fleet.recording.reading.mcap_reader import Row
+from fleet.recording.reading.mcap_reader import Extra, Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.tables import car_of
@@ -115,11 +116,68 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
     return count
 
 
-def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
+def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> tuple[int, int, str]:
+    """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
+
+    What several recorders have got is written once: the same key, number, time of publication and payload. Return the
+    number of messages, of those that came again, and the losses in words. Raises Exists, OSError, and NoSession if the
+    sessions are of several fleets, or none has an intact message.
+    """
+    fleets = {each.description.fleet for each in sessions if each.description is not None}
+    if len(fleets) > 1:
+        raise NoSession(f"these are sessions of several fleets: {', '.join(sorted(fleets))}")
+    twice, counts = 0, [0] * len(sessions)
+
+    def counted(number: int) -> Iterator[Row]:
+        for row in sessions[number].rows():
+            counts[number] += 1
+            yield row
+
+    def once() -> Iterator[Row]:
+        nonlocal twice
+        seen: set[int] = set()  # of 64 bits each: two of ten million messages are the same once in 400,000 merges
+        for row in heapq.merge(*map(counted, range(len(sessions))), key=lambda row: row[2]):
+            info, sequence, _, publish_ns, payload = row
+            told = hash((info.channel.topic, sequence, publish_ns, payload))
+            if sequence and told in seen:
+                twice += 1
+                continue
+            seen.add(told)
+            yield row
+
+    with atomic_directory(out) as new:
+        extras = [extra for each in sessions for extra in each.extras()]
+        count = _copy(watched(once()), new, sessions[0], extras)
+        named = zip(sessions, counts, strict=True)
+        lost = "; ".join(f"{each.name}: {words}" for each, own in named if (words := _losses(each, own)))
+        if not count:
+            names = ", ".join(each.name for each in sessions)
+            raise NoSession(f"nothing in {names} is intact: {lost or 'all are empty'}")
+        described = [each.description for each in sessions if each.description is not None]
+        marks = sorted((mark for each in described for mark in each.marks), key=lambda mark: str(mark.get("time")))
+        pins = [pin for each in described for pin in each.pins]
+        about = {"by": "merge", "of": ", ".join(each.name for each in sessions), "lost": lost}
+        _describe(sessions[0], new, count, about)
+        if (made := session_dir.SessionInfo.read(new)) is not None:
+            started = min((each.started for each in described), default=made.started)
+            missing = None if lost else 0
+            origin = {**made.origin, "of": about["of"], "lost": lost, "missing": missing}
+            kept = any(each.kept for each in described)
+            replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin).write(new)
+    return count, twice, lost
+
+
+def _losses(session: Session, count: int) -> str:
+    """Return in words what could not be read of a session, or was lost before. count: the messages that were read."""
+    found = (session.damage_words, session.lost_extras, session.lacking(count), lost_words(session))
+    return "; ".join(filter(None, found))
+
+
+def _copy(rows: Iterable[Row], new: Path, session: Session, extras: Sequence[Extra] | None = None) -> int:
     """Write the segments, and return the number of messages. Attachments and metadata are in the first one."""
     description = session.description
     about = {"made_from": session.name}
-    extras = session.extras()
+    extras = session.extras() if extras is None else extras
     if description is not None:
         about |= {"fleet": description.fleet, "started": description.started, "host": description.host}
     remaining = iter(rows)
