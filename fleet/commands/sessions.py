@@ -273,7 +273,7 @@ def recover(session: Path, out: Path | None) -> None:
 @sessions.command(
     epilog="""\b
 example:
-  fleet sessions merge hall-a/latest hall-b/latest --out both
+  fleet sessions merge latest latest~1 --out both
 """,
 )
 @click.argument("several", nargs=-1, required=True, type=SessionPath(), metavar="SESSION SESSION...")
