@@ -56,16 +56,16 @@ const narrow = matchMedia("(max-width: 34rem) and (orientation: portrait)");
 narrow.addEventListener("change", changed);
 const MORE = "#/more";
 const FIRST_TABS = 4;
-const tabs = () => {
-  const all = Object.entries(PAGES);
-  return narrow.matches ? [...all.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, "more"]]] : all;
-};
+const tabs = () => (narrow.matches ? FEW_TABS : ALL_TABS);
 const MorePage = () => html`<h1>${t.more}</h1>
   <ul class="plain more">
     ${Object.entries(PAGES).slice(FIRST_TABS).map(
       ([to, [name, , drawing]]) => html`<li key=${to}><a class="button" href=${to}><${Icon} name=${drawing} /> ${name}</a></li>`,
     )}
   </ul>`;
+
+const ALL_TABS = Object.entries(PAGES);
+const FEW_TABS = [...ALL_TABS.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, "more"]]];
 
 // ---------------------------------------------------------------- STOP
 
@@ -173,9 +173,16 @@ function Paused({ cars }) {
 }
 
 // Above the content on a large screen, a tab bar at the bottom of a phone.
-function Navigation({ here }) {
+class Navigation extends Component {
+  shouldComponentUpdate(next) {
+    return next.here !== this.props.here || next.shown !== this.props.shown;
+  }
+  render({ here, shown }) {
+    return html`<${Tabs} here=${here} shown=${shown} />`;
+  }
+}
+function Tabs({ here, shown }) {
   const bar = useRef(null);
-  const shown = tabs();
   const current = shown.some(([to]) => to === here) ? here : MORE;
   useEffect(() => bar.current.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest", inline: "nearest" }), [current]);
   return html`<nav aria-label="Pages" ref=${bar}>
@@ -202,7 +209,7 @@ class App extends Component {
         event.preventDefault();
         document.getElementById("content").focus();
       }}>${t.skip}</a>
-      <${Navigation} here=${here} />
+      <${Navigation} here=${here} shown=${tabs()} />
       <header class="top">
         <span class="person">${store.hello && store.rights ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
         <span class="fleet-name">${state?.fleet ?? ""}</span>

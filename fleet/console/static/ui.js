@@ -10,7 +10,12 @@ import { t } from "./texts.js";
 export const html = htm.bind(h);
 export { Component, render, useEffect, useRef, useState };
 
-export const Icon = ({ name }) => icon(html, name);
+// Made once: Preact passes over what is the same as before, ten times a second.
+const icons = new Map();
+export const Icon = ({ name }) => {
+  if (!icons.has(name)) icons.set(name, icon(html, name));
+  return icons.get(name);
+};
 
 // Chips for all cars, the person's own ones, and each group. `isOn` tells which of these sets are chosen.
 export const SetChips = ({ cars, label, isOn, onPress }) => {
