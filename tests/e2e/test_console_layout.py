@@ -164,6 +164,7 @@ def test_no_tile_moves_when_cars_come(stage: ConsoleStage) -> None:
         expect(tiles).to_have_count(len(CARS) + 2)
         assert {car: box for car, box in boxes(tiles).items() if car in CARS} == before
         page.locator("nav a", has_text="Drive").click()
+        expect(page.locator(".car-chip")).to_have_count(len(CARS) + 2)
         chips = page.locator(".car-chip input").evaluate_all("(all) => all.map((each) => each.name)")
         assert chips == [f"select-{car}" for car in (*sorted(CARS), "aaa", "middle")]
     finally:
