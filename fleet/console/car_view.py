@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final
@@ -338,6 +338,12 @@ class FleetView:
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""
         return [self._cars[name].as_dict(now) for name in self.names]
+
+    def newest(self, now: float) -> Iterator[tuple[str, str, float, Any]]:
+        """Yield car, topic, age (s) and message of everything that is known of all cars."""
+        for name, car in self._cars.items():
+            for topic, seen in car.state.newest_by_topic.items():
+                yield name, topic, max(0.0, now - seen.at), seen.message
 
     @property
     def people(self) -> People | None:

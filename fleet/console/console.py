@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -22,6 +22,7 @@ from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
+from fleet.console.lane_feed import LaneFeed
 from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
 from fleet.console.page_feed import Handler, PageFeed
@@ -40,9 +41,10 @@ from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
-from schemas.keys import person_of
+from schemas.keys import person_of, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
+from schemas.topics import TOPICS
 from schemas.words import Phase, Rank, Reason, Scope, Verb
 
 MAX_PAGES: Final = 96
@@ -101,9 +103,10 @@ class Console:
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
         self._readings: Latest[Sample] = Latest()
-        self.plan = PlanFeed(fleet, file, self.operator, self.sender_of, self.management_refusal)
+        self.plan = PlanFeed(fleet, file, self.operator, self.sender_of, self.management_refusal, self._newest_samples)
         self._plots = PlotFeed(fleet, self.operator.spawn)
-        self._feeds: Sequence[PageFeed] = (self._plots, Inspections(fleet, self._view.look_up), self.plan)
+        self._lanes = LaneFeed()
+        self._feeds: Sequence[PageFeed] = (self._plots, self._lanes, Inspections(fleet, self._view.look_up), self.plan)
         self._statuses: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_status, limit=_MAX_EVENTS, newest=True
         )
@@ -172,6 +175,13 @@ class Console:
         self._readings(sample.key, sample)
         self._plots.on_sample(sample)
 
+    def _newest_samples(self) -> Iterator[tuple[float, Sample]]:
+        """Yield the newest messages of the cars, as they were on the bus, each with its age, s."""
+        name = self._fleet.sync.name
+        for car, topic, age_s, message in self._view.newest(time.monotonic()):
+            encoding = TOPICS[topic].encoding
+            yield age_s, Sample(topic_key(name, car, topic), message.SerializeToString(), encoding, 0, 0)
+
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
         next_at = loop.time()
@@ -226,10 +236,13 @@ class Console:
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
                 self._view.on_message(key.car, key.topic, message, now)
+                if self._view.has_place(key.car):
+                    self._lanes.on_message(key, message)
                 if key.topic == "state/safety" and self._report is not None:
                     self._report.on_safety(key.car, message, now)
         present = self._present
         self._view.on_presence(present, now)
+        self._lanes.keep(frozenset(self._view.names))
         if self._view.left_out and not self._said_left_out:
             self._said_left_out = True
             log.warning(
@@ -260,6 +273,8 @@ class Console:
             return
         (key, event), now = found, time.monotonic()
         self._view.on_message(key.car, key.topic, event, now)
+        if self._view.has_place(key.car):
+            self._lanes.on_message(key, event)
         if key.topic != "event/command":
             return
         if self._report is not None:

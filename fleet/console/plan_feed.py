@@ -3,21 +3,22 @@
 import asyncio
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fleet.aio import Fleet
-from fleet.console.bus_message import message_in
+from fleet.console.bus_message import is_shown, message_in
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
+from fleet.console.plan_answer import PlanQuestion
 from fleet.console.plan_checks import PlanChecks
 from fleet.console.plan_process import PlanProcess
-from fleet.console.plan_view import PlanView, coordinator_topic
+from fleet.console.plan_view import PlanView, coordinator_topic, named
 from fleet.console.requests import PageMessage
 from fleet.policy.requests import PlanRequest
 from schemas import keys
@@ -30,7 +31,7 @@ class PlanFeed(PageFeed):
     """The plan in force, and who may change it.
 
     file: the fleet file. operator: the console's own. sender_of, refusal: the name under which a person acts, and why
-    they may not manage plans.
+    they may not manage plans. newest: the newest messages of the cars, each with its age, s.
     """
 
     def __init__(
@@ -40,12 +41,14 @@ class PlanFeed(PageFeed):
         operator: ConsoleOperator,
         sender_of: Callable[[PagePerson | None], str],
         refusal: Callable[[PagePerson | None], str],
+        newest: Callable[[], Iterable[tuple[float, Sample]]],
     ) -> None:
         self._fleet = fleet
         self._operator = operator
         self._sender_of = sender_of
         self._refusal = refusal
-        self.checks = PlanChecks()
+        self._newest = newest
+        self.checks = PlanChecks(file)
         self._process = PlanProcess(fleet, file)
         self._coordinators: set[str] = set()
         """Tokens of the coordinator."""
@@ -92,16 +95,25 @@ class PlanFeed(PageFeed):
         ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
-    async def set_plan(self, text: str, person: PagePerson | None) -> tuple[bool, str]:
+    async def check(self, text: str, person: PagePerson | None) -> dict[str, Any]:
+        """Return what a person is told of a plan (plan_answer.answer_to). Raises TooManyChecks."""
+        present = tuple(name for name in self._fleet.sync.cars() if is_shown(name))
+        before, roles, phase = self._view.in_force
+        question = PlanQuestion(text, present, tuple(self._newest()), before, roles, phase)
+        return await self.checks.check(question, person and person.name)
+
+    async def set_plan(self, text: str, person: PagePerson | None) -> dict[str, Any]:
         """Put a plan in force for this person. Return whether it is, and words, or the faults, one per line.
 
         If no plan runs, the console starts a coordinator. Raises TooManyChecks.
         """
         sender = self._sender_of(person)
-        ok, words = await self.checks.check(text, person and person.name)
-        if not ok:
-            return ok, words
-        return await self._process.set_plan(text, partial(self._operator.ask_coordinator, "plan", text, sender))
+        found = await self.check(text, person)
+        if not found["ok"]:
+            return found
+        ask = partial(self._operator.ask_coordinator, "plan", text, sender)
+        ok, words = await self._process.set_plan(text, ask)
+        return {"ok": ok, "words": named(words, text)}
 
     def on_page(self, page: PageLink) -> None:
         """Show the plan to a new page."""

@@ -1,9 +1,14 @@
 """The content of the plan page: the plan in force, the role of each car, and the reasons. Pure."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Final
 
+from fleet.policy.plan.plan import version_of
 from schemas import keys, messages
 from schemas.words import Level
+
+MAX_PLAN_NAME_LENGTH: Final = 80
+"""Maximum length of the name of a plan, so that it is one line of a large screen."""
 
 
 class PlanView:
@@ -30,10 +35,22 @@ class PlanView:
             case "@coordinator/decision":
                 self._decisions[value.subject] = value
             case _:  # the log
-                at_ms = value.timestamp.seconds * 1000
+                at_ms, words = value.timestamp.seconds * 1000, value.message
+                if self._plan is not None:
+                    words = named(words, self._plan.text)
                 is_bad = messages.level_of(value) in (Level.WARNING, Level.ERROR)
-                self._log = [{"at_ms": at_ms, "words": value.message, "bad": is_bad}, *self._log[:9]]
+                self._log = [{"at_ms": at_ms, "words": words, "bad": is_bad}, *self._log[:9]]
         self.changed = True
+
+    @property
+    def in_force(self) -> tuple[str, dict[str, str], str]:
+        """The text of the running plan (empty: none), the role of each car, and the phase."""
+        if self._plan is None or not self._running:
+            return "", {}, ""
+        if self._assignment is None:
+            return self._plan.text, {}, ""
+        roles = {car: role.name for role in self._assignment.roles for car in role.cars}
+        return self._plan.text, roles, self._assignment.phase
 
     def on_presence(self, *, running: bool) -> None:
         """Handle that the coordinator is on the bus, or not."""
@@ -46,7 +63,8 @@ class PlanView:
         shown: dict[str, Any] = {"running": self._running, "plan": None, "log": self._log}
         if plan is None:
             return shown
-        shown["plan"] = {"text": plan.text, "version": plan.version, "set_by": plan.set_by}
+        roles = [] if assignment is None else [role.name for role in assignment.roles]
+        shown["plan"] = {"text": plan.text, "name": plan_name(plan.text, roles), "set_by": plan.set_by}
         if assignment is not None:
             shown["roles"] = [{"name": role.name, "cars": list(role.cars)} for role in assignment.roles]
             shown |= {"phase": assignment.phase, "rules": list(assignment.rules), "stopped_by": assignment.stopped_by}
@@ -62,6 +80,22 @@ class PlanView:
             for _, each in sorted(self._decisions.items())
         ]
         return shown
+
+
+def plan_name(text: str, roles: Iterable[str]) -> str:
+    """Return what a person calls a plan: the comment that it begins with, else its roles. Never its hash."""
+    for line in text.splitlines():
+        words = line.strip()
+        if words and not words.startswith("#"):
+            break
+        if (words := words.lstrip("# ")) and not words.startswith("yaml-language-server"):
+            return words[:MAX_PLAN_NAME_LENGTH].rstrip(". ")
+    return ", ".join(roles)[:MAX_PLAN_NAME_LENGTH] or "without a name"
+
+
+def named(words: str, text: str) -> str:
+    """Return words of a coordinator about the plan of this text, with its name in place of its hash."""
+    return words.replace(f"plan {version_of(text)}", f"plan “{plan_name(text, ())}”")
 
 
 def coordinator_topic(key: str, fleet: str) -> str:

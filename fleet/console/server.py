@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager, contextmanager, nullcontext, suppres
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
 from starlette.applications import Starlette
@@ -33,8 +33,10 @@ from fleet.console.log_rate import LogRate
 from fleet.console.pairing import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.plan_checks import TooManyChecks
+from fleet.console.plan_view import plan_name
 from fleet.console.request_body import read_text
 from fleet.console.requests import is_stop
+from fleet.examples import EXAMPLES
 from schemas.bus import LARGEST_PAYLOAD, BusError
 from schemas.process import signals
 
@@ -231,7 +233,10 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:
-        return await _answer_plan(request, console, console.plan.checks.check)
+        return await _answer_plan(request, console, console.plan.check)
+
+    async def plan_examples(_: Request) -> Response:
+        return JSONResponse({"ok": True, "examples": await asyncio.to_thread(example_plans)})
 
     async def set_plan(request: Request) -> Response:
         person = request.scope.get(PERSON)
@@ -272,6 +277,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
             Route("/", page),
             Route("/hello", hello),
             Route(STOP_PATH, stop, methods=["POST"]),
+            Route("/plan/examples", plan_examples),
             Route("/plan/check", check_plan, methods=["POST"]),
             Route("/plan/set", set_plan, methods=["POST"]),
             *console.sessions.routes(),
@@ -303,8 +309,14 @@ def _too_much(words: str) -> Response:
     return JSONResponse({"ok": False, "words": words}, 429, {"connection": "close"})
 
 
+def example_plans() -> list[dict[str, str]]:
+    """Return name and text of the plans that come with the package."""
+    texts = (path.read_text("utf-8") for path in sorted((EXAMPLES / "plans").glob("*.yaml")))
+    return [{"name": plan_name(text, ()), "text": text} for text in texts]
+
+
 async def _answer_plan(
-    request: Request, console: Console, ask: Callable[[str, PagePerson | None], Awaitable[tuple[bool, str]]]
+    request: Request, console: Console, ask: Callable[[str, PagePerson | None], Awaitable[dict[str, Any]]]
 ) -> Response:
     """Answer a request with the text of a plan."""
     person: PagePerson | None = request.scope.get(PERSON)
@@ -315,10 +327,10 @@ async def _answer_plan(
     if text is None:
         return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
     try:
-        ok, words = await ask(text, person)
+        answer = await ask(text, person)
     except TooManyChecks:  # others of this person came while the body did
         return _too_much(TOO_MANY_PLANS)
-    return JSONResponse({"ok": ok, "words": words})
+    return JSONResponse(answer)
 
 
 @asynccontextmanager

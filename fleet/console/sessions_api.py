@@ -7,7 +7,9 @@ import asyncio
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -124,10 +126,7 @@ class SessionsApi:
             lambda: {path for path in self._place.absolute().iterdir() if path.is_symlink()}
         )
         found = [each for each in listed if Path(each["path"]) not in links]
-        shown = ("state", "words", "started", "length_s", "bytes", "messages", "lost", "cars", "marks", "kept")
-        rows = [
-            {"name": Path(each["path"]).name, **{field: each[field] for field in shown}} for each in reversed(found)
-        ]
+        rows = [session_row(each) for each in reversed(found)]
         return JSONResponse({"place": str(self._place), "sessions": rows})
 
     async def _verify(self, request: Request) -> Response:
@@ -209,6 +208,25 @@ class SessionsApi:
             self._scratch = Path(tempfile.mkdtemp(prefix="fleet-console-"))
         self._number += 1
         return self._scratch / f"{name}-{self._number}"
+
+
+_SHOWN: Final = ("state", "words", "length_s", "bytes", "messages", "lost", "cars", "kept")
+
+
+def session_row(listed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a page shows of a session, from a line of `fleet sessions list --json`."""
+    row = {"name": Path(listed["path"]).name, **{field: listed[field] for field in _SHOWN}}
+    marks = [{"text": each.get("text"), "by": each.get("by"), **_moment(each.get("time"))} for each in listed["marks"]]
+    return row | _moment(listed["started"]) | {"marks": marks}
+
+
+def _moment(text: object) -> dict[str, int | None]:
+    """Return a time as ms since the epoch, with the offset of this computer's zone then, s. None if it is no time."""
+    try:
+        at_s = datetime.fromisoformat(str(text)).timestamp()
+        return {"at_ms": round(at_s * 1000), "zone_s": time.localtime(at_s).tm_gmtoff}
+    except (ValueError, OverflowError, OSError):  # of a recording that says no time, or one beyond the clock's
+        return {"at_ms": None, "zone_s": 0}
 
 
 def _stream(data: Iterator[bytes], name: str) -> Response:

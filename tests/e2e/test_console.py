@@ -338,13 +338,14 @@ def test_everything_works_by_keyboard_alone(stage: ConsoleStage) -> None:
 
 
 def unreachable(page: Page) -> list[str]:
-    """Return the controls of a page that Tab does not reach."""
+    """Return the controls of a page that Tab does not reach. One that is disabled is none."""
     controls = "document.querySelectorAll('a[href], button, input, select, textarea, summary')"
     page.evaluate("document.activeElement.blur()")
     for _ in range(2 * page.evaluate(f"{controls}.length")):
         page.keyboard.press("Tab")
         page.evaluate("document.activeElement.dataset.reached = ''")
-    missed = f"[...{controls}].filter((each) => !('reached' in each.dataset) && each.getClientRects().length > 0)"
+    is_missed = "(each) => !('reached' in each.dataset || each.disabled) && each.getClientRects().length > 0"
+    missed = f"[...{controls}].filter({is_missed})"
     found: list[str] = page.evaluate(f"{missed}.map((each) => each.outerHTML.slice(0, 120))")
     return found
 
@@ -615,13 +616,22 @@ def test_a_plan_is_shown_explained_stopped_checked_and_set(stage: ConsoleStage, 
     page.locator("[data-plan=check]").click()
     page.get_by_role("button", name="Line 2:").click()
     assert page.evaluate("document.activeElement.selectionStart") == len("roles:\n")
-    page.locator("[data-plan=set]").click()
+    assert page.locator("[data-plan=set]").is_disabled()
     assert "flying" not in stage.fleet.get("fleet/@coordinator/plan")[0].text
-    page.locator("textarea").fill("roles:\n  lamp: {mode: color_led, count: 1}\n")
+    page.locator("textarea").fill("# One lamp.\nroles:\n  lamp: {mode: color_led, count: 1}\n")
+    assert page.locator("[data-plan=set]").is_disabled(), "it was not tried yet"
+    page.locator("[data-plan=check]").click()
+    page.locator("[data-change='role guide']").get_by_text("gone").wait_for()
+    page.locator("[data-change='role lamp']").get_by_text("color_led").wait_for()
+    page.locator("[data-try][data-changed=true]").first.wait_for()
+    assert "lamp" not in stage.fleet.get("fleet/@coordinator/plan")[0].text, "it is a dry run"
+    assert serious(page) == []
     page.locator("[data-plan=set]").click()
     page.locator("[data-role=lamp]").wait_for()
+    page.get_by_text("One lamp, set by you: running.").wait_for()
+    assert re.findall(r"[0-9a-f]{12}", page.locator("main").inner_text()) == [], "no hash of a plan"
     page.locator("textarea").fill("#" * 100_000)
-    page.locator("[data-plan=set]").click()
+    page.locator("[data-plan=check]").click()
     page.get_by_text("The plan has more than 64 KiB.").wait_for()
     assert serious(page) == []
     page.locator("[data-plan=stop]").click()

@@ -1,11 +1,12 @@
 """The page of sessions in a real browser: the recorder, marks, and the actions on a recording."""
 
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page
+from playwright.sync_api import Locator, Page, expect
 
 from tests.e2e.test_console import serious
 from tests.support.console import ConsoleProcess, ConsoleStage
@@ -36,6 +37,13 @@ def sessions_page(stage: ConsoleStage) -> Page:
     return page
 
 
+def others(row: Locator) -> Locator:
+    """Unfold the other actions of a recording. Return it."""
+    if row.locator("details.others[open]").count() == 0:
+        row.locator("details.others > summary").click()
+    return row
+
+
 def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, place: Path) -> None:
     page = sessions_page(stage)
     page.locator("[data-recorder=recording]").wait_for()
@@ -46,7 +54,10 @@ def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, 
     page.locator("[data-recorder=stopped]").wait_for()
     row = page.locator("[data-session]").filter(has_text="whole")
     row.wait_for()
-    row.get_by_role("button", name="Verify").click()
+    expect(row.locator("h3")).to_have_text(re.compile(r"today \d\d:\d\d, \d+ (s|min)"))
+    expect(row.locator("[data-mark]")).to_have_text(re.compile(r"\d\d:\d\d:\d\d here it slips"))
+    assert row.locator(".main").count() == 1
+    others(row).get_by_role("button", name="Verify").click()
     row.get_by_text("whole,").wait_for()
     with page.expect_download() as downloaded:
         row.get_by_role("link", name="Download").first.click()
@@ -73,7 +84,7 @@ def test_a_stop_arrives_while_a_session_is_verified_and_shown_in_rerun(stage: Co
     page = sessions_page(stage)
     row = page.locator("[data-session]").last
     row.get_by_role("button", name="Open in Rerun").click()
-    row.get_by_role("button", name="Verify").click()
+    others(row).get_by_role("button", name="Verify").click()
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")
     report = stage.report(page, lambda: page.keyboard.press("Escape"))
@@ -95,6 +106,7 @@ def test_axe_finds_nothing_serious_and_the_stop_is_in_view(stage: ConsoleStage, 
     page = stage.phone("#/sessions") if size == "phone" else stage.page("#/sessions")
     page.locator("[data-session]").first.wait_for()
     page.locator("[data-recorder]").wait_for()
+    others(page.locator("[data-session]").first)
     assert serious(page) == []
     box, window = page.locator("#stop").bounding_box(), page.viewport_size
     assert box is not None
@@ -107,6 +119,8 @@ def test_axe_finds_nothing_serious_and_the_stop_is_in_view(stage: ConsoleStage, 
 def test_each_action_is_reached_by_keyboard(stage: ConsoleStage) -> None:
     page = sessions_page(stage)
     page.locator("[data-recorder]").wait_for()
+    for row in page.locator("[data-session]").all():
+        others(row)
     wanted = page.locator("main button, main a, main input").count()
     reached: set[str] = set()
     for _ in range(wanted + 40):

@@ -85,6 +85,7 @@ def test_a_mark_and_the_name_of_a_recording_are_text(stage: ConsoleStage, page: 
     odd = page.locator("[data-session]").filter(has_text="<b>boldevil")
     odd.wait_for()
     is_text(page)
+    odd.locator("details.others > summary").click()
     odd.get_by_role("button", name="Verify").click()
     odd.get_by_text("whole,").wait_for()
     is_text(page)

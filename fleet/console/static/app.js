@@ -193,6 +193,20 @@ function Tabs({ here, shown }) {
   </nav>`;
 }
 
+// How old what one sees is, and why the console lets this page not in.
+function Connection() {
+  const { state } = store;
+  const [symbol, kind, words] =
+    state === null || store.unpaired
+      ? ["◌", "off", store.unpaired ? t.connection.unpaired : t.connection.none]
+      : store.lost || !store.connected
+        ? ["⚠", "old", t.connection.old(t.ago(store.silent_s))]
+        : !state.hub
+          ? ["⚠", "bus", t.connection.bus]
+          : ["●", "live", t.connection.live];
+  return html`<span class=${`connection ${kind === "live" ? "" : "bad"}`} data-connection=${kind}><span aria-hidden="true">${symbol}</span> ${words}</span>`;
+}
+
 class App extends Component {
   componentDidMount() {
     subscribe(() => this.setState({}));
@@ -212,13 +226,15 @@ class App extends Component {
       <${Navigation} here=${here} shown=${tabs()} />
       <header class="top">
         <span class="person">${store.hello && store.rights ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
+        <${Connection} />
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
       <main id="content" tabindex="-1" class=${here === "#/" ? "filled" : ""}>
-        ${isReady() ? html`<${Page} key=${here} cars=${carsInPlace()} />` : html`<h1>${t.title}</h1><p>${t.connecting}</p>`}
+        ${isReady() ? html`<${Page} key=${here} cars=${carsInPlace()} />` : html`<h1>${t.title}</h1><p>${t.connecting}</p>
+          ${store.refusedWhy && html`<p class="bad" data-refused>${t.refusedWhy(store.refusedWhy)}</p>`}`}
       </main>
       <div class="messages"><div class="notices">
-        ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost} />`}
+        ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost(store.refusedWhy)} />`}
         ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
         ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}

@@ -3,12 +3,14 @@
 import { parse, seen } from "./foreign.js";
 import { motionOf } from "./holds.js";
 import { placed } from "./places.js";
+import { clockAt, dayWords } from "./when.js";
 
 const RECONNECT_MS = 500;
 const NOT_PAIRED = 4001; // the close code of a page whose device was revoked, or whose pairing has expired
 const SENT_TOO_MUCH = 4008; // the close code of a page that has sent far more than a person can
 const COOLDOWN_MS = 15_000;
 const UNPAIRED_MS = 5000;
+const MAX_WHY = 200; // letters of a refusal that are shown
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
 const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
@@ -37,6 +39,7 @@ export const store = {
   lost: false,
   silent_s: 0, // whole seconds since the console said anything, while it is lost
   stopUnsent: false, // the last STOP has not reached the console
+  refusedWhy: "", // why the console lets this page not in, in its own words
   unpaired: "", // "revoked": not even STOP works. "expired": STOP by fetch works
   press: null, // the motion that is driven: {id, motion, cars}
   results: [],
@@ -111,8 +114,11 @@ function note(words, bad) {
 export const consoleNow = () => (store.state?.at_ms ?? 0) + performance.now() - stateAt;
 
 // The time of day at the console: HH:MM:SS, or fewer or more letters of HH:MM:SS.mmm.
-export const clock = (at_ms, letters = 8) =>
-  new Date(at_ms + 1000 * (store.state?.zone_s ?? 0)).toISOString().slice(11, 11 + letters);
+export const clock = (at_ms, letters = 8) => clockAt(at_ms, store.state?.zone_s ?? 0, letters);
+
+// When something was, as a person says it: "today 00:46".
+export const when = ({ at_ms, zone_s }, letters = 5) =>
+  `${dayWords(at_ms, zone_s, consoleNow(), store.state?.zone_s ?? 0, describe.calendar)} ${clockAt(at_ms, zone_s, letters)}`;
 
 // ---------------------------------------------------------------- STOP
 
@@ -367,8 +373,11 @@ async function connect() {
   // A console that was started again has another cookie.
   try {
     const hello = await fetch("/hello");
-    store.unpaired = hello.status !== 403 ? "" : (await hello.text()).includes("expired") ? "expired" : "revoked";
+    const why = hello.ok ? "" : seen((await hello.text()).slice(0, MAX_WHY));
+    store.unpaired = hello.status !== 403 ? "" : why.includes("expired") ? "expired" : "revoked";
+    if (why) store.refusedWhy = why;
   } catch {
+    store.refusedWhy = "";
     setTimeout(connect, RECONNECT_MS);
     return;
   }
@@ -380,6 +389,7 @@ async function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
   socket.onopen = () => {
     store.connected = true;
+    store.refusedWhy = "";
     pressNumber = 0;
     for (const message of wishes.values()) send(message);
     changed();
@@ -388,6 +398,7 @@ async function connect() {
   socket.onclose = (event) => {
     store.connected = false;
     letGo();
+    store.refusedWhy = seen(event.reason);
     if (event.code === SENT_TOO_MUCH) note(event.reason, true);
     if (event.code === NOT_PAIRED) store.unpaired = "revoked"; // `/hello` knows better in a moment
     changed();

@@ -1,13 +1,12 @@
 // The sessions page: the recorder, and the list of recordings with what can be done with each.
 
-import { ask, store } from "./console.js";
+import { ask, store, when, who } from "./console.js";
 import { seen } from "./foreign.js";
 import { t } from "./texts.js";
 import { html, Refused, useEffect, useState } from "./ui.js";
+import { clockAt, lengthWords } from "./when.js";
 
 const POLL_MS = 2000;
-
-const length = (s) => `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
 
 const isHere = () => ["127.0.0.1", "localhost"].includes(location.hostname);
 
@@ -41,7 +40,7 @@ function Recorder({ onChange }) {
   return html`<section aria-labelledby="recording">
     <h2 id="recording">${t.recording}</h2>
     ${status !== null && html`<p data-recorder=${status.state ?? "none"}>
-      ${status.ok ? `${t.recorderStates[status.state] ?? status.state} ${t.recordingTo(status.session, status.messages, t.size(status.bytes))} ${status.words}` : status.words}
+      ${status.ok ? `${t.recorderStates[status.state] ?? status.state} ${t.recordingTo(seen(status.session), status.messages, t.size(status.bytes))} ${status.words}` : status.words}
     </p>`}
     <div class="controls">
       ${status?.ok && (on
@@ -55,34 +54,51 @@ function Recorder({ onChange }) {
   </section>`;
 }
 
-function Row({ session }) {
+const MARKS = 5; // the others are one press away
+
+function Marks({ marks }) {
+  const line = (mark, index) => html`<li key=${index} data-mark=${mark.at_ms}>
+    <time>${mark.at_ms === null ? "" : clockAt(mark.at_ms, mark.zone_s)}</time> ${mark.text}${mark.by ? html` <span class="dim">${who(mark.by)}</span>` : ""}</li>`;
+  if (marks.length === 0) return null;
+  const rest = marks.slice(MARKS);
+  return html`<ul class="plain marks">${marks.slice(0, MARKS).map(line)}</ul>
+    ${rest.length > 0 && html`<details><summary>${t.moreMarks(rest.length)}</summary><ul class="plain marks">${rest.map(line)}</ul></details>`}`;
+}
+
+function Session({ session }) {
   const [answer, setAnswer] = useState(null);
   const path = `/sessions/${encodeURIComponent(session.name)}`;
+  const title = session.at_ms === null ? seen(session.name) : `${when(session)}, ${lengthWords(session.length_s)}`;
   const act = async (what) => {
     setAnswer({ words: t.working });
     setAnswer(await ask(`${path}/${what}`, ""));
   };
-  const button = (what, words) => html`<button key=${what} data-session-do=${what} aria-label=${`${words}: ${seen(session.name)}`} onClick=${() => act(what)}>${words}</button>`;
-  const cells = [length(session.length_s), t.size(session.bytes), session.lost, session.marks.length || "", session.cars.join(", ")];
-  return html`<tr data-session=${session.name}>
-    <th scope="row">${seen(session.name)}</th>
-    <td>${t.sessionStates[session.state] ?? session.state}${session.words && html`<br /><small>${session.words}</small>`}</td>
-    ${cells.map((cell, index) => html`<td key=${index}>${cell}</td>`)}
-    <td>
-      <div class="controls">
-        ${button("verify", t.verify)}
-        <a class="button" href=${`${path}/download`} download aria-label=${`${t.download}: ${seen(session.name)}`}>${t.download}</a>
-        ${Object.entries(t.exportAs).map(([kind, words]) => button(`export/${kind}`, words))}
-        ${isHere() ? button("view", t.rerun) : html`<small>${t.rerunElsewhere}</small>`}
-      </div>
-      <div role="status">
-        ${answer !== null && html`<p class="words">${answer.words}</p>`}
-        ${answer?.url && (answer.url.startsWith("/")
-          ? html`<a class="button" href=${answer.url} download>${t.fetchExport}</a>`
-          : html`<a class="button" href=${answer.url} target="_blank" rel="noopener noreferrer">${t.rerunReady}</a>`)}
-      </div>
-    </td>
-  </tr>`;
+  const button = (what, words, kind = "") => html`<button key=${what} class=${kind} data-session-do=${what} aria-label=${`${words}: ${title}`} onClick=${() => act(what)}>${words}</button>`;
+  const download = (kind) => html`<a class=${`button ${kind}`} href=${`${path}/download`} download aria-label=${`${t.download}: ${title}`}>${t.download}</a>`;
+  const facts = [t.sessionStates[session.state] ?? session.state, session.cars.join(", "), t.size(session.bytes), session.lost > 0 && t.lostMessages(session.lost), session.kept && t.kept];
+  return html`<article class="session" data-session=${session.name}>
+    <h3>${title}</h3>
+    <p class="facts">${facts.filter(Boolean).join(" · ")}</p>
+    ${session.words && html`<p class="bad">⚠ ${session.words}</p>`}
+    <${Marks} marks=${session.marks} />
+    <div class="controls">
+      ${isHere() ? button("view", t.rerun, "main") : download("main")}
+      <details class="others"><summary>${t.otherActions}</summary>
+        <div class="controls">
+          ${isHere() && download("")}
+          ${button("verify", t.verify)}
+          ${Object.entries(t.exportAs).map(([kind, words]) => button(`export/${kind}`, words))}
+        </div>
+        <p class="hint">${seen(session.name)}${isHere() ? "" : `. ${t.rerunElsewhere}`}</p>
+      </details>
+    </div>
+    <div role="status">
+      ${answer !== null && html`<p class="words">${answer.words}</p>`}
+      ${answer?.url && (answer.url.startsWith("/")
+        ? html`<a class="button" href=${answer.url} download>${t.fetchExport}</a>`
+        : html`<a class="button" href=${answer.url} target="_blank" rel="noopener noreferrer">${t.rerunReady}</a>`)}
+    </div>
+  </article>`;
 }
 
 export function SessionsPage() {
@@ -95,18 +111,13 @@ export function SessionsPage() {
     <h1>${t.sessions}</h1>
     <${Recorder} onChange=${refresh} />
     <section aria-labelledby="listed">
-      <h2 id="listed">${t.sessions}</h2>
+      <h2 id="listed">${t.recordings}</h2>
       <button onClick=${refresh}>${t.refresh}</button>
       ${listed === null && html`<p>${t.working}</p>`}
       ${listed?.words && html`<p>${listed.words}</p>`}
       ${listed?.sessions?.length === 0 && html`<p>${t.noSessions(listed.place)}</p>`}
       ${listed?.sessions?.length > 0 &&
-      html`<div class="sessions" tabindex="0" role="region" aria-labelledby="listed">
-        <table>
-          <thead><tr>${t.sessionColumns.map((name) => html`<th key=${name} scope="col">${name}</th>`)}</tr></thead>
-          <tbody>${listed.sessions.map((session) => html`<${Row} key=${session.name} session=${session} />`)}</tbody>
-        </table>
-      </div>`}
+      html`<div class="sessions">${listed.sessions.map((session) => html`<${Session} key=${session.name} session=${session} />`)}</div>`}
     </section>
   `;
 }

@@ -137,7 +137,7 @@ class Plan:
     @property
     def version(self) -> str:
         """The start of the text's hash."""
-        return hashlib.sha256(self.text.encode()).hexdigest()[:12]
+        return version_of(self.text)
 
     @property
     def first(self) -> str:
@@ -185,3 +185,8 @@ class Plan:
         if car in self.fixed:
             return self.fixed[car] == role.name
         return role.cars is None or car in role.cars
+
+
+def version_of(text: str) -> str:
+    """Return the version of the plan with this text."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

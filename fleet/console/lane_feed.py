@@ -1,0 +1,64 @@
+"""Feeds the time line, and the bands of the plots, with what the cars did since the console started."""
+
+import json
+import time
+from collections.abc import Container, Mapping
+from typing import Any, Final
+
+from fleet.console.page_feed import Handler, PageFeed
+from fleet.console.page_link import PageLink
+from fleet.console.requests import PageMessage
+from fleet.recording.tools.lanes import HELD_NS, LANE_TOPICS, Lanes
+from schemas.keys import Key
+
+LIVE_LANES_NS: Final = 900 * 1_000_000_000
+"""How far back the live lanes go: a plot shows ten minutes, and half as many again stay for a pause."""
+TICKS_BETWEEN_LANES: Final = 10
+"""The lanes are sent once a second: they are to be looked at, not to drive by."""
+
+
+class LaneFeed(PageFeed):
+    """The live lanes, and the pages that show them."""
+
+    def __init__(self) -> None:
+        self._lanes = Lanes()
+        self._pages: set[int] = set()
+        self._ticks = 0
+
+    @property
+    def messages(self) -> Mapping[str, Handler]:
+        """Show the lanes, or do not."""
+        return {"lanes": self._begin, "lanes_end": lambda page, _: self._pages.discard(page.number)}
+
+    def on_message(self, key: Key, message: Any) -> None:
+        """Take in a message of a car."""
+        if key.topic in LANE_TOPICS:
+            self._lanes.add(key.car, key.topic, message, time.time_ns())
+
+    def keep(self, cars: Container[str]) -> None:
+        """Forget all cars but these: anybody on the bus may invent some."""
+        self._lanes.keep(cars)
+
+    def _begin(self, page: PageLink, _: PageMessage) -> None:
+        self._pages.add(page.number)
+        self._show(page, LIVE_LANES_NS)
+
+    def tick(self, pages: Mapping[int, PageLink]) -> None:
+        """Show what has changed since the last time. A page that did not read it gets it with the next."""
+        self._ticks += 1
+        if self._ticks % TICKS_BETWEEN_LANES:
+            return
+        for number in self._pages & set(pages):
+            # What was sent last may have been replaced before it was read: so each message reaches back some more.
+            self._show(pages[number], 2 * HELD_NS)
+
+    def end(self, page: int) -> None:
+        """Forget a page."""
+        self._pages.discard(page)
+
+    def _show(self, page: PageLink, back_ns: int) -> None:
+        now = time.time_ns()
+        if page.has_unsent("lanes"):
+            back_ns = LIVE_LANES_NS  # a whole one may be what waits
+        spans = [span.as_list() for span in self._lanes.since(now - back_ns)]
+        page.show("lanes", json.dumps({"t": "lanes", "spans": spans}, separators=(",", ":")))

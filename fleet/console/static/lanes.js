@@ -1,0 +1,22 @@
+// What the cars did lately, as the console tells it: spans of modes, drivers, holds, stops and losses.
+
+import { on, unwish, wish } from "./console.js";
+
+const KEPT_MS = 900_000; // as long as the console itself
+
+// Each as {car, lane, begin, end, words, bad}, times in ms, the oldest first.
+export const spanOf = ([car, lane, begin, end, words, bad]) => ({ car, lane, begin, end, words, bad });
+
+const live = new Map();
+on("lanes", ({ spans }) => {
+  for (const each of spans) live.set(each.slice(0, 3).join(" "), spanOf(each));
+  const newest = Math.max(...[...live.values()].map((each) => each.end));
+  for (const [key, each] of live) if (each.end < newest - KEPT_MS) live.delete(key);
+});
+export const liveSpans = () => [...live.values()];
+
+// Ask for them while a page shows them. Return what ends it.
+export function showLanes() {
+  wish({ t: "lanes" });
+  return () => unwish("lanes", { t: "lanes_end" });
+}

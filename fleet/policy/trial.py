@@ -1,0 +1,83 @@
+"""A dry run: what a plan would decide first for the cars as they are now. Pure, and nothing is commanded."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fleet.policy.decide import FIRST_STATE_TIMEOUT_S, step
+from fleet.policy.decision import Decision, DecisionKind
+from fleet.policy.plan.plan import Plan
+from fleet.policy.rules import PhaseState
+from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
+from fleet.policy.state import HeldRole, PolicyState, carry_over
+
+
+@dataclass(frozen=True, slots=True)
+class PlanInForce:
+    """What the coordinator does now: its plan, the role of each car, and its phase."""
+
+    plan: Plan
+    roles: Mapping[str, str]
+    phase: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CarTrial:
+    """What a plan would first do with one car."""
+
+    car: str
+    role_before: str
+    """Empty: none."""
+    role: str
+    mode_before: str
+    """Empty: not known."""
+    decision: Decision
+
+    @property
+    def is_changed(self) -> bool:
+        """True if the car would get another role, or a mode that it is not in."""
+        mode = self.decision.mode
+        if mode is None:  # it is left alone
+            return False
+        return self.role != self.role_before or mode != self.mode_before
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """The first decisions of a plan."""
+
+    cars: tuple[CarTrial, ...]
+    places: tuple[Decision, ...]
+    """Roles that would lack cars, each with the reason."""
+
+
+def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, now: float) -> Trial:
+    """Return what this plan would decide for these cars, first of all. Conditions over time have just begun.
+
+    `in_force`: None if no plan runs. Roles and the phase go on if both plans have them, as under `fleet plan set`.
+    """
+    # The states of all cars that speak are there already: nobody has to be waited for.
+    begun = now - FIRST_STATE_TIMEOUT_S
+    memory = PolicyState(started_at=begun)
+    if in_force is not None:
+        held = {car: HeldRole(role) for car, role in in_force.roles.items() if role in in_force.plan.roles}
+        phase = PhaseState(in_force.phase, begun) if in_force.phase in in_force.plan.phases else PhaseState()
+        memory = carry_over(PolicyState(started_at=begun, held_roles=held, phase=phase), in_force.plan, plan)
+    decided = step(plan, snapshot, memory, now)
+    # The coordinator also publishes who has none of its roles.
+    own = () if in_force is None else in_force.roles.items()
+    roles_before = {car: role for car, role in own if in_force is not None and role in in_force.plan.roles}
+    cars = tuple(
+        CarTrial(
+            each.subject,
+            roles_before.get(each.subject, ""),
+            decided.roles.get(each.subject, ""),
+            snapshot.cars.get(each.subject, UNKNOWN_CAR).mode,
+            each,
+        )
+        for each in decided.decisions
+        if each.kind in _OF_CARS
+    )
+    return Trial(cars, tuple(each for each in decided.decisions if each.kind is DecisionKind.VACANT))
+
+
+_OF_CARS = frozenset({DecisionKind.ROLE, DecisionKind.RULE, DecisionKind.IDLE, DecisionKind.ALONE})

@@ -1,0 +1,180 @@
+"""The lanes of a time line: for each car when which mode was in force, who drove, what kept it, stops and losses. Pure.
+
+The console draws them live, and of a session. Times are those of one clock that the caller chooses, ns since the epoch:
+for a session that of the recorder, since the clock of a gateway may be wrong.
+
+A state holds until the next one, and no longer than until it is stale: what nobody said is not drawn. A stop begins
+when it arrived and ends with its last record.
+"""
+
+from collections import deque
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+
+from fleet.recording.tools.stop_findings import asked_by
+from schemas import keys
+from schemas.authority import binding_pause
+from schemas.commands import STOPPING_VERBS
+from schemas.topics import TOPICS
+from schemas.words import UNKNOWN, LinkState, Motion, Phase, Verdict
+
+LANE_TOPICS: Final = ("state/mode", "state/motion", "state/safety", "state/link", "event/command")
+MARK_TOPIC: Final = f"{keys.RECORDER}/mark"
+MODE_TOPIC: Final = TOPICS["state/mode"]
+assert MODE_TOPIC.stale_after_s is not None
+HELD_NS: Final = round(MODE_TOPIC.stale_after_s * 1e9)
+"""Time after which a state is stale. All states of a car have the same."""
+MAX_SPANS: Final = 4096
+"""Maximum number of spans of one lane. The oldest are forgotten: a car that changes each second fills more than an
+hour with them."""
+MAX_OPEN_STOPS: Final = 64
+"""Maximum number of stops of a car without an end. Their records may be lost."""
+_MOVING: Final = frozenset(Motion) - {Motion.STOP}
+_BAD_ENDS: Final = frozenset({Phase.FAILED, Phase.EXPIRED, Phase.REJECTED})
+_SILENT: Final = "not heard"
+_LAST_PHASES: Final = _BAD_ENDS | {Phase.COMPLETE, Phase.SUPERSEDED}
+
+
+class Lane(StrEnum):
+    """What is drawn of a car, from top to bottom."""
+
+    MODE = "mode"
+    DRIVER = "driver"
+    HOLD = "hold"
+    STOP = "stop"
+    LOSS = "loss"
+
+
+@dataclass(slots=True)
+class LaneSpan:
+    """One thing that was so from `begin_ns` to `end_ns`. Its end grows while it lasts."""
+
+    car: str
+    lane: Lane
+    begin_ns: int
+    end_ns: int
+    words: str
+    bad: bool = False
+
+    def as_list(self) -> list[Any]:
+        """Return it as JSON values, with times in ms."""
+        return [self.car, self.lane, self.begin_ns // 1_000_000, self.end_ns // 1_000_000, self.words, self.bad]
+
+
+@dataclass(frozen=True, slots=True)
+class LaneMark:
+    """What somebody marked."""
+
+    at_ns: int
+    words: str
+    by: str = ""
+
+
+@dataclass(slots=True)
+class Lanes:
+    """The lanes of all cars, from their messages in the order of their times."""
+
+    spans: dict[tuple[str, Lane], deque[LaneSpan]] = field(default_factory=dict)
+    marks: deque[LaneMark] = field(default_factory=lambda: deque(maxlen=MAX_SPANS))
+    _stops: dict[str, dict[str, LaneSpan]] = field(default_factory=dict)
+    """By car and id: the stops that have no end yet."""
+    _open: dict[tuple[str, Lane], LaneSpan] = field(default_factory=dict)
+    """The span of each lane that the next state may prolong."""
+    _heard_ns: dict[str, int] = field(default_factory=dict)
+    """When each car last said how its link is."""
+
+    def add(self, car: str, topic: str, message: Any, at_ns: int) -> None:
+        """Take in a message of LANE_TOPICS, or a mark. Others change nothing."""
+        match topic:
+            case "state/mode":
+                is_wrong = message.verdict == Verdict.CONTRADICTED
+                mode = message.inferred if is_wrong else message.asked
+                self._hold(car, Lane.MODE, "" if mode == UNKNOWN else mode, at_ns, bad=is_wrong)
+            case "state/motion":
+                self._hold(car, Lane.DRIVER, message.owner if message.motion in _MOVING else "", at_ns)
+            case "state/safety":
+                self._hold(car, Lane.HOLD, _kept_by(message), at_ns, bad=len(message.estops) > 0)
+            case "state/link":
+                is_lost = message.state in (LinkState.LOST, LinkState.STALE)
+                self._hold(car, Lane.LOSS, message.state if is_lost else "", at_ns, bad=is_lost)
+                self._silence(car, at_ns)
+            case "event/command" if message.verb in STOPPING_VERBS:
+                self._stop(car, message, at_ns)
+            case _ if topic == MARK_TOPIC:
+                self.marks.append(LaneMark(at_ns, message.message, message.name))
+
+    def keep(self, cars: Container[str]) -> None:
+        """Forget all cars but these."""
+        for found in (self.spans, self._open):
+            for place in [place for place in found if place[0] not in cars]:
+                del found[place]
+        for by_car in (self._stops, self._heard_ns):
+            for car in [car for car in by_car if car not in cars]:
+                del by_car[car]
+
+    def since(self, at_ns: int) -> Iterator[LaneSpan]:
+        """Yield the spans that reach this time, or are later: by car, lane and time."""
+        for _, spans in sorted(self.spans.items()):
+            yield from (span for span in spans if span.end_ns >= at_ns)
+
+    def at(self, at_ns: int) -> dict[tuple[str, Lane], LaneSpan]:
+        """Return what was so at a time, by car and lane."""
+        found = {}
+        for place, spans in self.spans.items():
+            for span in spans:
+                if span.begin_ns <= at_ns <= span.end_ns:
+                    found[place] = span  # of two that touch the later one
+        return found
+
+    def _hold(self, car: str, lane: Lane, words: str, at_ns: int, *, bad: bool = False) -> None:
+        """Note what a state says: empty words end what was so."""
+        spans = self._spans(car, lane)
+        last = spans[-1] if spans else None
+        if last is not None and self._open.get((car, lane)) is last and at_ns - last.end_ns <= HELD_NS:
+            last.end_ns = max(last.end_ns, at_ns)
+            if last.words == words and last.bad == bad:
+                return
+        self._open.pop((car, lane), None)
+        if words:
+            span = LaneSpan(car, lane, at_ns, at_ns, words, bad)
+            spans.append(span)
+            self._open[car, lane] = span
+
+    def _silence(self, car: str, at_ns: int) -> None:
+        """Draw the time as a loss for which a car was not heard, once it is heard again."""
+        before = self._heard_ns.get(car)
+        self._heard_ns[car] = at_ns
+        if before is not None and at_ns - before > HELD_NS:
+            spans = self._spans(car, Lane.LOSS)
+            current = spans.pop() if spans and self._open.get((car, Lane.LOSS)) is spans[-1] else None
+            spans.append(LaneSpan(car, Lane.LOSS, before, at_ns, _SILENT, bad=True))
+            if current is not None:
+                spans.append(current)
+
+    def _stop(self, car: str, event: Any, at_ns: int) -> None:
+        stops = self._stops.setdefault(car, {})
+        span = stops.get(event.id)
+        if span is None:
+            span = stops[event.id] = LaneSpan(car, Lane.STOP, at_ns, at_ns, "")
+            self._spans(car, Lane.STOP).append(span)
+            while len(stops) > MAX_OPEN_STOPS:
+                del stops[next(iter(stops))]
+        span.end_ns = max(span.end_ns, at_ns)
+        span.words = f"{asked_by(event)} {event.phase}{f' ({event.basis})' if event.basis else ''}"
+        span.bad = event.phase in _BAD_ENDS
+        if event.phase in _LAST_PHASES:
+            del stops[event.id]
+
+    def _spans(self, car: str, lane: Lane) -> deque[LaneSpan]:
+        return self.spans.setdefault((car, lane), deque(maxlen=MAX_SPANS))
+
+
+def _kept_by(safety: Any) -> str:
+    """Return what keeps a car from moving: an e-stop, the pause of the fleet, or a hold. Empty: nothing."""
+    if safety.estops:
+        return f"e-stop by {keys.person_of(safety.estops[0].by)}"
+    if (pause := binding_pause(safety.pauses)) is not None:
+        return f"pause by {keys.person_of(pause.by)}"
+    return f"hold by {keys.person_of(safety.hold.by)}" if safety.HasField("hold") else ""
