@@ -58,7 +58,7 @@ const MARKS = 5; // the others are one press away
 
 function Marks({ marks }) {
   const line = (mark, index) => html`<li key=${index} data-mark=${mark.at_ms}>
-    <time>${mark.at_ms === null ? "" : clockAt(mark.at_ms, mark.zone_s)}</time> ${mark.text}${mark.by ? html` <span class="dim">${who(mark.by)}</span>` : ""}</li>`;
+    <time>${mark.at_ms === null ? "" : clockAt(mark.at_ms, mark.zone_s)}</time> ${seen(mark.text)}${mark.by ? html` <span class="dim">${who(mark.by)}</span>` : ""}</li>`;
   if (marks.length === 0) return null;
   const rest = marks.slice(MARKS);
   return html`<ul class="plain marks">${marks.slice(0, MARKS).map(line)}</ul>
