@@ -32,6 +32,8 @@ class Service(StrEnum):
     SIMULATOR = "sim"
 
 
+AS_THE_USER: Final = frozenset({f"{IdentityRole.SERVICE}.{name}" for name in (Service.CONSOLE, Service.SIMULATOR)})
+"""The services that also run with the certificate of the user: the page is that person's then, and no truth is told."""
 _FORWARDED: Final = frozenset({Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE})
 """What gateways tell one another in the name of whoever told one of them."""
 

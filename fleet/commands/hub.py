@@ -19,6 +19,7 @@ from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
 from schemas.bus import Bus, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
+from schemas.identity import IdentityRole, Service
 from schemas.printable import printable
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
@@ -38,16 +39,18 @@ def hub() -> None:
     """Make this computer the hub of several: with certificates, so that everybody is who they say."""
 
 
-@hub.command(epilog="\b\nexample:\n  fleet hub init")
-def init() -> None:
+@hub.command(epilog="\b\nexamples:\n  fleet hub init\n  fleet hub init --car red")
+@click.option("--car", "cars", multiple=True, metavar="CAR", help="Also for this car, whose gateway runs here.")
+def init(cars: tuple[str, ...]) -> None:
     """Make this computer the hub that other computers may join.
 
-    It gets an authority, and a certificate for you, for each car and each service. It listens on the network, with TLS:
-    who has no certificate gets nothing. `fleet up` starts it. On one computer alone, `fleet up --secure` does the same,
-    and listens on loopback only.
+    It gets an authority, and a certificate for you and for each service; `fleet up` adds those of its cars. It listens
+    on the network, with TLS: who has no certificate gets nothing. `fleet up` starts it. On one computer alone, `fleet
+    up --secure` does the same, and listens on loopback only.
     """
     with cli_errors(), _disk_errors():
-        store = local_hub.ensure_hub_here(local_hub.SECURE_ENDPOINT, listens=(local_hub.EVERYWHERE,))
+        names = [keys.check_name(each) for each in cars]
+        store = local_hub.ensure_hub_here(local_hub.SECURE_ENDPOINT, names, listens=(local_hub.EVERYWHERE,))
     name = store.credentials.me.partition(".")[2]
     click.echo(
         f"This computer is a hub now, and you are {name} there. Its authority is in {store.directory}: keep a copy of "
@@ -59,19 +62,24 @@ def init() -> None:
 @hub.command(epilog="\b\nexamples:\n  fleet hub invite mia\n  fleet hub invite --car red")
 @click.argument("person", required=False)
 @click.option("--car", help="Invite a computer that runs the gateway of this car.")
+@click.option(
+    "--service", type=click.Choice([each.value for each in Service]), help="Invite a computer that runs this service."
+)
 @click.option("--port", type=click.IntRange(1, 65535), default=JOIN_PORT, show_default=True, help="Listen here.")
 @click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
 @json_option
-def invite(person: str | None, car: str | None, port: int, host: str | None, *, as_json: bool) -> None:
+def invite(
+    person: str | None, car: str | None, service: str | None, port: int, host: str | None, *, as_json: bool
+) -> None:
     """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
 
     The hub restarts first, since it gets another rule: drives end, modes go on, and all are back after a second.
     """
-    if (person is None) == (car is None):
-        raise click.UsageError("say who is invited: fleet hub invite NAME, or fleet hub invite --car NAME")
+    if [person, car, service].count(None) != 2:
+        raise click.UsageError("say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME")
     with cli_errors(), _disk_errors():
-        name = keys.check_name(person or car or "", "person" if person else "car name")
-        invited = identity.person(name) if person else identity.car(name)
+        name = keys.check_name(person or car or service or "", "car name" if car else "person")
+        invited = identity.person(name) if person else identity.car(name) if car else f"{IdentityRole.SERVICE}.{name}"
         endpoint = resolve_endpoint()
         store = _own_store(endpoint)
         store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from schemas.bus.errors import BusError
+from schemas.identity import AS_THE_USER, IdentityRole
 from schemas.state_dir import directory_of
 
 DIRECTORY: Final = "tls"
@@ -54,14 +55,24 @@ class Credentials:
             return ""
 
     def identity(self, wanted: str = "") -> str:
-        """Return the wanted identity if its certificate is here, else that of the user. Raises NoCredentials."""
-        for name in (wanted, self.me):
+        """Return the wanted identity, by default that of the user, if its certificate is here. Raises NoCredentials.
+
+        A gateway that spoke as somebody else would be heard by nobody, without a word.
+        """
+        names = (wanted, self.me) if wanted in AS_THE_USER else (wanted or self.me,)
+        for name in names:
             if name and (self.directory / f"{name}.pem").is_file():
                 return name
-        raise NoCredentials(
-            f"This computer has no certificate for the hub at {self.endpoint}. On the hub's computer, "
-            "`fleet hub invite NAME` prints a code; here, `fleet join HOST CODE` takes it."
-        )
+        role, _, own = (wanted or "person.NAME").partition(".")
+        option = "" if role == IdentityRole.PERSON else f"--{role} "
+        if (self.directory / f"{HUB}.key").is_file():
+            words = f"The hub's computer has no certificate for {wanted}: `fleet hub init {option}{own}` makes it"
+        else:
+            words = (
+                f"This computer has no certificate for {wanted or 'you'} at {self.endpoint}. On the hub's computer, "
+                f"`fleet hub invite {option}{own}` prints a code; here, `fleet join HOST CODE` takes it"
+            )
+        raise NoCredentials(f"{words}.")
 
     def of_client(self, wanted: str = "") -> dict[str, Any]:
         """Return Zenoh's settings of the link of a client. Raises NoCredentials."""

@@ -57,8 +57,8 @@ class Bus:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
         start_hub: True to start a hub if there is none. Otherwise a missing hub raises NoFleet.
-        identity: the one to connect as, such as `car.red`, if this computer has its certificate. By default, and
-        otherwise, it is that of the user. It matters only to a hub with certificates. Raises NoCredentials.
+        identity: the one to connect as, such as `car.red`; by default that of the user. It matters only to a hub with
+        certificates. Raises NoCredentials if this computer has no such certificate.
         """
         where = resolve_endpoint(endpoint)
         identity = Credentials.of(where).identity(identity) if is_secure(where) else ""

@@ -99,7 +99,12 @@ def test_without_a_certificate_the_way_to_one_is_said(tmp_path: Path) -> None:
 def test_a_program_has_its_own_certificate_or_that_of_the_user(tmp_path: Path) -> None:
     credentials = store_in(tmp_path).credentials
     assert credentials.identity("car.red") == "car.red"
-    assert credentials.identity("car.blue") == ME
+    with pytest.raises(NoCredentials, match="fleet hub init --car blue"):
+        credentials.identity("car.blue")
+    (tmp_path / "hub.key").unlink()
+    with pytest.raises(NoCredentials, match="fleet hub invite --car blue"):
+        credentials.identity("car.blue")
+    assert credentials.identity("service.console") == ME, "the page of a person"
     assert credentials.identity() == ME
 
 

@@ -1,0 +1,114 @@
+"""Three machines on one: network namespaces with a link between each and the hub's. Needs Linux and root.
+
+The links can be cut. Each machine has a state directory of its own, and joins the hub by the commands for people.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from fleet.hub.local_hub import SECURE_ENDPOINT
+from tests.support.processes import GatewayProcess, wait_for
+
+HUB, PI, OPERATOR = "fleet-hub", "fleet-pi", "fleet-operator"
+SUBNETS = {PI: "10.77.1", OPERATOR: "10.77.2"}
+_EXEC = "import os, sys; os.execvp('ip', ['ip', 'netns', 'exec', sys.argv[1], sys.executable, *sys.argv[2:]])"
+
+
+def _ip(*words: str) -> None:
+    done = subprocess.run(["ip", *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (words, done.stderr, "this soak needs root, and network namespaces")
+
+
+class Machines:
+    """The three machines. `close` ends their processes and removes them."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._started: list[GatewayProcess] = []
+        for name in (HUB, PI, OPERATOR):
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+            _ip("netns", "add", name)
+            _ip("-n", name, "link", "set", "lo", "up")
+        for number, (name, subnet) in enumerate(SUBNETS.items()):
+            here, there = f"fleet{number}a", f"fleet{number}b"
+            _ip("-n", HUB, "link", "add", here, "type", "veth", "peer", "name", there, "netns", name)
+            for place, device, address in ((HUB, here, f"{subnet}.1"), (name, there, f"{subnet}.2")):
+                _ip("-n", place, "addr", "add", f"{address}/24", "dev", device)
+                _ip("-n", place, "link", "set", device, "up")
+        self._devices = dict(zip(SUBNETS, ("fleet0a", "fleet1a"), strict=True))
+
+    def start(self, machine: str, *arguments: str, **environment: str) -> GatewayProcess:
+        """Start Python with these arguments on a machine."""
+        own = {"FLEET_STATE_DIR": str(self.directory / machine), "FLEET_ENDPOINT": "", **environment}
+        log = self.directory / f"{len(self._started)}.log"
+        self._started.append(GatewayProcess(["-c", _EXEC, machine, *arguments], log, own))
+        return self._started[-1]
+
+    def run(self, machine: str, *arguments: str, **environment: str) -> tuple[int, list[str], str]:
+        """Run `fleet` on a machine to its end. Return the exit code, the lines, and stderr."""
+        process = self.start(machine, "-m", "fleet.cli", *arguments, **environment)
+        code = process.wait()
+        return code, process.lines(), process.stderr
+
+    def make_hub(self) -> GatewayProcess:
+        """Make the hub's machine the hub, and start it."""
+        code, _, words = self.run(HUB, "hub", "init", "--car", "red", FLEET_AS="ann")
+        assert code == 0, words
+        hub = self.start(HUB, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
+        wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the hub is up")
+        return hub
+
+    def join(self, machine: str, *invited: str) -> None:
+        """Let a machine join, by the commands that people type."""
+        address = f"{SUBNETS[machine]}.1"
+        arguments = ("-m", "fleet.cli", "hub", "invite", *invited, "--json", "--as-hub", address)
+        invitation = self.start(HUB, *arguments)
+        said: Any = invitation.line()
+        code, _, words = self.run(machine, "join", said["host"], said["code"])
+        assert code == 0, words
+        assert invitation.wait() == 0, invitation.stderr
+
+    def kill_hub(self) -> None:
+        """Kill the hub, whoever has started it."""
+        listed = subprocess.run(["ip", "netns", "pids", HUB], capture_output=True, text=True, check=True).stdout.split()
+        hubs = [pid for pid in listed if "schemas.bus.hub" in " ".join(psutil.Process(int(pid)).cmdline())]
+        assert hubs, "there is a hub"
+        for pid in hubs:
+            os.kill(int(pid), signal.SIGKILL)
+
+    def cut(self, machine: str) -> None:
+        """Cut the link of a machine: no byte and no sign of its end goes through."""
+        _ip("-n", HUB, "link", "set", self._devices[machine], "down")
+
+    def mend(self, machine: str) -> None:
+        """Mend the link of a machine."""
+        _ip("-n", HUB, "link", "set", self._devices[machine], "up")
+
+    def close(self) -> None:
+        """End all processes, and remove the machines."""
+        for process in self._started:
+            if process.popen.poll() is None:
+                process.popen.kill()
+            process.wait()
+        for name in (HUB, PI, OPERATOR):
+            listed = subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True, check=False)
+            for pid in listed.stdout.split():
+                subprocess.run(["kill", "-9", pid], check=False)
+            subprocess.run(["ip", "netns", "del", name], check=False)
+
+
+@contextlib.contextmanager
+def machines(directory: Path) -> Iterator[Machines]:
+    """Yield three machines, and remove them afterwards."""
+    made = Machines(directory)
+    try:
+        yield made
+    finally:
+        made.close()
