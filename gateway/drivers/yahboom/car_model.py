@@ -174,14 +174,7 @@ class CarModel:
 
     def stop_case(self, *, is_soft: bool) -> StopCase:
         """Return what a stop rests on now if the car does not show it."""
-        profile = self.profile
-        return cases.case_of(
-            self.stop_style,
-            profile.kind,
-            has_readings=profile.has_readings,
-            is_soft=is_soft,
-            can_show=self.can_show,
-        )
+        return cases.case_of(self.stop_style, self.profile, is_soft=is_soft, can_show=self.can_show)
 
     @property
     def silent_program(self) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.drivers.yahboom.protocol.platforms import StopStyle
+from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from schemas.words import Platform
 
 DOUBTED_PROBES: Final = 2
@@ -248,13 +248,13 @@ CASES: Final = (
 """All of them, in the order of the docs."""
 
 
-def case_of(style: StopStyle, platform: Platform, *, has_readings: bool, is_soft: bool, can_show: bool) -> StopCase:
-    """Return what a stop rests on if the car does not show it."""
-    if not has_readings:
+def case_of(style: StopStyle, profile: Profile, *, is_soft: bool, can_show: bool) -> StopCase:
+    """Return what a stop of this style rests on if a car of this profile does not show it."""
+    if not profile.has_readings:
         return NO_READINGS
     match style:
         case StopStyle.GENERAL:
-            return RASPBERRY_PI if platform is Platform.RASPBERRY_PI else UNKNOWN_PLATFORM
+            return RASPBERRY_PI if profile.kind is Platform.RASPBERRY_PI else UNKNOWN_PLATFORM
         case _ if is_soft:
             return SOFT
         case StopStyle.BOTH:
