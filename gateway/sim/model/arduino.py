@@ -9,7 +9,8 @@ from math import inf
 from typing import Final
 
 from gateway.sim.model.firmware import COLOR_S, WHISTLE_S, Program, Wait, motion
-from gateway.sim.model.mode_car import ARDUINO_LIGHTS, ModeCar, to_int
+from gateway.sim.model.mode_car import ARDUINO_LIGHTS, MODE_OF_DIGIT, ModeCar, to_int
+from schemas.words import Mode
 
 TX_BUFFER: Final = 64
 # A wedged car never clears its string, which grows until the RAM is full.
@@ -46,7 +47,7 @@ class ArduinoCar(ModeCar):
             self._serial_event()
             if self._complete and (yield from self._parse()):
                 continue  # the car obeys bytes from the time of an opening right after it, not a turn later
-            if self._mode == 0:
+            if self._mode is Mode.MANUAL:
                 yield from self._manual()
             else:
                 yield from self._mode_turn()
@@ -86,7 +87,7 @@ class ArduinoCar(ModeCar):
         text, head = self._string, self._traits.head
         if text.find("MODE") > 0 and text.find(head) > 0:
             yield from self._mode_frame(text)
-        elif self._mode != 0:
+        elif self._mode is not Mode.MANUAL:
             pass  # row "a general stop in a mode other than 0"
         elif not (yield from self._named_frame(text)):
             if head in text:
@@ -102,14 +103,13 @@ class ArduinoCar(ModeCar):
         place = len(self._traits.head) + 6
         if text[place + 1 : place + 2] == "0":
             self._drive(0, 0)
-            self._mode = 0
+            self._mode = Mode.MANUAL
             yield from self._busy(self._traits.close_s)
             return
         digit = text[place : place + 1]
-        known = digit in ("0", "1", "2", "3", "4", "5", "6")
-        self._mode = int(digit) if known else 0
+        self._mode = MODE_OF_DIGIT.get(digit, Mode.MANUAL)
         # Row "a mode opened while driving": nothing here touches the motors.
-        beeps = BEEP_S + 0.2 * (self._mode + 1) if known else 0.0
+        beeps = BEEP_S + 0.2 * (int(digit) + 1) if digit in MODE_OF_DIGIT else 0.0
         yield from self._busy(beeps + OPEN_S)
 
     def _general_frame(self, text: str) -> Program:
@@ -188,7 +188,7 @@ class ArduinoCar(ModeCar):
     def _on_alarm(self) -> None:
         """Report by the timer, also during a block. Its ranging blocks nothing."""
         self._alarm_at += self._next_interval_s(self._traits.interval_s)
-        if self._mode == 0 and not self._is_silent:
+        if self._mode is Mode.MANUAL and not self._is_silent:
             self._send(self._report_frame(self._range()))
 
     def _print(self, data: bytes) -> Program:
@@ -201,7 +201,7 @@ class ArduinoCar(ModeCar):
     def _turn(self, fields: str) -> Program:
         """Send the frame of one loop turn in modes 2, 5 and 6, at the rate of the UART."""
         frame = self._frame(fields)
-        if self._mode == 6:
+        if self._mode is Mode.FOLLOWING:
             frame = frame[:-1]  # row "6 following": no `#`
         if self._fan or self._is_silent or not self._traits.readings:
             yield Wait(self._now + len(frame) / self._rate)

@@ -33,16 +33,6 @@ ECHO_S_PER_CM: Final = 58e-6
 REPORT_BASE_S: Final = 0.004
 TEXT_LINE: Final = b"EXEC:F\r\n"
 
-MODE_OF_DIGIT: Final = {
-    0: Mode.MANUAL,
-    1: Mode.REMOTE_CONTROL,
-    2: Mode.TRACKING,
-    3: Mode.OBSTACLE_AVOIDANCE,
-    4: Mode.COLOR_LED,
-    5: Mode.LIGHT_SEEKING,
-    6: Mode.FOLLOWING,
-}
-
 
 class Rng(Protocol):
     """A seeded source of random numbers; `random.Random` is one."""
@@ -157,7 +147,7 @@ class Firmware:
         self._left = self._right = 0
         self._blocked = False
         self._alive = True
-        self._mode = 0
+        self._mode = Mode.MANUAL
         self._fan = False
         self._servo = 90
         self._speed = 0
@@ -220,7 +210,7 @@ class Firmware:
     def truth(self) -> Truth:
         """The state at `now`, as of the last call."""
         return Truth(
-            mode=MODE_OF_DIGIT[self._mode],
+            mode=self._mode,
             motor_left=self._left,
             motor_right=self._right,
             blocked=self._blocked,
@@ -257,7 +247,7 @@ class Firmware:
         self._tx_free = now
         self._drive(0, 0)
         self._blocked = False
-        self._mode = 0
+        self._mode = Mode.MANUAL
         self._fan = False
         self._rgb = (0, 0, 0)
         self._alive = True

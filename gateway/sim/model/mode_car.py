@@ -10,7 +10,6 @@ from typing import ClassVar, Final
 
 from gateway.sim.model.firmware import (
     COLOR_S,
-    MODE_OF_DIGIT,
     NO_ECHO_S,
     WHISTLE_S,
     CarBodyState,
@@ -22,12 +21,24 @@ from gateway.sim.model.firmware import (
 )
 from gateway.sim.model.ir_remote import SIGNS, Button
 from gateway.sim.model.traits import CarTraits
+from schemas.words import Mode
 
 BOOT_S: Final = 0.5
 AVOIDANCE_RANGINGS: Final = 5
 SHARP_S: Final = 0.08
 FAR_CM: Final = 500.0
 """In avoidance, the program discards a distance from here on like a missing echo."""
+
+MODE_OF_DIGIT: Final = {
+    "0": Mode.MANUAL,
+    "1": Mode.REMOTE_CONTROL,
+    "2": Mode.TRACKING,
+    "3": Mode.OBSTACLE_AVOIDANCE,
+    "4": Mode.COLOR_LED,
+    "5": Mode.LIGHT_SEEKING,
+    "6": Mode.FOLLOWING,
+}
+"""The modes by the x of `MODE<x><y>`. `_mode_turn` has what a car does in each."""
 
 ARDUINO_LIGHTS: Final = {
     "1": (255, 255, 255),
@@ -87,7 +98,7 @@ class ModeCar(Firmware):
 
     @property
     def _is_silent(self) -> bool:
-        return MODE_OF_DIGIT[self._mode] in self._traits.silent_modes
+        return self._mode in self._traits.silent_modes
 
     def _turn(self, fields: str) -> Program:
         """Print the frame of one loop turn in modes 2, 5 and 6, which takes the time of the turn."""
@@ -102,15 +113,15 @@ class ModeCar(Firmware):
     def _mode_turn(self) -> Program:
         """Run one loop turn of the current mode, which is not mode 0."""
         match self._mode:
-            case 2:
+            case Mode.TRACKING:
                 yield from self._tracking()
-            case 3:
+            case Mode.OBSTACLE_AVOIDANCE:
                 yield from self._avoidance()
-            case 4:
+            case Mode.COLOR_LED:
                 yield from self._color_led()
-            case 5:
+            case Mode.LIGHT_SEEKING:
                 yield from self._light_seeking()
-            case 6:
+            case Mode.FOLLOWING:
                 yield from self._following()
             case _:
                 yield from self._remote()
@@ -120,7 +131,7 @@ class ModeCar(Firmware):
     def press(self, button: Button, now: float) -> bool:
         """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
         self._run(now)
-        if self._mode != 1 or self._pressed is not None:
+        if self._mode is not Mode.REMOTE_CONTROL or self._pressed is not None:
             return False
         self._pressed = button
         self._run(now)

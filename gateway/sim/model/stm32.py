@@ -8,7 +8,7 @@ Arduino program here.
 from typing import ClassVar, Final
 
 from gateway.sim.model.firmware import Program, Wait, motion
-from gateway.sim.model.mode_car import ModeCar, to_int
+from gateway.sim.model.mode_car import MODE_OF_DIGIT, ModeCar, to_int
 from gateway.sim.model.traits import CarTraits
 from schemas.words import Mode
 
@@ -55,7 +55,7 @@ class Stm32Car(ModeCar):
         while True:
             try:
                 self._obey_buffer()
-                if self._mode == 0:
+                if self._mode is Mode.MANUAL:
                     yield from self._manual()
                 else:
                     yield from self._mode_turn()
@@ -64,7 +64,7 @@ class Stm32Car(ModeCar):
 
     def _on_alarm(self) -> None:
         self._alarm_at += self._next_interval_s(self._traits.interval_s)
-        self._is_report_due = self._mode == 0
+        self._is_report_due = self._mode is Mode.MANUAL
 
     def _pwm(self) -> int:
         return round(255 * self._speed / STM32_TOP_SPEED)
@@ -78,7 +78,7 @@ class Stm32Car(ModeCar):
     def _busy(self, seconds: float) -> Program:
         """Wait in a turn of a mode. Frames are obeyed meanwhile, and a MODE frame ends the turn."""
         end = self._now + seconds
-        while self._now < end and self._mode != 1:  # the remote has nothing to wait for
+        while self._now < end and self._mode is not Mode.REMOTE_CONTROL:  # the remote has nothing to wait for
             yield Wait(end, wakes=True)
             self._obey_buffer()
 
@@ -126,9 +126,9 @@ class Stm32Car(ModeCar):
         place = len(self._traits.head) + 6
         digit = text[place : place + 1]
         if text[place + 1 : place + 2] == "0":
-            self._mode = 0
-        elif digit in tuple("0123456"):
-            self._mode = int(digit)
+            self._mode = Mode.MANUAL
+        elif digit in MODE_OF_DIGIT:
+            self._mode = MODE_OF_DIGIT[digit]
         else:
             return
         self._pressed = None
