@@ -194,7 +194,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(drive_request(motion, duration_s, wait=wait))
 
     def mode(self, mode: str) -> R:
-        """Set the mode: `manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking, following`."""
+        """Set the mode, a word of `schemas.words.Mode`: `manual` to steer the car, or `tracking` and others."""
         return self.do(mode_request(mode))
 
     def led(self, r: int, g: int, b: int) -> R:
