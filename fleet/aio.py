@@ -31,7 +31,8 @@ from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, re
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
-from schemas.words import Rank, Scope, Verb
+from schemas.commands import Verb
+from schemas.words import Rank, Scope
 
 _THREADS: Final = 256
 """Maximum number of concurrent calls. A drive blocks its thread until its end."""

@@ -2,10 +2,31 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
-from schemas.words import Verb
+
+class Verb(StrEnum):
+    """What a command does. `COMMANDS` has a row for each."""
+
+    DRIVE = "drive"
+    MODE = "mode"
+    LED = "led"
+    LIGHT = "light"
+    SERVO = "servo"
+    ARM = "arm"
+    WHISTLE = "whistle"
+    SPEED = "speed"
+    FAN = "fan"
+    STOP = "stop"
+    ESTOP = "estop"
+    RESUME = "resume"
+    PAUSE = "pause"
+    UNPAUSE = "unpause"
+    LEND = "lend"
+    LEASE = "lease"
+    FIND = "find"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ is only text, so whoever carries out a command asks `speaks_for`.
 from enum import StrEnum
 from typing import Final
 
-from schemas.commands import COMMANDS, STOPS
+from schemas.commands import COMMANDS, STOPS, Verb
 from schemas.keys import is_name, person_of
-from schemas.words import Rank, Verb
+from schemas.words import Rank
 
 
 class IdentityRole(StrEnum):

@@ -1,7 +1,8 @@
 """The closed sets of words: whatever a field of a message, a key or a file names by one of a few words. Pure.
 
 A word has the same spelling in messages, files, commands and code. What a word is on a car's wire is in
-`gateway.drivers.yahboom.protocol`. Messages hold words as text, so another version's word never breaks a reader.
+`gateway.drivers.yahboom.protocol`. Messages hold words as text, so another version's word never breaks a reader. The
+verbs are in `commands`, each beside what is true of it.
 """
 
 from enum import StrEnum
@@ -99,28 +100,6 @@ class SpeedStep(StrEnum):
 
 
 # ------------------------------------------------------------------ commands
-
-
-class Verb(StrEnum):
-    """What a command does. `commands` has a row for each."""
-
-    DRIVE = "drive"
-    MODE = "mode"
-    LED = "led"
-    LIGHT = "light"
-    SERVO = "servo"
-    ARM = "arm"
-    WHISTLE = "whistle"
-    SPEED = "speed"
-    FAN = "fan"
-    STOP = "stop"
-    ESTOP = "estop"
-    RESUME = "resume"
-    PAUSE = "pause"
-    UNPAUSE = "unpause"
-    LEND = "lend"
-    LEASE = "lease"
-    FIND = "find"
 
 
 CAPABILITIES: Final = (

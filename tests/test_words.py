@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 
-from schemas import words
+from schemas import commands, words
 from tests.test_style import ROOT, nodes, source_files
 
 pytestmark = pytest.mark.xdist_group("sources")
@@ -36,7 +36,7 @@ FIELDS: Final[Mapping[str, tuple[EnumType, ...]]] = {
     "status": (words.Phase,),
     "step": (words.SpeedStep,),
     "trust": (words.CarTrust,),
-    "verb": (words.Verb, words.RecorderVerb),
+    "verb": (commands.Verb, words.RecorderVerb),
     "verdict": (words.Verdict, words.FrameVerdict, words.Cause, words.LinkVerdict),
     "what": (words.LinkState, words.Motors),
 }
@@ -49,7 +49,7 @@ ENUMS: Final = tuple(
     each for each in vars(words).values() if isinstance(each, EnumType) and each.__module__ == words.__name__
 )
 # Colors, parts, subcommands and options have names of their own that are spelled alike.
-LISTED: Final = tuple(each for each in ENUMS if each not in (words.Light, words.Servo, words.Verb, words.FrameVerdict))
+LISTED: Final = tuple(each for each in ENUMS if each not in (words.Light, words.Servo, words.FrameVerdict))
 SIDES: Final = {"left", "right"}
 """Two motions, and where a sensor is."""
 

@@ -49,11 +49,11 @@ from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
 from schemas.bus import Bus, BusError, Failure, NoFleet, Sample, canon
-from schemas.commands import COMMANDS
+from schemas.commands import COMMANDS, Verb
 from schemas.identity import IdentityRole
 from schemas.identity import parse as parse_identity
 from schemas.topics import Qos
-from schemas.words import ProcessKind, Rank, RunState, Scope, Verb
+from schemas.words import ProcessKind, Rank, RunState, Scope
 
 _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0

@@ -13,9 +13,9 @@ from typing import Any, Final, Generic, TypeVar
 from fleet.client.effects import ESTOP_FLEET, RELEASE
 from fleet.client.outcome import Until
 from schemas import keys, messages
-from schemas.commands import COMMANDS
+from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Motion, Scope, Verb
+from schemas.words import Motion, Scope
 
 R = TypeVar("R")
 

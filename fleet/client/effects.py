@@ -3,8 +3,8 @@
 from typing import Final
 
 from fleet.client.claims import NOT_CONFIRMED, STOP_SENT, STOPPED
-from schemas.commands import COMMANDS, STOPPING_VERBS
-from schemas.words import Basis, Phase, Reason, Verb
+from schemas.commands import COMMANDS, STOPPING_VERBS, Verb
+from schemas.words import Basis, Phase, Reason
 
 _ANY: Final = "*"
 UNCONFIRMED: Final = "unconfirmed"

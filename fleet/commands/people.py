@@ -5,8 +5,7 @@ import click
 from fleet.client.client import Fleet
 from fleet.commands.options import end_with, json_option, with_client
 from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
-from schemas.commands import COMMANDS
-from schemas.words import Verb
+from schemas.commands import COMMANDS, Verb
 
 
 @click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")

@@ -40,12 +40,12 @@ from fleet.console.stop_report import StopReport
 from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
-from schemas.commands import STOPS
+from schemas.commands import STOPS, Verb
 from schemas.keys import person_of, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.topics import TOPICS
-from schemas.words import Phase, Rank, Reason, Scope, Verb
+from schemas.words import Phase, Rank, Reason, Scope
 
 MAX_PAGES: Final = 96
 """Maximum number of connected pages."""

@@ -16,8 +16,8 @@ from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from schemas import keys, messages
 from schemas.bus import Failure
-from schemas.commands import COMMANDS
-from schemas.words import Motion, Phase, Reason, Verb
+from schemas.commands import COMMANDS, Verb
+from schemas.words import Motion, Phase, Reason
 
 # The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
 DRIVE_TTL_S: Final = 0.5

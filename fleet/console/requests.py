@@ -10,9 +10,9 @@ from typing import Any, Final, Self
 
 from fleet.client import commands
 from schemas import keys
-from schemas.commands import STOPPING_VERBS, STOPS
+from schemas.commands import STOPPING_VERBS, STOPS, Verb
 from schemas.limits import MAX_REASON_LENGTH
-from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep, Verb
+from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep
 
 MAX_CARS: Final = 128
 """Maximum number of cars in one message."""

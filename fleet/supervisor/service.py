@@ -23,11 +23,11 @@ from schemas.bus import (
     reply_message,
     reply_value,
 )
-from schemas.commands import COMMANDS
+from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.identity import speaks_for
 from schemas.topics import Qos
-from schemas.words import Phase, Rank, Reason, Verb
+from schemas.words import Phase, Rank, Reason
 
 SECOND_CHECK_DELAY_S: Final = 0.3
 """Time after which two supervisors that start at the same moment have both declared."""

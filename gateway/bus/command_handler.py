@@ -20,8 +20,9 @@ from gateway.control.driver import Driver
 from gateway.control.events import LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
+from schemas.commands import Verb
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.words import Level, Phase, Reason, Verb
+from schemas.words import Level, Phase, Reason
 
 _LOGGING_LEVELS: Final = {
     Level.DEBUG: logging.DEBUG,

@@ -34,13 +34,13 @@ from gateway.control.commands import (
 )
 from schemas import messages
 from schemas.authority import Sender
-from schemas.commands import COMMANDS, STOPS
+from schemas.commands import COMMANDS, STOPS, Verb
 from schemas.identity import speaks_for
 from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
-from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep, Verb
+from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep
 
 W = TypeVar("W", bound=str)
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import zenoh
 
 from schemas import bus, keys
-from schemas.commands import STOPS
-from schemas.words import Verb
+from schemas.commands import STOPS, Verb
 
 if TYPE_CHECKING:
     import asyncio

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from schemas.authority import Sender
-from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep, Verb
+from schemas.commands import Verb
+from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,9 +18,9 @@ from fleet.hub import authority
 from fleet.hub.hub_store import HubStore
 from schemas import keys
 from schemas.bus import Bus
-from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS
+from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS, Verb
 from schemas.identity import Service, car, person, service
-from schemas.words import Rank, Verb
+from schemas.words import Rank
 from tests.support.ports import free_port
 from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
 from tests.support.secure import FIELDS, ask, client_of, secure_fleet, sender_of, shapes, stranger

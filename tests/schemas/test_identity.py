@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.commands import COMMANDS, STOPS
+from schemas.commands import COMMANDS, STOPS, Verb
 from schemas.identity import IdentityRole, Service, car, parse, person, service, speaks_for
-from schemas.words import Rank, Verb
+from schemas.words import Rank
 
 FORWARDED = {Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE}
 MIA = "mia@host-1"

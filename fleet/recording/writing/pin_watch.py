@@ -25,10 +25,10 @@ from fleet.recording.stop_count import MAX_RECENT_IDS
 from fleet.recording.tools.car_timeline import message_time_ns
 from fleet.recording.tools.stop_findings import asked_by, failed_stop_code
 from schemas import keys, messages
-from schemas.commands import STOPPING_VERBS
+from schemas.commands import STOPPING_VERBS, Verb
 from schemas.messages import Observation
 from schemas.topics import TOPICS
-from schemas.words import PinCause, Verb
+from schemas.words import PinCause
 
 CLOCK_STEP_NS: Final = round(CLOCK_STEP_S * 1e9)
 _EVENTS: Final = ("event/command", "event/log")

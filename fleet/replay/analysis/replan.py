@@ -30,8 +30,9 @@ from fleet.replay.analysis.recorded_decisions import (
 )
 from schemas import keys, messages
 from schemas.bus import Sample
+from schemas.commands import Verb
 from schemas.topics import PROTOBUF
-from schemas.words import Phase, Rank, Verb
+from schemas.words import Phase, Rank
 
 STEP_INTERVAL_NS: Final = 100_000_000
 MAX_BATCH_NS: Final = 10_000_000

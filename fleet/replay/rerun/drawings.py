@@ -24,8 +24,8 @@ from fleet.replay.rerun.lenses import component, is_drawn, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
 from schemas.colors import Rgb, car_color
-from schemas.commands import COMMANDS
-from schemas.words import Phase, Verb
+from schemas.commands import COMMANDS, Verb
+from schemas.words import Phase
 
 TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
 MAX_MARK_S: Final = 0.4
