@@ -106,6 +106,7 @@ def prepare(page: Page, name: str, link: str) -> None:
             page.locator("[data-record=start]").click()
             page.locator("[data-recorder=recording]").wait_for()
             wait_for(lambda: row.count() == 2, "both sessions are listed")
+            row.last.locator("details.others > summary").click()
             row.last.get_by_role("button", name="Verify").click()
             row.last.get_by_text("whole,").wait_for()
         case "setup":
