@@ -107,6 +107,11 @@ def play(
         words = f"fleet {name} is a replay of {found.name}: nothing in it takes commands"
         schedule = Schedule(rate, gap_ns)
         with Bus.open(connect, start_hub=True) as bus:
+            if bus.identity:
+                raise click.ClickException(
+                    f"The rules of {bus.endpoint} let nobody speak as a car. Play it on a bus of its own: "
+                    "`fleet play --connect tcp/127.0.0.1:7449`."
+                )
             player = Player(bus, name, words, cars_only)
             try:
                 player.begin(found.name, there)

@@ -36,6 +36,10 @@ def test_one_computer_and_another_that_joins(tmp_path: Path) -> None:
         services = {f"service.{name}" for name in ("supervisor", "coordinator", "recorder", "console", "sim")}
         assert {"car.red", "car.blue", *services} == {name for name, state in connected.items() if state == "connected"}
 
+        sessions = str(tmp_path / "sessions")
+        assert home("play", "--sessions", sessions).returncode == 1, "nobody speaks as a car"
+        assert home("plan", "run", str(tmp_path / "plan.yaml")).returncode != 0, "there is a coordinator"
+
         port = free_port()
         arguments = ["-m", "fleet.cli", "hub", "invite", "mia", "--json", "--as-hub", "127.0.0.1", "--port", str(port)]
         invitation = GatewayProcess(arguments, tmp_path / "invite.log", at_home)
