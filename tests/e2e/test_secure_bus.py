@@ -158,6 +158,7 @@ def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -
 
 def test_a_stream_drives_ones_own_car_and_no_other(stage: SecureStage) -> None:
     stage.free()
+    stage.fleet.ready("red")  # a stream that begins during a stop is held until it pauses
     with stage.client(MIA) as mia:
 
         def drive(car_name: str, identity: str) -> None:

@@ -1,9 +1,10 @@
 """A fleet of real processes on a hub with certificates. Every identity has its certificate in the same directory."""
 
+import contextlib
 import json
 import os
+import subprocess
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,22 @@ import zenoh
 
 from fleet.hub.hub_store import HubStore
 from schemas import keys, messages
-from schemas.bus import Credentials
+from schemas.bus import Credentials, accepts, router_settings
 from schemas.commands import COMMANDS
 from schemas.identity import Service, service
 from schemas.state_dir import STATE_VARIABLE, directory_of
 from tests.support.ports import free_port
-from tests.support.processes import FleetProcesses
+from tests.support.processes import FleetProcesses, wait_for
 
 
-@contextmanager
-def secure_fleet(directory: Path, me: str, others: Iterable[str]) -> Iterator[tuple[FleetProcesses, HubStore]]:
-    """Run a hub with certificates for `me`, the others and all services. Programs find them by FLEET_STATE_DIR."""
+@contextlib.contextmanager
+def secure_fleet(
+    directory: Path, me: str, others: Iterable[str], router: Path | None = None
+) -> Iterator[tuple[FleetProcesses, HubStore]]:
+    """Run a hub with certificates for `me`, the others and all services. Programs find them by FLEET_STATE_DIR.
+
+    router: a stock Zenoh router to run in its place.
+    """
     endpoint = f"tls/127.0.0.1:{free_port()}"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(STATE_VARIABLE, str(directory / "state"))
@@ -30,14 +36,17 @@ def secure_fleet(directory: Path, me: str, others: Iterable[str]) -> Iterator[tu
         store = HubStore.of(endpoint)
         store.ensure([*others, *map(service, Service)], me, addresses=["127.0.0.1"])
         assert store.directory.is_relative_to(directory_of(endpoint, directory / "state"))
-        fleet = FleetProcesses(endpoint, directory)
-        try:
-            yield fleet, store
-        finally:
-            fleet.close()
+        with contextlib.ExitStack() as stack:
+            if router is not None:  # our own hub ends at once, since the port is taken
+                file = directory / "router.json5"
+                file.write_text(json.dumps(router_settings(endpoint)))
+                process = stack.enter_context(subprocess.Popen([router, "--config", file], stderr=subprocess.DEVNULL))
+                stack.callback(process.kill)
+                wait_for(lambda: accepts(endpoint), "the router listens")
+            yield stack.enter_context(contextlib.closing(FleetProcesses(endpoint, directory))), store
 
 
-@contextmanager
+@contextlib.contextmanager
 def stranger(credentials: Credentials, **tls: Any) -> Iterator[zenoh.Session]:
     """Open a plain Zenoh client, as anybody could write it, with these settings of TLS. Raises zenoh.ZError."""
     settings = {
@@ -51,7 +60,7 @@ def stranger(credentials: Credentials, **tls: Any) -> Iterator[zenoh.Session]:
         yield session
 
 
-@contextmanager
+@contextlib.contextmanager
 def client_of(credentials: Credentials, identity: str) -> Iterator[zenoh.Session]:
     """Open a plain Zenoh client with the certificate of an identity."""
     with stranger(credentials, **credentials.of_client(identity)["tls"]) as session:

@@ -1,0 +1,64 @@
+"""A stock Zenoh router in the place of our hub, with the configuration of `fleet hub config`: the same rules hold.
+
+It is built from crates.io, in the version of the wheel, which takes ten minutes of a processor the first time.
+"""
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from schemas.identity import Service, service
+from tests.e2e import test_secure_bus
+from tests.e2e.test_secure_bus import ANN, BLUE, EVE, MIA, RED, SecureStage
+from tests.support.secure import secure_fleet
+
+CACHE = Path(__file__).parents[2] / ".cache"
+IDENTITIES = (ANN, MIA, EVE, RED, BLUE, *map(service, Service))
+
+
+@pytest.fixture(scope="module")
+def zenohd() -> Path:
+    """Return the router. Build it if it is not there."""
+    number = version("eclipse-zenoh")
+    place = CACHE / f"zenohd-{number}"
+    program = place / "bin/zenohd"
+    if not program.exists():
+        cargo = shutil.which("cargo")
+        assert cargo, "this soak builds zenohd with cargo, of Rust"
+        install = ["nice", cargo, "install", "zenohd", "--version", number, "--locked", "--debug", "--root", place]
+        subprocess.run(install, check=True)
+    return program
+
+
+@pytest.fixture(scope="module")
+def stage(zenohd: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureStage]:
+    with secure_fleet(tmp_path_factory.mktemp("zenohd"), ANN, [MIA, EVE, RED, BLUE], zenohd) as (fleet, store):
+        yield SecureStage(fleet, store)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("identity", IDENTITIES)
+def test_a_command_counts_under_ones_own_identity_only(identity: str, stage: SecureStage) -> None:
+    test_secure_bus.test_a_command_counts_under_ones_own_identity_only(identity, stage)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED])
+def test_what_the_people_table_says_is_what_happens(identity: str, stage: SecureStage) -> None:
+    test_secure_bus.test_what_the_people_table_says_is_what_happens(identity, stage)
+
+
+@pytest.mark.soak
+def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -> None:
+    test_secure_bus.test_nobody_publishes_answers_or_stands_in_for_another(stage)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("why", ["no certificate", "another authority", "expired", "not yet"])
+def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
+    test_secure_bus.test_a_stranger_gets_no_link(why, stage)
