@@ -30,9 +30,10 @@ from fleet.commands.group import (
 from fleet.commands.options import bus_options, cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
+from fleet.console import DEFAULT_PORT
 from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
-from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
+from fleet.console.server import HELLO, LOOPBACK, listen, serve
 from fleet.fleetfile.fleet_file import people_table, read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys

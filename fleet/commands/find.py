@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import quote
 
 import click
 
@@ -14,6 +15,7 @@ from fleet.commands.group import chosen_person
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import aligned, echo_csv, echo_safely
 from fleet.commands.params import Duration, car_option, existing_sessions_place
+from fleet.console import DEFAULT_PORT
 from fleet.policy.car_condition import parse_condition
 from fleet.recording import time_spec
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS, NoMark, add_mark
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
 MAX_FOR_S: Final = 86_400.0
 """Maximum of --for: recordings of lessons and demos are no longer than a day."""
-FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open")
+FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open", "link")
 """Fields of a hit as JSON and CSV."""
 _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
 
@@ -150,8 +152,15 @@ def _row(path: Path, hit: "Hit") -> tuple[str, ...]:
 
 def _to_dict(path: Path, hit: "Hit") -> dict[str, object]:
     times = (time_spec.iso(hit.begin_ns), time_spec.iso(hit.end_ns), round(hit.length_s, 3))
-    values = (path.name, str(path), hit.car, *times, hit.mode or None, hit.command or None, _open_command(path, hit))
+    opens = (_open_command(path, hit), _link(path, hit))
+    values = (path.name, str(path), hit.car, *times, hit.mode or None, hit.command or None, *opens)
     return dict(zip(FIELDS, values, strict=True))
+
+
+def _link(path: Path, hit: "Hit") -> str:
+    """Return where a running `fleet console` with its usual port shows the hit on the time line."""
+    at = time_spec.iso(hit.begin_ns)
+    return f"http://127.0.0.1:{DEFAULT_PORT}/#/time?session={quote(path.name, safe='')}&at={at}"
 
 
 def _open_command(path: Path, hit: "Hit") -> str:

@@ -28,6 +28,7 @@ from fleet.console.operators import Operators
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
+from fleet.console.past_api import PastApi
 from fleet.console.permissions import management_refusal, rights_of
 from fleet.console.plan_feed import PlanFeed
 from fleet.console.plot_buffer import plottable
@@ -80,6 +81,7 @@ class Console:
         self._sleep = sleep or SleepWatch(clock_pair())
         self.sessions = SessionsApi(fleet, place, self.management_refusal)
         self.setup = SetupApi(fleet, file)
+        self.past = PastApi(place, self._shown_colors)
         self._presses = PressBook()
         self._view = FleetView(self._color_of)
         self._colors: Mapping[str, Rgb] = {}
@@ -149,6 +151,11 @@ class Console:
 
     def _color_of(self, car: str, index: int) -> str:
         return hex_color(self._colors.get(car) or car_color(car, index))
+
+    def _shown_colors(self) -> dict[str, str]:
+        """Return the color of each car, as the pages show it."""
+        listed = {name: hex_color(color) for name, color in self._colors.items()}
+        return listed | {name: self._view.look_up(name).color for name in self._view.names}
 
     def _on_status(self, sample: Sample) -> None:
         if (found := message_in(sample, logging.WARNING)) is None:
@@ -568,4 +575,5 @@ class Console:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
         await self.plan.close()
+        await self.past.close()
         await self.sessions.close()

@@ -96,7 +96,7 @@ class PlanFeed(PageFeed):
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     async def check(self, text: str, person: PagePerson | None) -> dict[str, Any]:
-        """Return what a person is told of a plan (plan_answer.answer_to). Raises TooManyChecks."""
+        """Return what a person is told of a plan (plan_answer.answer_to). Raises TooManyQuestions."""
         present = tuple(name for name in self._fleet.sync.cars() if is_shown(name))
         before, roles, phase = self._view.in_force
         question = PlanQuestion(text, present, tuple(self._newest()), before, roles, phase)
@@ -105,7 +105,7 @@ class PlanFeed(PageFeed):
     async def set_plan(self, text: str, person: PagePerson | None) -> dict[str, Any]:
         """Put a plan in force for this person. Return whether it is, and words, or the faults, one per line.
 
-        If no plan runs, the console starts a coordinator. Raises TooManyChecks.
+        If no plan runs, the console starts a coordinator. Raises TooManyQuestions.
         """
         sender = self._sender_of(person)
         found = await self.check(text, person)

@@ -51,13 +51,13 @@ class PlotBuffer:
         """Car and topic of all series."""
         return list(self._numbers)
 
-    def add(self, car: str, topic: str, message: Any) -> None:
-        """Add the values of a message. A field that was not measured has none."""
+    def add(self, car: str, topic: str, message: Any, at_ms: int | None = None) -> None:
+        """Add the values of a message. A field that was not measured has none. at_ms: their time (None: its stamp)."""
         for number, field in self._numbers.get((car, topic), ()):
             value = value_in(message)(field)
             if isinstance(value, int | float) and self._count < MAX_BUFFERED_VALUES:
-                at_ms = messages.stamp_ms(message.stamp)
-                self._values.setdefault(number, []).append((at_ms, round(float(value), 4)))
+                stamp_ms = messages.stamp_ms(message.stamp) if at_ms is None else at_ms
+                self._values.setdefault(number, []).append((stamp_ms, round(float(value), 4)))
                 self._count += 1
 
     def take(self) -> dict[int, list[tuple[int, float]]]:

@@ -32,10 +32,10 @@ from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGu
 from fleet.console.log_rate import LogRate
 from fleet.console.pairing import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
-from fleet.console.plan_checks import TooManyChecks
 from fleet.console.plan_view import plan_name
 from fleet.console.request_body import read_text
 from fleet.console.requests import is_stop
+from fleet.console.worker import TooManyQuestions
 from fleet.examples import EXAMPLES
 from schemas.bus import LARGEST_PAYLOAD, BusError
 from schemas.process import signals
@@ -44,8 +44,6 @@ if TYPE_CHECKING:  # only `--lan` needs its packages
     from fleet.console.lan import Lan
 
 STATIC: Final = Path(__file__).parent / "static"
-DEFAULT_PORT: Final = 7480
-"""A port near that of the bus (7447). Fleets of other names take those in between."""
 LOOPBACK: Final = "127.0.0.1"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
@@ -282,6 +280,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
             Route("/plan/set", set_plan, methods=["POST"]),
             *console.sessions.routes(),
             *console.setup.routes(),
+            *console.past.routes(),
             *people_routes(lan),
             *more,
             WebSocketRoute("/ws", connect),
@@ -328,7 +327,7 @@ async def _answer_plan(
         return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
     try:
         answer = await ask(text, person)
-    except TooManyChecks:  # others of this person came while the body did
+    except TooManyQuestions:  # others of this person came while the body did
         return _too_much(TOO_MANY_PLANS)
     return JSONResponse(answer)
 

@@ -89,6 +89,11 @@ def test_a_mark_and_the_name_of_a_recording_are_text(stage: ConsoleStage, page: 
     odd.get_by_role("button", name="Verify").click()
     odd.get_by_text("whole,").wait_for()
     is_text(page)
+    odd.locator(".main").click()
+    page.locator("[data-past-at][data-coming=false]").wait_for()
+    page.locator("select[name=session]").wait_for()
+    is_text(page)
+    page.locator("[data-live-now]").click()
 
 
 def test_names_in_a_plan_are_text(stage: ConsoleStage, page: Page) -> None:

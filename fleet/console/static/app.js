@@ -1,6 +1,7 @@
 // The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
 
-import { carsInPlace, changed, clock, estopAll, isReady, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
+import { carsInPlace, changed, clock, estopAll, isReady, pauseAll, setTexts, stopAll, store, subscribe, unpause, when, who } from "./console.js";
+import { goLive, jump, route } from "./past.js";
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
@@ -14,29 +15,32 @@ import { Component, html, Icon, Refused, render, useEffect, useRef, useState, Ve
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-// uPlot is three times as large as all else: only this page loads it.
+// Only who opens these pages loads them: uPlot is three times as large as all else.
 const loadPlots = async () => {
   const looks = document.createElement("link");
   Object.assign(looks, { rel: "stylesheet", href: "/static/vendor/uplot.css" });
   document.head.append(looks);
   return (await import("./plots-page.js")).PlotsPage;
 };
-let Plots = null;
-function PlotsLater({ cars }) {
-  const [failed, setFailed] = useState(false);
-  const [, setLoaded] = useState(Plots !== null);
-  useEffect(() => {
-    if (Plots !== null) return;
-    loadPlots().then(
-      (page) => {
-        Plots = page;
-        setLoaded(true);
-      },
-      () => setFailed(true),
-    );
-  }, []);
-  if (Plots !== null) return html`<${Plots} cars=${cars} />`;
-  return failed ? html`<h1>${t.plots}</h1><p>${t.unreachable}</p>` : html`<p>${t.loading}</p>`;
+const loadTime = async () => (await import("./time-page.js")).TimePage;
+function later(title, load) {
+  let Page = null;
+  return function Later({ cars }) {
+    const [failed, setFailed] = useState(false);
+    const [, setLoaded] = useState(Page !== null);
+    useEffect(() => {
+      if (Page !== null) return;
+      load().then(
+        (page) => {
+          Page = page;
+          setLoaded(true);
+        },
+        () => setFailed(true),
+      );
+    }, []);
+    if (Page !== null) return html`<${Page} cars=${cars} />`;
+    return failed ? html`<h1>${title}</h1><p>${t.unreachable}</p>` : html`<p>${t.loading}</p>`;
+  };
 }
 
 // Each page with the drawing of its tab.
@@ -44,7 +48,8 @@ const PAGES = {
   "#/": [t.fleet, FleetPage, "fleet"],
   "#/drive": [t.drive, DrivePage, "drive"],
   "#/plan": [t.plan, PlanPage, "plan"],
-  "#/plots": [t.plots, PlotsLater, "plots"],
+  "#/plots": [t.plots, later(t.plots, loadPlots), "plots"],
+  "#/time": [t.time, later(t.time, loadTime), "time"],
   "#/inspect": [t.inspect, InspectPage, "inspect"],
   "#/people": [t.people, PeoplePage, "people"],
   "#/sessions": [t.sessions, SessionsPage, "sessions"],
@@ -207,6 +212,21 @@ function Connection() {
   return html`<span class=${`connection ${kind === "live" ? "" : "bad"}`} data-connection=${kind}><span aria-hidden="true">${symbol}</span> ${words}</span>`;
 }
 
+// On every page while somebody looks back, with the way to now.
+function PastBar() {
+  const { past } = store;
+  if (past === null) return null;
+  const isComing = past.shown === null || past.shown.at_ms !== past.at_ms;
+  return html`<div class="past-bar" role="status" data-past-at=${past.at_ms} data-coming=${isComing}>
+    <strong>${t.pastOf(past.at_ms > 0 ? when({ at_ms: past.at_ms, zone_s: store.state.zone_s }, 10) : "")}</strong>
+    <button onClick=${() => jump(past.session, past.at_ms - 10_000)} aria-label=${t.timeBack(10)}>−10 s</button>
+    <button onClick=${() => jump(past.session, past.at_ms + 10_000)} aria-label=${t.timeOn(10)}>+10 s</button>
+    <button class="main" data-live-now onClick=${goLive}>${t.backToNow}</button>
+    <span class="dim">${t.pastStops}</span>
+    ${past.words && html`<span class="bad">⚠ ${past.words}</span>`}
+  </div>`;
+}
+
 class App extends Component {
   componentDidMount() {
     subscribe(() => this.setState({}));
@@ -214,10 +234,11 @@ class App extends Component {
   }
   render() {
     const { state } = store;
-    const asked = location.hash === MORE ? [t.more, MorePage] : PAGES[location.hash];
-    const here = asked === undefined ? "#/" : location.hash;
+    const asked = route() === MORE ? [t.more, MorePage] : PAGES[route()];
+    const here = asked === undefined ? "#/" : route();
     const [title, Page] = asked ?? PAGES["#/"];
-    document.title = `${title} – ${t.title}`;
+    document.title = `${store.past === null ? "" : `${t.past}: `}${title} – ${t.title}`;
+    document.documentElement.toggleAttribute("data-past", store.past !== null);
     return html`
       <a class="skip" href="#content" onClick=${(event) => {
         event.preventDefault();
@@ -234,6 +255,7 @@ class App extends Component {
           ${store.refusedWhy && html`<p class="bad" data-refused>${t.refusedWhy(store.refusedWhy)}</p>`}`}
       </main>
       <div class="messages"><div class="notices">
+        ${isReady() && html`<${PastBar} />`}
         ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost(store.refusedWhy)} />`}
         ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}

@@ -15,6 +15,7 @@ const LOST_MS = 1500;
 const MAX_RESULTS = 6;
 const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
 const MAX_DRAWING_MS = 150; // the longest time that counts, so that the page rests 450 ms at most
+const STOPS = ["stop", "estop"]; // also while somebody looks back
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
 // A page that is loaded again, as phones do with one that slept, has the same cars selected. Another tab has its own.
@@ -33,6 +34,7 @@ export const store = {
   state: null,
   rights: null, // what this person may not do: words by car and action; `mine`: the cars of this person
   groups: {}, // the names of cars by group
+  past: null, // the moment that is looked at: {session, at_ms, cars, ...} (past.js); null: now
   places: [], // the name of the car at each place
   hello: null,
   connected: false,
@@ -163,12 +165,35 @@ export function estopAll(why) {
 const personOf = (sender) => seen(sender.split("@")[0] || sender);
 export const who = (sender) => (sender === store.hello?.sender ? describe.you : personOf(sender));
 
+// ---------------------------------------------------------------- the past
+
+// While somebody looks back, nothing is commanded but stops: what one sees is not what would be commanded.
+let rightsNow = null;
+function applyRights() {
+  const refused = store.past === null ? {} : { manage: describe.pastRefused, unpause: describe.pastRefused };
+  store.rights = rightsNow && { ...rightsNow, ...refused };
+}
+
+// Show a moment of a recording; null: now. What is held is let go.
+export function showPast(past) {
+  if ((past === null) !== (store.past === null)) release();
+  store.past = past;
+  applyRights();
+  changed();
+}
+
+// The cars that are shown, the time that is shown, and how long nothing came, s.
+export const shownCars = () => store.past?.cars ?? store.state?.cars ?? [];
+export const shownNow = () => store.past?.at_ms ?? consoleNow();
+export const unheard_s = () => (store.past === null ? store.silent_s : 0);
+
 // Why cars refuse an action of this person, each once. The gateways decide; the page says it before.
 const refusal = (action, car) => store.rights?.cars[car]?.[action];
 export function refusals(action, cars) {
+  if (store.past !== null) return [describe.pastRefused];
   return [...new Set(cars.map((car) => refusal(action, car)).filter(Boolean))];
 }
-export const isRefused = (action, cars) => cars.length > 0 && cars.every((car) => refusal(action, car));
+export const isRefused = (action, cars) => store.past !== null || (cars.length > 0 && cars.every((car) => refusal(action, car)));
 
 // The cars that the fleet file or a loan gives to this person, whatever else keeps them from driving now.
 export const isMine = (car) => store.rights.mine.includes(car);
@@ -190,7 +215,7 @@ export const isReady = () => store.state !== null && store.rights !== null;
 
 // The cars in the order of their places.
 export function carsInPlace() {
-  const cars = new Map(store.state.cars.map((car) => [car.name, car]));
+  const cars = new Map(shownCars().map((car) => [car.name, car]));
   store.places = placed(store.places, [...cars.keys()], isShared([...cars.keys()]) ? isMine : () => false);
   return store.places.filter((name) => cars.has(name)).map((name) => cars.get(name));
 }
@@ -202,6 +227,7 @@ export function pauseAll(why) {
 }
 
 export function unpause() {
+  if (store.past !== null) return;
   verbs.set(++requestNumber, "unpause");
   send({ t: "unpause", id: requestNumber });
 }
@@ -220,6 +246,7 @@ function letGo() {
 export const isHeld = (source) => holds.some((each) => each.source === source);
 
 export function press(motion, cars, source) {
+  if (store.past !== null) return;
   holds = [...holds.filter((each) => each.source !== source), { source, motion }];
   drive(cars);
 }
@@ -260,12 +287,13 @@ document.addEventListener("visibilitychange", () => {
 // ---------------------------------------------------------------- commands
 
 export function command(verb, cars, fields = {}) {
-  if (cars.length === 0) return;
+  if (cars.length === 0 || (store.past !== null && !STOPS.includes(verb))) return;
   verbs.set(++requestNumber, verb);
   send({ t: "do", id: requestNumber, verb, cars, ...fields });
 }
 
 export function lease(kind, cars) {
+  if (store.past !== null) return;
   verbs.set(++requestNumber, kind === "take" ? "lease" : "release");
   send({ t: kind, id: requestNumber, cars });
 }
@@ -329,7 +357,8 @@ function onMessage(text) {
       stateChanged();
       return;
     case "rights":
-      store.rights = message;
+      rightsNow = message;
+      applyRights();
       break;
     case "groups":
       store.groups = message.groups;

@@ -1,7 +1,7 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
 import {
-  askBySocket, changed, command, isHeld, isMine, isRefused, isShared, lease, on, onTick, press, refusals, release, select, store, who,
+  askBySocket, changed, command, isHeld, isMine, isRefused, isShared, lease, on, onTick, press, refusals, release, select, shownCars, store, who,
 } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
 import { Battery, html, Refused, Results, SetChips, useEffect, useRef, useState } from "./ui.js";
@@ -14,8 +14,7 @@ const TYPES_INTO = "input:not([type=checkbox]), select, textarea";
 const STICK_THRESHOLD = 0.5;
 
 const selected = () => {
-  const cars = store.state?.cars ?? [];
-  return cars.filter((car) => store.selected.has(car.name));
+  return shownCars().filter((car) => store.selected.has(car.name));
 };
 const names = () => selected().map((car) => car.name);
 

@@ -3,7 +3,7 @@
 // No tile ever moves: a press must not meet another car than the one that the eye has chosen. So each tile has one
 // size whatever is in it, and what comes and goes (trouble, all about a car) has a place of its own.
 
-import { carSets, changed, clock, command, isRefused, refusals, select, store, who } from "./console.js";
+import { carSets, changed, clock, command, isRefused, refusals, select, store, unheard_s, who } from "./console.js";
 import { arrows, links, modes, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
 import { Battery, html, Memo, Refused, Results, SetChips, useState, Verdict } from "./ui.js";
 
@@ -72,7 +72,7 @@ const Loan = ({ car }) =>
       </div>`;
 
 // How long nothing new has come of a car, s. 0 while news come.
-const silence = (car) => (car.silent_s ?? 0) + store.silent_s;
+const silence = (car) => (car.silent_s ?? 0) + unheard_s();
 
 const isMoving = (car) => car.motors.state === "on";
 
@@ -181,7 +181,7 @@ function Details({ car }) {
         <${Verdict} table=${verdicts} name=${mode.verdict}
           detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
       <//>
-      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.past(car.motors.past, t.ago(car.motors.past_s + store.silent_s))}` : ""}<//>
+      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.wasThen(car.motors.past, t.ago(car.motors.past_s + unheard_s()))}` : ""}<//>
       ${car.shows && car.shows !== "yes" && html`<${Row} name=${t.showsStops}>${t.shows[car.shows] ?? ""} ${car.shows_words}<//>`}
       <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${who(car.motion.owner)})` : ""}<//>
       <${Row} name=${t.battery}>
@@ -215,7 +215,7 @@ function Details({ car }) {
 }
 
 // A tile is drawn again if anything that it shows has changed, or if it is chosen.
-const drawn = (car, ...more) => JSON.stringify([car, store.rights.cars[car.name], store.silent_s, ...more]);
+const drawn = (car, ...more) => JSON.stringify([car, store.rights.cars[car.name], unheard_s(), store.past === null, ...more]);
 
 export function FleetPage({ cars }) {
   const shown = cars.find((car) => car.name === chosen);
@@ -233,7 +233,7 @@ export function FleetPage({ cars }) {
     </div>
     <${TroubleStrip} cars=${cars} />
     <div class="tiles">
-      ${cars.length === 0 && html`<p>${t.noCars}</p>`}
+      ${cars.length === 0 && html`<p>${store.past === null ? t.noCars : t.noCarsThen}</p>`}
       ${places.map((name) => {
         const car = byName.get(name);
         if (car === undefined) return html`<div class="cell" key=${name}></div>`;

@@ -1,6 +1,7 @@
 // The inspect page: raw frames beside what they became, the ledger of commands, and what the gateway knows.
 
 import { clock, on, store, unwish, wish } from "./console.js";
+import { need } from "./past.js";
 import { t } from "./texts.js";
 import { html, useEffect, useState } from "./ui.js";
 
@@ -70,11 +71,17 @@ const Gateway = ({ rows }) => html`<section>
 export function InspectPage({ cars }) {
   const [car, setCar] = useState([...store.selected][0] ?? cars[0]?.name ?? null);
   const [frozen, setFrozen] = useState(null);
+  const isPast = store.past !== null;
   useEffect(() => {
+    if (isPast) {
+      need({ car: car ?? "" });
+      return () => need({ car: "" });
+    }
     if (car !== null) wish({ t: "inspect", cars: [car] });
     return () => unwish("inspect", { t: "inspect_end" });
-  }, [car]);
-  const shown = frozen ?? (inspection?.car === car ? inspection : null);
+  }, [car, isPast]);
+  const newest = isPast ? store.past.detail : inspection;
+  const shown = (isPast ? null : frozen) ?? (newest?.car === car ? newest : null);
   return html`
     <h1>${t.inspect}</h1>
     <div class="controls">

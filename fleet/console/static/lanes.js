@@ -1,11 +1,9 @@
 // What the cars did lately, as the console tells it: spans of modes, drivers, holds, stops and losses.
 
 import { on, unwish, wish } from "./console.js";
+import { spanOf } from "./spans.js";
 
 const KEPT_MS = 900_000; // as long as the console itself
-
-// Each as {car, lane, begin, end, words, bad}, times in ms, the oldest first.
-export const spanOf = ([car, lane, begin, end, words, bad]) => ({ car, lane, begin, end, words, bad });
 
 const live = new Map();
 on("lanes", ({ spans }) => {

@@ -1,8 +1,9 @@
 // The plots page: up to four readings, each of several cars, over thirty seconds to ten minutes. A plot can be paused and
 // zoomed: all plots then show the same time. Bands show what the cars did: modes on top, stops from top to bottom.
 
-import { clock, consoleNow, on, store, unwish, wish } from "./console.js";
+import { clock, on, shownNow, store, unwish, wish } from "./console.js";
 import { liveSpans, showLanes } from "./lanes.js";
+import { lanesOf, need, openSession } from "./past.js";
 import { readings, t } from "./texts.js";
 import { html, useEffect, useRef, useState } from "./ui.js";
 import uPlot from "./vendor/uplot.js";
@@ -34,7 +35,7 @@ class Grid {
   }
   data() {
     this.frozen = null;
-    const last = Math.floor(consoleNow() / this.slot_ms);
+    const last = Math.floor(shownNow() / this.slot_ms);
     const slots = Array.from({ length: SLOTS }, (_, index) => last - SLOTS + 1 + index);
     for (const row of this.rows) {
       for (const slot of row.keys()) if (slot <= last - SLOTS) row.delete(slot);
@@ -96,6 +97,8 @@ function drawBands(chart, cars, spans) {
   ctx.restore();
 }
 
+const shownSpans = () => (store.past === null ? liveSpans() : (lanesOf(store.past.session)?.spans ?? []));
+
 function Plot({ title, cars, grid, view, onZoom }) {
   const area = useRef(null);
   const [newest, setNewest] = useState("");
@@ -121,7 +124,7 @@ function Plot({ title, cars, grid, view, onZoom }) {
       cursor: { drag: { x: true, y: false, setScale: false }, focus: { prox: 16 }, points: { size: 7 } },
       legend: { live: true },
       hooks: {
-        drawClear: [(chart) => drawBands(chart, cars, liveSpans())],
+        drawClear: [(chart) => drawBands(chart, cars, shownSpans())],
         setSelect: [
           (chart) => {
             const { left, width } = chart.select;
@@ -155,7 +158,7 @@ function Plot({ title, cars, grid, view, onZoom }) {
 
 // The same time in all plots: null while they run.
 function ViewControls({ view, span_s, setView }) {
-  const now_s = () => consoleNow() / 1000;
+  const now_s = () => shownNow() / 1000;
   const shown = () => view ?? { from: now_s() - span_s, to: now_s() };
   const zoom = (factor) => {
     const { from, to } = shown();
@@ -175,6 +178,10 @@ function ViewControls({ view, span_s, setView }) {
   </div>`;
 }
 
+const isOf = (asked, readings, cars, span_s) =>
+  asked !== null && asked.span_s === span_s && asked.series.length === readings.filter(Boolean).length * cars.length
+  && asked.series.every(([car, topic, field]) => cars.some((each) => each.name === car) && readings.includes(`${topic} ${field}`));
+
 export function PlotsPage({ cars }) {
   const [chosen, setChosen] = useState(() => new Set(store.selected.size ? store.selected : cars.slice(0, 3).map((car) => car.name)));
   const [span_s, setSpan] = useState(60);
@@ -184,6 +191,9 @@ export function PlotsPage({ cars }) {
   const names = shown.map((car) => car.name).join(" ");
   const [view, setView] = useState(null); // {from, to} in s, while paused
   const offered = store.hello?.plottable ?? [];
+  const isPast = store.past !== null;
+  // The values before the moment that is shown: of other series they come in a moment.
+  const samples = isPast && isOf(store.past.shown, readings, shown, span_s) ? store.past.samples : null;
   useEffect(showLanes, []);
 
   useEffect(() => {
@@ -200,6 +210,15 @@ export function PlotsPage({ cars }) {
     });
     setGrids(made);
     setView(null);
+    if (isPast) {
+      for (const [number, some] of Object.entries(samples ?? {})) {
+        const place = places[number];
+        if (place !== undefined) made[place[0]].add(place[1], some);
+      }
+      need({ series, span_s });
+      return () => {};
+    }
+    need({ series: [], span_s: 0 });
     on("samples", ({ values }) => {
       for (const [number, some] of Object.entries(values)) {
         const place = places[number];
@@ -214,7 +233,11 @@ export function PlotsPage({ cars }) {
       on("samples", () => false);
       unwish("plot", { ...wanted, series: [] });
     };
-  }, [names, span_s, readings.join("|")]);
+  }, [names, span_s, readings.join("|"), isPast, samples]);
+  useEffect(() => () => need({ series: [], span_s: 0 }), []);
+  useEffect(() => {
+    if (isPast) openSession(store.past.session);
+  }, [store.past?.session]);
 
   const toggle = (name) => {
     const next = new Set(chosen);

@@ -2,6 +2,7 @@
 
 import { ask, store, when, who } from "./console.js";
 import { seen } from "./foreign.js";
+import { linkTo } from "./past.js";
 import { t } from "./texts.js";
 import { html, Refused, useEffect, useState } from "./ui.js";
 import { clockAt, lengthWords } from "./when.js";
@@ -47,7 +48,7 @@ function Recorder({ onChange }) {
         ? html`<button data-record="stop" disabled=${refused !== ""} onClick=${() => act("stop")}>${t.recordStop}</button>`
         : html`<button data-record="start" disabled=${refused !== ""} onClick=${() => act("start")}>${t.recordStart}</button>`)}
       ${on && html`<label>${t.markText} <input name="mark" maxlength="1000" value=${text} onInput=${(event) => setText(event.target.value)} /></label>
-        <button data-record="mark" disabled=${text.trim() === ""} onClick=${() => act("mark", text)}>${t.markSet}</button>`}
+        <button data-record="mark" disabled=${text.trim() === "" || store.past !== null} onClick=${() => act("mark", text)}>${t.markSet}</button>`}
     </div>
     ${status?.ok && refused && html`<${Refused} words=${[refused]} />`}
     <p role="status">${said}</p>
@@ -56,9 +57,9 @@ function Recorder({ onChange }) {
 
 const MARKS = 5; // the others are one press away
 
-function Marks({ marks }) {
+function Marks({ name, marks }) {
   const line = (mark, index) => html`<li key=${index} data-mark=${mark.at_ms}>
-    <time>${mark.at_ms === null ? "" : clockAt(mark.at_ms, mark.zone_s)}</time> ${seen(mark.text)}${mark.by ? html` <span class="dim">${who(mark.by)}</span>` : ""}</li>`;
+    ${mark.at_ms !== null && html`<a href=${linkTo(name, mark.at_ms)}>${clockAt(mark.at_ms, mark.zone_s)}</a>`} ${seen(mark.text)}${mark.by ? html` <span class="dim">${who(mark.by)}</span>` : ""}</li>`;
   if (marks.length === 0) return null;
   const rest = marks.slice(MARKS);
   return html`<ul class="plain marks">${marks.slice(0, MARKS).map(line)}</ul>
@@ -73,19 +74,20 @@ function Session({ session }) {
     setAnswer({ words: t.working });
     setAnswer(await ask(`${path}/${what}`, ""));
   };
-  const button = (what, words, kind = "") => html`<button key=${what} class=${kind} data-session-do=${what} aria-label=${`${words}: ${title}`} onClick=${() => act(what)}>${words}</button>`;
-  const download = (kind) => html`<a class=${`button ${kind}`} href=${`${path}/download`} download aria-label=${`${t.download}: ${title}`}>${t.download}</a>`;
+  const button = (what, words) => html`<button key=${what} data-session-do=${what} aria-label=${`${words}: ${title}`} onClick=${() => act(what)}>${words}</button>`;
+  const download = html`<a class="button" href=${`${path}/download`} download aria-label=${`${t.download}: ${title}`}>${t.download}</a>`;
   const facts = [t.sessionStates[session.state] ?? session.state, session.cars.join(", "), t.size(session.bytes), session.lost > 0 && t.lostMessages(session.lost), session.kept && t.kept];
   return html`<article class="session" data-session=${session.name}>
     <h3>${title}</h3>
     <p class="facts">${facts.filter(Boolean).join(" · ")}</p>
     ${session.words && html`<p class="bad">⚠ ${session.words}</p>`}
-    <${Marks} marks=${session.marks} />
+    <${Marks} name=${session.name} marks=${session.marks} />
     <div class="controls">
-      ${isHere() ? button("view", t.rerun, "main") : download("main")}
+      <a class="button main" href=${linkTo(session.name)} aria-label=${`${t.lookAt}: ${title}`}>${t.lookAt}</a>
       <details class="others"><summary>${t.otherActions}</summary>
         <div class="controls">
-          ${isHere() && download("")}
+          ${isHere() && button("view", t.rerun)}
+          ${download}
           ${button("verify", t.verify)}
           ${Object.entries(t.exportAs).map(([kind, words]) => button(`export/${kind}`, words))}
         </div>

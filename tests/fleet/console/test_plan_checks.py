@@ -9,10 +9,10 @@ from typing import Any
 import psutil
 import pytest
 
-from fleet.console import plan_checks
 from fleet.console.budgets import MAX_OPEN_CHECKS
 from fleet.console.plan_answer import MAX_TOLD_CHARACTERS, PlanQuestion
-from fleet.console.plan_checks import PlanChecks, TooManyChecks
+from fleet.console.plan_checks import PlanChecks
+from fleet.console.worker import TooManyQuestions
 from fleet.policy.plan.parser import BadPlan, parse
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -106,7 +106,7 @@ async def test_a_person_has_few_open_checks_and_others_have_theirs(checks: PlanC
     mine = [asyncio.ensure_future(checks.check(PlanQuestion(PLAN), "mia")) for _ in range(MAX_OPEN_CHECKS)]
     await asyncio.sleep(0)
     assert checks.is_busy("mia")
-    with pytest.raises(TooManyChecks):
+    with pytest.raises(TooManyQuestions):
         await checks.check(PlanQuestion(GOOD), "mia")
     assert await is_good(checks, GOOD, "bob")
     assert [each["ok"] for each in await asyncio.gather(*mine)] == [True] * MAX_OPEN_CHECKS
@@ -125,10 +125,9 @@ async def test_a_check_that_is_given_up_or_dies_spoils_no_other(checks: PlanChec
     assert await is_good(checks, GOOD)
 
 
-async def test_the_process_ends_when_nothing_was_checked_for_a_while(
-    checks: PlanChecks, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plan_checks, "IDLE_CHECKER_S", 0.0)
+async def test_the_process_ends_when_nothing_was_checked_for_a_while(tmp_path: Path) -> None:
+    checks = PlanChecks(tmp_path / "fleet.yaml", idle_s=0.0)
     assert await is_good(checks, GOOD)
     await asyncio.to_thread(wait_for, lambda: not workers(), "it has ended")
     assert await is_good(checks, GOOD)
+    await checks.close()

@@ -12,7 +12,9 @@ from urllib.parse import quote
 
 import pytest
 
+from fleet.console.past_api import MAX_OPEN_LOOKS
 from tests.fleet.recording.damaged import written
+from tests.fleet.replay.make_session import START_NS, make
 from tests.support.console import ConsoleProcess
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses
@@ -83,6 +85,34 @@ def test_recordings_are_listed_verified_downloaded_and_exported_and_no_path_lead
         assert answer(console.port, "GET", f"/exports/{bad}")[0] == 404, bad
     assert ask(f"/sessions/{name}/verify", Origin="http://evil.example") == 403
     assert ask("/recording/stop", Cookie="") == 403
+    assert console.process.end() == 0
+
+
+def test_the_past_of_a_recording_is_told_and_no_path_leads_out(fleet: FleetProcesses, tmp_path: Path) -> None:
+    place, secret = tmp_path / "sessions", tmp_path / "20260101T000000Z-secret"
+    name = "20260921T141320Z-fleet"
+    for path in (place / name, secret):
+        path.mkdir(parents=True)
+        make(path / "0001.mcap")
+    console = ConsoleProcess(fleet, "--sessions", str(place))
+    own = {"Origin": console.address, "Cookie": cookie_of(console.port)}
+    body = json.dumps({"at_ms": START_NS // 1_000_000 + 4500, "car": "red"})
+    lanes = json.loads(answer(console.port, "GET", f"/past/{name}")[1])
+    assert (lanes["ok"], lanes["cars"]) == (True, ["blue", "green", "red"])
+    moment = json.loads(answer(console.port, "POST", f"/past/{name}/at", body, **own)[1])
+    assert [each["motion"]["motion"] for each in moment["cars"]] == ["forward"] * 3
+    assert moment["detail"]["car"] == "red"
+    for bad in ("..", "%2e%2e", f"..%2f{secret.name}", f"../{secret.name}", ".", "a%00b"):
+        assert answer(console.port, "GET", f"/past/{bad}")[0] == 404, bad
+        assert answer(console.port, "POST", f"/past/{bad}/at", body, **own)[0] == 404, bad
+    assert answer(console.port, "POST", f"/past/{name}/at", "{}x", **own)[0] == 400
+    assert answer(console.port, "POST", f"/past/{name}/at", body, **own | {"Origin": "http://evil.example"})[0] == 403
+    many = [send_request(console.port, "GET", f"/past/{name}") for _ in range(10)]
+    statuses = [each.getresponse().status for each in many]
+    for each in many:
+        each.close()
+    assert set(statuses) == {200, 429}
+    assert statuses.count(200) >= MAX_OPEN_LOOKS
     assert console.process.end() == 0
 
 

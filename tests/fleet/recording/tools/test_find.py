@@ -20,6 +20,7 @@ from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
 from fleet.client.wait import ConditionWait
 from fleet.conditions import BadExpression
+from fleet.console import DEFAULT_PORT
 from fleet.policy.car_condition import parse_condition
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SESSION_FILE
@@ -148,6 +149,7 @@ def test_a_hit_has_the_mode_and_the_last_command_and_opens(sessions: Path, tmp_p
     _, row, command = done.stdout.splitlines()
     assert row.split()[2] == "red"
     assert command.strip() == hit["open"]
+    assert hit["link"] == f"http://127.0.0.1:{DEFAULT_PORT}/#/time?session=s%201&at={hit['from']}"
     time = command.rpartition(" ")[2]
     cut = in_process.fleet("sessions", "cut", sessions / "s 1", "--from", time, "--out", tmp_path / "part")
     assert cut.returncode == 0, cut.stderr

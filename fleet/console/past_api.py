@@ -1,0 +1,115 @@
+"""Requests of the pages for the past: the lanes of a recording, and what was so at one of its moments.
+
+Anyone who may see the page may look back. Two processes read the recordings (past_worker.py): the lanes of an hour take
+seconds, and nobody's jump waits for them.
+"""
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from fleet.console.guard import PERSON
+from fleet.console.plot_buffer import series_of
+from fleet.console.plot_feed import MAX_PLOT_S
+from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.session_files import NotInFolder, session_path
+from fleet.console.sessions_api import read_body, refuse
+from fleet.console.worker import TooManyQuestions, Worker
+from schemas.keys import is_name
+
+LANES_TIMEOUT_S: Final = 120.0
+"""Timeout of the lanes of a recording: an hour of twenty cars takes 3 s, at the lowest share of a processor ten times
+that, and a day of three cars as long."""
+MOMENT_TIMEOUT_S: Final = 20.0
+"""Timeout of a moment: 0.2 s with twenty cars, at the lowest share ten times that, and 10 s to start the process."""
+IDLE_READER_S: Final = 300.0
+"""Time after the last question for which the processes stay: a person looks at what a jump shows."""
+MAX_OPEN_LOOKS: Final = 2
+"""Maximum number of questions of one person that wait: a page asks for one moment at a time."""
+_MAX_MS: Final = 2**53
+"""Maximum of a time of JavaScript that is exact."""
+_TOO_MANY: Final = "Other looks of this person at recordings have no answer yet. Try again in a few seconds."
+
+
+class PastApi:
+    """The routes. place: the sessions folder. colors: returns the color of each car."""
+
+    def __init__(self, place: Path, colors: Callable[[], Mapping[str, str]]) -> None:
+        self._place = place
+        self._colors = colors
+        self._lanes, self._moments = (
+            Worker("fleet.console.past_worker", timeout_s=timeout_s, idle_s=IDLE_READER_S, max_open=MAX_OPEN_LOOKS)
+            for timeout_s in (LANES_TIMEOUT_S, MOMENT_TIMEOUT_S)
+        )
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        return [
+            Route("/past/{name}", self._answer_lanes),
+            Route("/past/{name}/at", self._answer_moment, methods=["POST"]),
+        ]
+
+    async def close(self) -> None:
+        """End the processes."""
+        await self._lanes.close()
+        await self._moments.close()
+
+    async def _answer_lanes(self, request: Request) -> Response:
+        return await self._ask(self._lanes, request, {})
+
+    async def _answer_moment(self, request: Request) -> Response:
+        try:
+            question = moment_question(await read_body(request))
+        except BadPageMessage as error:
+            return refuse(str(error), 400)
+        return await self._ask(self._moments, request, question | {"colors": dict(self._colors())})
+
+    async def _ask(self, worker: Worker, request: Request, question: Mapping[str, Any]) -> Response:
+        try:
+            path = await asyncio.to_thread(session_path, self._place, request.path_params["name"])
+        except (NotInFolder, OSError) as error:
+            return refuse(str(error), 404)
+        person = request.scope.get(PERSON)
+        try:
+            found = await worker.ask({"path": str(path.absolute()), **question}, person and person.name)
+        except TooManyQuestions:
+            return refuse(_TOO_MANY, 429)
+        return JSONResponse(found) if found is not None else refuse("The recording could not be read in time.")
+
+
+def moment_question(text: str) -> dict[str, Any]:
+    """Return the checked question of a page: a moment, a car with its details, and what is plotted before it.
+
+    Raises BadPageMessage.
+    """
+    try:
+        fields = json.loads(text)
+    except (ValueError, RecursionError):
+        raise BadPageMessage("this is no JSON") from None
+    if not isinstance(fields, dict):
+        raise BadPageMessage("this is no question")
+    at_ms, span_s = _number(fields, "at_ms", _MAX_MS), _number(fields, "span_s", MAX_PLOT_S)
+    car = fields.get("car") or ""
+    if not isinstance(car, str) or (car and not is_name(car)):
+        raise BadPageMessage("car is no car")
+    series = series_of(PageMessage({"series": fields.get("series", [])}))
+    return {
+        "at_ms": int(at_ms),
+        "car": car,
+        "span_s": span_s,
+        "series": [(each.car, each.topic, each.field) for each in series],
+    }
+
+
+def _number(fields: Mapping[str, Any], name: str, most: float) -> float:
+    """Return a number from 0 to `most`. Raises BadPageMessage."""
+    value = fields.get(name, 0)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:  # NaN is not, either
+        raise BadPageMessage(f"{name} is not 0 to {most}")
+    return float(value)

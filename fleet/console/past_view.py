@@ -1,0 +1,101 @@
+"""What the pages show of a moment of a recording: the same views as live, fed with what was known then.
+
+The clock is that of the recorder: `now` is the moment, and each message counts from when it was recorded.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+from fleet.console.bus_message import is_finite, is_shown
+from fleet.console.car_view import CarView, FleetView
+from fleet.console.frame_log import FrameLog
+from fleet.console.plot_buffer import PlotBuffer, Series
+from fleet.recording.tools.lanes import HELD_NS, Lanes
+from fleet.recording.tools.moment import Known
+from schemas.colors import car_color, hex_color
+from schemas.topics import CAR_TOPICS
+
+DETAIL_BEFORE_NS: Final = 60_000_000_000
+"""Time before the moment whose commands and frames are shown of one car: a command ends within seconds, and a page
+shows 60 frames, which a car that reports once a second sends in a minute."""
+PLOT_SLOTS: Final = 600
+"""Values of one series: a page draws no more (static/plots-page.js)."""
+_TOPICS: Final = frozenset(topic.name for topic in CAR_TOPICS)
+_MS: Final = 1_000_000
+_S: Final = 1e9
+
+
+def cars_at(known: Iterable[Known], at_ns: int, colors: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return what a page shows of each car at a moment. known: by the time at which it was recorded."""
+    view = FleetView(lambda name, index: colors.get(name) or hex_color(car_color(name, index)))
+    of_cars = [each for each in known if is_told(each)]
+    view.list_cars(sorted({each.key.car for each in of_cars}))
+    spoke = {each.key.car: each.log_ns for each in of_cars if each.key.topic.startswith("state/")}
+    begun = min((each.log_ns for each in of_cars), default=at_ns)
+    view.on_presence(spoke, begun / _S)  # nothing records presence: a gateway that speaks each second is there
+    for each in of_cars:
+        view.on_message(each.key.car, each.key.topic, each.message, each.log_ns / _S)
+    for end_ns in sorted({ns + HELD_NS for ns in spoke.values() if ns + HELD_NS < at_ns}):
+        view.on_presence([car for car, ns in spoke.items() if ns + HELD_NS > end_ns], end_ns / _S)
+    return view.as_list(at_ns / _S)
+
+
+def is_told(each: Known) -> bool:
+    """Return True for a message that a page may be told: of a car, with numbers that JSON has."""
+    return (
+        each.key.topic in _TOPICS
+        and not each.key.car.startswith("@")
+        and is_shown(each.key.car)
+        and is_finite(each.message)
+    )
+
+
+def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns: int) -> dict[str, Any]:
+    """Return frames, commands, events and states of one car before a moment, as the inspect page shows them.
+
+    messages: its frames and events. known: the newest of everything else.
+    """
+    view, frames = CarView(car, ""), FrameLog()
+    view.on_presence(0.0, present=True)
+    mine = [*(each for each in known if each.key.car == car and not each.key.topic.startswith(("event/", "frame/")))]
+    for each in sorted((*mine, *messages), key=lambda each: each.log_ns):
+        if not is_told(each):
+            continue
+        if each.key.topic.startswith("frame/"):
+            frames.on_frame(each.key.topic, each.message)
+            if each.key.topic == "frame/tx":
+                view.commands.on_frame(each.message)
+        else:
+            view.on_message(each.key.topic, each.message, each.log_ns / _S)
+    return {
+        "car": car,
+        "frames": frames.as_list(),
+        "ledger": list(reversed(view.ledger)),
+        "commands": view.commands.as_list(),
+        "doctor": view.diagnose(at_ns / _S),
+        "gateway": view.describe_gateway(),
+    }
+
+
+def samples_of(
+    series: Sequence[Series], messages: Iterable[Known], from_ns: int, to_ns: int
+) -> dict[int, list[tuple[int, float]]]:
+    """Return the values of each series by its number: of each slot of a plot the last one."""
+    buffer = PlotBuffer(series)
+    for each in messages:
+        if is_told(each):
+            buffer.add(each.key.car, each.key.topic, each.message, each.log_ns // _MS)
+    slot_ms = max(1, -(-(to_ns - from_ns) // _MS // PLOT_SLOTS))  # rounded up
+    return {
+        number: list({at_ms // slot_ms: (at_ms, value) for at_ms, value in values}.values())
+        for number, values in buffer.take().items()
+    }
+
+
+def lanes_as_dict(lanes: Lanes) -> dict[str, Any]:
+    """Return lanes and marks as JSON values."""
+    marks = sorted(lanes.marks, key=lambda each: each.at_ns)
+    return {
+        "spans": [span.as_list() for span in lanes.since(0) if is_shown(span.car)],
+        "marks": [[each.at_ns // _MS, each.words, each.by] for each in marks],
+    }

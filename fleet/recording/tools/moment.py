@@ -1,0 +1,85 @@
+"""What was known at one moment of a session: the newest message of each key, and the lanes of the whole session.
+
+The moment is one of the recorder's clock, as `start_ns` and `end_ns` of `Session.messages`: the clock of a gateway may
+be wrong, and two of them differ. What the recorder had not got by then is not known yet. Of the messages that it had,
+the newest by the time of publishing counts, as in the tables: a backfilled one comes late and is old.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+
+from google.protobuf.message import DecodeError
+
+from fleet.recording.reading.mcap_reader import Row
+from fleet.recording.reading.message_decoder import message_of
+from fleet.recording.reading.session import Session
+from fleet.recording.selection import Selection
+from fleet.recording.tools.car_timeline import STATE_BEFORE_NS
+from fleet.recording.tools.lanes import LANE_TOPICS, MARK_TOPIC, Lanes
+from schemas import keys, messages
+from schemas.topics import TOPICS
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A message as it was known. Times: ns, of the recorder's and of the publisher's clock."""
+
+    key: keys.Key
+    message: Any
+    log_ns: int
+    publish_ns: int
+
+
+def known_at(session: Session, at_ns: int, *, before_ns: int = STATE_BEFORE_NS) -> list[Known]:
+    """Return the newest message of each key up to a moment, by the time at which it was recorded.
+
+    Only of the time `before_ns` before it: gateways repeat their states each second, so what is older nobody said any
+    more. Messages that are not of their key's type are left out.
+    """
+    newest = newest_rows(session.rows(Selection(None, at_ns - before_ns + 1, at_ns + 1)))
+    return sorted(_decoded(newest.values()), key=lambda each: each.log_ns)
+
+
+def newest_rows(rows: Iterable[Row]) -> Mapping[str, Row]:
+    """Return the row of each key that was published last; of two at one time the later one in the file. Pure."""
+    newest: dict[str, Row] = {}
+    for row in rows:
+        topic = row[0].channel.topic
+        before = newest.get(topic)
+        if before is None or row[3] >= before[3]:
+            newest[topic] = row
+    return newest
+
+
+def read_between(session: Session, expressions: tuple[str, ...], from_ns: int, to_ns: int) -> Iterator[Known]:
+    """Yield the messages of some keys from `from_ns` to `to_ns`, both included, as they were recorded."""
+    yield from _decoded(session.rows(Selection(expressions, from_ns, to_ns + 1)))
+
+
+def lanes_of(session: Session) -> Lanes:
+    """Return the lanes and marks of a whole session. `session.damage` then has what could not be read."""
+    expressions = (*(f"*/*/{topic}" for topic in LANE_TOPICS), f"*/{MARK_TOPIC}")
+    lanes = Lanes()
+    for each in read_between(session, expressions, 0, _LATEST_NS):
+        if each.key.topic in LANE_TOPICS:
+            lanes.add(each.key.car, each.key.topic, each.message, each.log_ns)
+        else:
+            lanes.add("", MARK_TOPIC, each.message, each.log_ns)
+    return lanes
+
+
+_LATEST_NS: Final = 2**63 - 2
+"""The latest time that a file can have."""
+
+
+def _decoded(rows: Iterable[Row]) -> Iterator[Known]:
+    """Yield the messages with our own classes: a schema only gains fields, and an older recording lacks some."""
+    for info, _, log_ns, publish_ns, data in rows:
+        key = keys.parse(info.channel.topic)
+        topic = None if key is None else TOPICS.get(key.topic) or TOPICS.get(f"{key.car}/{key.topic}")
+        if key is None or topic is None or message_of(info) != topic.message:
+            continue
+        with suppress(DecodeError):
+            yield Known(key, messages.message_class(topic.message).FromString(data), log_ns, publish_ns)
