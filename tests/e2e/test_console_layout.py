@@ -180,6 +180,7 @@ def grouped(stage: ConsoleStage) -> Iterator[ConsoleStage]:
     """Say what a supervisor says of groups, until the pages know it."""
     status = pb.Supervision(groups={"left": "red,blue,nobody", "right": "green", "gone": "nobody"})
     publisher = stage.fleet.bus.publisher("fleet/@supervisor/status", SUPERVISOR_STATUS, keys.SUPERVISOR)
+    stage.page()  # a console that was just started subscribes before it shows a page
     publisher.put(status, time.time_ns())
     yield stage
     publisher.put(pb.Supervision(), time.time_ns())

@@ -153,17 +153,21 @@ def test_lanes_of_modes_and_stops_come_to_a_page_that_asks(stage: ConsoleStage) 
     page.locator("[data-plot='0'] canvas").wait_for()
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")
-    page.keyboard.press("Escape")
-    stage.stands()
     spans = "async () => (await import('/static/lanes.js')).liveSpans()"
     lanes: dict[str, list[str]] = {}
 
-    def has_all() -> bool:
+    def told() -> dict[str, list[str]]:
         lanes.clear()
         for each in page.evaluate(spans):
             lanes.setdefault(f"{each['car']} {each['lane']}", []).append(each["words"])
-        return any("complete" in words for words in lanes.get("red stop", ())) and "red hold" in lanes
+        return lanes
 
+    def has_all() -> bool:
+        return any("complete" in words for words in told().get("red stop", ())) and "red hold" in lanes
+
+    wait_for(lambda: "red driver" in told(), "the drive is in its lane")
+    page.keyboard.press("Escape")
+    stage.stands()
     wait_for(has_all, "the lanes of the drive and its stop")
     assert lanes["red mode"] == ["manual"]
     assert lanes["red driver"] == ["mia"]

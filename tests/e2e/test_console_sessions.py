@@ -83,7 +83,7 @@ def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, 
 def test_a_stop_arrives_while_a_session_is_verified_and_shown_in_rerun(stage: ConsoleStage) -> None:
     page = sessions_page(stage)
     row = page.locator("[data-session]").last
-    row.get_by_role("button", name="Open in Rerun").click()
+    others(row).get_by_role("button", name="Open in Rerun").click()
     others(row).get_by_role("button", name="Verify").click()
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")

@@ -22,7 +22,7 @@ from tests.support.processes import FleetProcesses, wait_for
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
 FLEET_FILE = "cars:\n  red: {platform: arduino}\n  blue: {platform: stm32+arm}\n  green: {}\n"
-ON_PHONES = ("fleet", "drive", "plan", "plots", "inspect", "pair")
+ON_PHONES = ("fleet", "drive", "plan", "plots", "time", "inspect", "sessions", "pair")
 COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""
@@ -109,6 +109,13 @@ def prepare(page: Page, name: str, link: str) -> None:
             row.last.locator("details.others > summary").click()
             row.last.get_by_role("button", name="Verify").click()
             row.last.get_by_text("whole,").wait_for()
+        case "plan":
+            page.locator("select[name=example]").select_option(index=1)
+            page.locator("[data-plan=form]").click()
+            page.locator("[data-form-role]").first.wait_for()
+            page.locator("[data-plan=check]").click()
+            page.locator("[data-trial]").wait_for()
+            page.locator("main").evaluate("(main) => main.scrollTo(0, 0)")
         case "setup":
             page.locator("input[name=links]").fill(link)
             page.locator("[data-setup=scan]").click()
