@@ -29,7 +29,7 @@ def zenohd() -> Path:
     if not program.exists():
         cargo = shutil.which("cargo")
         assert cargo, "this soak builds zenohd with cargo, of Rust"
-        install = ["nice", cargo, "install", "zenohd", "--version", number, "--locked", "--debug", "--root", place]
+        install = ["nice", cargo, "install", "zenohd", "--version", number, "--locked", "--debug", "--root", str(place)]
         subprocess.run(install, check=True)
     return program
 
