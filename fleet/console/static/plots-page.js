@@ -115,7 +115,7 @@ function Plot({ title, cars, grid, view, onZoom }) {
       height: area.current.clientHeight - 40,
       pxAlign: 0,
       tzDate: consoleDate,
-      axes: [axis, { ...axis, label: title, labelSize: 24 }],
+      axes: [{ ...axis, space: 80, values: (_, splits) => splits.map((at) => clock(at * 1000)) }, { ...axis, label: title, labelSize: 24 }],
       scales: { x: { range: (_, min, max) => (shown.current === null ? [min, max] : [shown.current.from, shown.current.to]) } },
       series: [
         { label: t.plotTime, value: (_, at) => (at == null ? "–" : clock(at * 1000, 10)) },

@@ -41,7 +41,7 @@ class CarLanes extends Component {
 }
 
 function useSessions() {
-  const [found, setFound] = useState({ sessions: [], running: "" });
+  const [found, setFound] = useState({ sessions: [], running: null });
   useEffect(() => {
     let over = false;
     Promise.all([ask("/sessions"), ask("/recording/status", "")]).then(([listed, recorder]) => {
@@ -91,7 +91,7 @@ export function TimePage() {
   const { spans = [], marks = [] } = shown ?? {};
   const cars = past === null ? carsInPlace().map((car) => car.name) : [...new Set([...(shown?.cars ?? []), ...past.cars.map((car) => car.name)])];
 
-  const canScrub = name !== "" || running !== "";
+  const canScrub = name !== "" || Boolean(running);
   const go = (to_ms) => {
     const asked = Math.min(whole.to, Math.max(whole.from, to_ms));
     if (past === null && asked > whole.to - LIVE_GAP_MS) return;
@@ -134,7 +134,7 @@ export function TimePage() {
     </div>
     ${shown?.loading && shown.begin === undefined && html`<p role="status">${t.timeLoading}</p>`}
     ${shown?.words && html`<p class="bad">⚠ ${shown.words}</p>`}
-    ${!canScrub && html`<p class="hint">${t.timeUnrecorded}</p>`}
+    ${!canScrub && running !== null && html`<p class="hint">${t.timeUnrecorded}</p>`}
     <div class="controls" role="group" aria-label=${t.timeSteps}>
       ${button("previous", "|◀", t.timePrevious, previousTime(times, at))}
       ${button("back10", "−10 s", t.timeBack(10), at - 10_000)}${button("back1", "−1 s", t.timeBack(1), at - 1000)}
