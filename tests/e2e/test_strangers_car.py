@@ -29,6 +29,7 @@ def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForeignLot]:
         started.close()
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(240)
 def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: ForeignLot) -> None:
     found = stop_all(lot, gaps(MODES, seed=10))

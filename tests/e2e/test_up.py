@@ -90,7 +90,7 @@ def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) 
 
 
 @pytest.mark.parametrize(
-    "name", ["green", "@simulator", *(pytest.param(each, marks=pytest.mark.soak) for each in ("@recorder", "@console"))]
+    "name", ["@simulator", *(pytest.param(each, marks=pytest.mark.soak) for each in ("green", "@recorder", "@console"))]
 )
 def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     pid = up.running(name)
