@@ -163,7 +163,7 @@ def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
     from fleet.hub import local_hub  # needs an extra
 
     if secure and not is_secure(endpoint):
-        endpoint = local_hub.SECURE_ENDPOINT
+        endpoint = f"tls/{endpoint.partition('/')[2]}"
     if secure or local_hub.is_hub_here(endpoint):
         try:
             local_hub.ensure_hub_here(endpoint, spec.cars)

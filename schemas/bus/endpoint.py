@@ -55,8 +55,8 @@ def is_loopback(endpoint: str) -> bool:
 
 def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
     """Raise BadEndpoint if a hub would be open to a network without the user's consent."""
-    # A hub has no passwords and no certificates: everyone who reaches it can drive the cars.
-    if not insecure_lan and not is_loopback(endpoint):
+    # A plain hub has no passwords and no certificates: everyone who reaches it can drive the cars.
+    if not insecure_lan and not is_loopback(endpoint) and not is_secure(endpoint):
         raise BadEndpoint(
             f"a hub at {endpoint} would let everyone on that network drive the cars: "
             f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or accept it with --insecure-lan"
