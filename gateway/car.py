@@ -38,6 +38,7 @@ from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
 from schemas.process import signals
 from schemas.process.parent import has_ended
+from schemas.process.service_notifier import ServiceNotifier
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
@@ -140,6 +141,7 @@ class CarGateway:
             on_gap=self._on_gap,
             on_open=self._on_open,
         )
+        self._notifier = ServiceNotifier()
         self._writer = Writer(
             self._driver,
             self._link,
@@ -147,6 +149,7 @@ class CarGateway:
             self._wake,
             on_gap=self._on_gap,
             on_opened=partial(self._save_learned, at_once=True),
+            notifier=self._notifier,
         )
         self._hub_lost = asyncio.Event()
         self._values_due, self._histories_due = asyncio.Event(), asyncio.Event()
@@ -205,6 +208,7 @@ class CarGateway:
                     task.cancel()
                 _, running = await asyncio.wait(running, timeout=CANCEL_RETRY_S)
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
+            self._notifier.close()
             if self._link.link is not None:
                 await self._link.link.close()
             self._save_learned(self._loop.time(), at_once=True)

@@ -1,6 +1,7 @@
 """When the writer of one car has work: at once if something happened, else when control or the decoder needs it."""
 
 import asyncio
+from math import inf
 from typing import Final
 
 from gateway.control.controller import Controller
@@ -33,11 +34,11 @@ class Wake:
         """Begin to work: what happens from now on wakes the writer again."""
         self._event.clear()
 
-    async def wait(self) -> None:
-        """Wait for work."""
+    async def wait(self, latest: float = inf) -> None:
+        """Wait for work, until `latest` of the loop's clock."""
         now = self._loop.time()
         self._at = self._due_at(now)
-        timer = self._loop.call_at(min(self._at, now + MAX_SLEEP_S), self._event.set)
+        timer = self._loop.call_at(min(self._at, latest, now + MAX_SLEEP_S), self._event.set)
         await self._event.wait()
         timer.cancel()
 

@@ -9,6 +9,7 @@ from gateway.control.events import OutgoingFrame
 from gateway.link import LinkLost
 from gateway.link_loop import LinkLoop
 from gateway.wake import Wake
+from schemas.process.service_notifier import ServiceNotifier
 from schemas.words import Reason
 
 
@@ -24,8 +25,13 @@ class Writer:
         *,
         on_gap: Callable[[float], None],
         on_opened: Callable[[float], None],
+        notifier: ServiceNotifier,
     ) -> None:
-        """`on_gap`: looks for a gap of the loop before a frame is chosen. `on_opened`: `Driver.opened_as` changed."""
+        """`on_gap`: looks for a gap of the loop before a frame is chosen. `on_opened`: `Driver.opened_as` changed.
+
+        `notifier`: is fed by each turn and each frame, and by nothing else. So if no frame can be written any more,
+        systemd starts another gateway, which stops the car.
+        """
         self._loop = asyncio.get_running_loop()
         self._driver = driver
         self._link = link
@@ -33,6 +39,7 @@ class Writer:
         self._wake = wake
         self._on_gap = on_gap
         self._on_opened = on_opened
+        self._notifier = notifier
         self.finished = asyncio.Event()
         """Set when the driver has finished after `shut_down`."""
 
@@ -44,7 +51,8 @@ class Writer:
             flush()
             if self._driver.finished:
                 self.finished.set()
-            await self._wake.wait()
+            self._notifier.feed(self._loop.time())
+            await self._wake.wait(self._notifier.due_at)
 
     async def _write_due(self) -> None:
         """Write the frames that are due."""
@@ -71,6 +79,7 @@ class Writer:
                 self._on_opened(now)
             self._link.health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
+            self._notifier.feed(now)
 
     def _next_frame(self) -> OutgoingFrame | None:
         """Return the frame to write now, if any. The computer may have slept since the last one."""
