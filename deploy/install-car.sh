@@ -40,7 +40,7 @@ usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [
   --platform P      arduino, stm32, raspberry_pi, ... (default: auto)
   --options TEXT    more options of `gateway run`
   --ble             also what Bluetooth links need
-  --all             also hub, recorder and console: for the computer of the hub
+  --all             also hub, recorder, console and exporter: for the computer of the hub
   --wheel FILE      install this file (default: the newest version from PyPI)
   --uninstall       remove what this script has made, apart from files that were changed since
   --prefix DIR      put everything below DIR, and start nothing (for tests)
@@ -200,7 +200,7 @@ pip() {
 }
 what=${wheel:-$package}
 if [ -n "$all" ]; then
-    pip install --quiet --upgrade "${what}[secure,console]"
+    pip install --quiet --upgrade "${what}[secure,console,metrics]"
 else
     # shellcheck disable=SC2086 # a list of words
     pip install --quiet --upgrade $needs ${ble:+"$needs_ble"}
@@ -227,7 +227,7 @@ put "$rules" 0644 <"$here/70-fleet-cars.rules"
 put "$units/car-gateway@.service" 0644 <"$here/car-gateway@.service"
 if [ -n "$all" ]; then
     for unit in car-hub.service car-hub-certificates.service car-hub-certificates.timer car-recorder.service \
-        car-console.service; do
+        car-console.service car-exporter.service; do
         put "$units/$unit" 0644 <"$here/$unit"
     done
 fi
@@ -259,5 +259,5 @@ fi
 if [ -n "$all" ]; then
     echo "For the hub's computer:"
     echo "  sudo systemctl enable --now car-hub-certificates.service car-hub-certificates.timer car-hub.service"
-    echo "  sudo systemctl enable --now car-recorder.service car-console.service"
+    echo "  sudo systemctl enable --now car-recorder.service car-console.service car-exporter.service"
 fi

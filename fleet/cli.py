@@ -49,6 +49,10 @@ COMMANDS: Final = {
         "doctor": ("fleet.commands.doctor:doctor", "Why a car or a session is odd, and what to type."),
         "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
         "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),
+        "exporter": (
+            "fleet.commands.exporter:exporter",
+            "The fleet as metrics for Prometheus.",
+        ),
         "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),
     },
     "Several computers": {
@@ -128,6 +132,7 @@ _EXTRAS: Final = {
     **dict.fromkeys(("starlette", "uvicorn", "segno"), "console"),
     **dict.fromkeys(("cryptography", "ifaddr"), "secure"),
     "bleak": "ble",
+    "prometheus_client": "metrics",
 }
 """The extra that installs a module."""
 

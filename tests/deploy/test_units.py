@@ -38,7 +38,7 @@ def settings(name: str) -> dict[str, list[str]]:
 
 
 def test_there_is_one_for_each_service() -> None:
-    kinds = ["console", "gateway@", "hub-certificates", "hub", "recorder"]
+    kinds = ["console", "exporter", "gateway@", "hub-certificates", "hub", "recorder"]
     assert [f"car-{kind}.service" for kind in kinds] == SERVICES
 
 

@@ -13,6 +13,7 @@ from tests.fleet.replay.make_session import Made
 
 VIEW = (1, "pip install 'zenoh-car-fleet[view]'")
 CONSOLE = (1, "pip install 'zenoh-car-fleet[console]'")
+METRICS = (1, "pip install 'zenoh-car-fleet[metrics]'")
 ANALYSIS = (1, "pip install 'zenoh-car-fleet[analysis]'")
 WORKS = (0, "")
 RUN = """
@@ -50,6 +51,7 @@ EXPECTED = {
     "replay SESSION --save OUT/one.rrd": VIEW,
     "view": VIEW,
     "console": CONSOLE,
+    "exporter": METRICS,
     "up --sim 1 --console": CONSOLE,
     "view --save OUT/live.rrd": VIEW,
     "sessions export SESSION --parquet OUT/parquet": ANALYSIS,

@@ -1,0 +1,104 @@
+"""Makes the board of Grafana from the table of metrics: deploy/grafana.json, and `fleet exporter --dashboard`.
+
+Pure. The data source is an input of the board, which Grafana asks for when the board is imported.
+"""
+
+from typing import Any, Final
+
+from fleet.exporter.metrics import METRICS, CarMetric, Metric, MetricKind, Unit
+
+_SOURCE: Final = {"type": "prometheus", "uid": "${DS_PROMETHEUS}"}
+_COLUMNS: Final = 24  # of Grafana's grid
+_WIDTH: Final = 12
+_HEIGHT: Final = 7
+_WORDS: Final = ("state", "mode")
+"""Labels of which one word has a 1: a time line shows that word."""
+
+
+def dashboard() -> dict[str, Any]:
+    """Return the board, with a panel for each title in the table."""
+    by_title: dict[str, list[Metric]] = {}
+    for metric in METRICS:
+        by_title.setdefault(metric.panel, []).append(metric)
+    panels = [_panel(number, title, shown) for number, (title, shown) in enumerate(by_title.items())]
+    return {
+        "__inputs": [{"name": "DS_PROMETHEUS", "label": "Prometheus", "type": "datasource", "pluginId": "prometheus"}],
+        "title": "Car fleet",
+        "uid": "car-fleet",
+        "schemaVersion": 39,
+        "refresh": "5s",
+        "time": {"from": "now-15m", "to": "now"},
+        "templating": {
+            "list": [
+                {
+                    "name": "car",
+                    "label": "Car",
+                    "type": "query",
+                    "datasource": _SOURCE,
+                    "query": {"query": "label_values(fleet_car_up, car)", "refId": "cars"},
+                    "definition": "label_values(fleet_car_up, car)",
+                    "includeAll": True,
+                    "multi": True,
+                    "refresh": 2,
+                    "sort": 1,
+                    "current": {"text": "All", "value": "$__all"},
+                }
+            ]
+        },
+        "panels": panels,
+    }
+
+
+def _panel(number: int, title: str, metrics: list[Metric]) -> dict[str, Any]:
+    per_row = _COLUMNS // _WIDTH
+    is_line_of_words = any(label in _WORDS for label in metrics[0].labels)
+    return {
+        "id": number + 1,
+        "title": title,
+        "description": "; ".join(metric.about for metric in metrics),
+        "type": "state-timeline" if is_line_of_words else "timeseries",
+        "datasource": _SOURCE,
+        "gridPos": {
+            "x": number % per_row * _WIDTH,
+            "y": number // per_row * _HEIGHT,
+            "w": _WIDTH,
+            "h": _HEIGHT,
+        },
+        "fieldConfig": {"defaults": {"unit": _unit(metrics[0]), "min": 0}, "overrides": []},
+        "targets": [
+            {
+                "refId": chr(ord("A") + index),
+                "datasource": _SOURCE,
+                "expr": _expression(metric),
+                "legendFormat": _legend(metric, shared=len(metrics) > 1),
+            }
+            for index, metric in enumerate(metrics)
+        ],
+    }
+
+
+def _unit(metric: Metric) -> str:
+    if metric.kind is MetricKind.COUNTER:
+        return "Bps" if metric.unit is Unit.BYTES else "none"
+    return metric.unit
+
+
+def _label_names(metric: Metric) -> tuple[str, ...]:
+    return metric.label_names if isinstance(metric, CarMetric) else metric.labels
+
+
+def _expression(metric: Metric) -> str:
+    """Return what is drawn: a counter's growth, else the value; of words only the one that is so."""
+    names = _label_names(metric)
+    selected = f'{metric.sample}{{car=~"$car"}}' if "car" in names else metric.sample
+    if metric.kind is MetricKind.COUNTER:
+        grown = f"rate({selected}[1m])" if metric.unit is Unit.BYTES else f"increase({selected}[1m])"
+        return f"sum by ({', '.join(names)}) ({grown})" if names else grown
+    return f"{selected} == 1" if any(label in _WORDS for label in metric.labels) else selected
+
+
+def _legend(metric: Metric, *, shared: bool) -> str:
+    words = [f"{{{{{name}}}}}" for name in _label_names(metric)]
+    if shared or not words:
+        words.append(metric.name.removeprefix("fleet_").removeprefix("car_").replace("_", " "))
+    return " ".join(words)

@@ -1,0 +1,89 @@
+"""The exporter: a client of the bus that answers Prometheus over HTTP. It commands nothing."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from fleet.client.client import Fleet
+from fleet.coordinator.inbox import Inbox, QueriedSample
+from fleet.exporter.fleet_metrics import EVENTS, STATUS, FleetMetrics
+from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, CarMetric, Metric, MetricKind
+from schemas import keys
+from schemas.bus import Sample
+
+LOOPBACK: Final = "127.0.0.1"
+DEFAULT_EXPORTER_PORT: Final = 9478
+_WAIT_S: Final = 0.25
+"""Maximum time until a stop of the exporter is noticed."""
+_TOPICS: Final = ("state/*", "sensor/battery")
+"""Topics that are heard, and asked for when a car arrives. The other readings come 27 times a second in tracking."""
+
+_Family = CounterMetricFamily | GaugeMetricFamily
+
+
+class Exporter(Collector):
+    """Collects for the registry of Prometheus' client. `run` hears the bus; a thread of the server calls `collect`."""
+
+    def __init__(self, client: Fleet) -> None:
+        self._client = client
+        self._inbox = Inbox(client, lambda: {*_TOPICS})
+        self._metrics = FleetMetrics()
+        self._lock = threading.Lock()
+        for topic in (*_TOPICS, EVENTS):
+            self._inbox.subscribe(keys.topic_key(client.name, "*", topic))
+        self._inbox.subscribe(f"{client.name}/{STATUS}")
+        self._inbox.watch_gateways()
+
+    def serve(self, address: str, port: int) -> tuple[int, Callable[[], None]]:
+        """Serve the metrics. Return the port, and a function that ends it. Raises OSError if the port is in use."""
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(self)
+        server, thread = start_http_server(port, address, registry)
+
+        def close() -> None:
+            server.shutdown()
+            server.server_close()
+            thread.join()
+
+        return int(server.server_port), close
+
+    def run(self, has_ended: Callable[[], bool]) -> None:
+        """Hear the bus until `has_ended()`."""
+        with ThreadPoolExecutor(max_workers=4) as pool:
+            while not has_ended():
+                # Wait without the lock: a scrape must not wait for a message.
+                heard = list(self._inbox.items(_WAIT_S))
+                now, wall_s = time.monotonic(), time.time()
+                changes = self._inbox.gateways()
+                with self._lock:
+                    for car, alive in changes.items():
+                        self._metrics.observer.on_token(car, now, alive=alive)
+                    for item in heard:
+                        if isinstance(item, QueriedSample):
+                            self._metrics.on_sample(item.sample, now, wall_s)
+                        elif isinstance(item, Sample):
+                            self._metrics.on_sample(item, now)
+                    self._metrics.forget(now)
+                self._inbox.query_arrived(changes, pool, began=True)
+
+    def collect(self) -> Iterator[_Family]:
+        """Yield all metrics with their values now."""
+        families = {metric.name: _family(metric) for metric in METRICS}
+        families[CONNECTED.name].add_metric((), float(self._client.bus.connected))
+        families[DROPS.name].add_metric((), self._inbox.dropped)
+        with self._lock:
+            for metric, labels, value in self._metrics.values(time.monotonic()):
+                families[metric.name].add_metric(labels, value)
+        yield from families.values()
+
+
+def _family(metric: Metric) -> _Family:
+    names = metric.label_names if isinstance(metric, CarMetric) else metric.labels
+    made = CounterMetricFamily if metric.kind is MetricKind.COUNTER else GaugeMetricFamily
+    return made(metric.name, metric.about, labels=names)
