@@ -255,6 +255,7 @@ if [ -n "$car" ]; then
     echo "The hub's computer invites it with: fleet hub invite --car $car"
     echo "Then join here:"
     echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet join HOST CODE"
+    echo "  sudo systemctl restart car-gateway@$car"
 fi
 if [ -n "$all" ]; then
     echo "For the hub's computer:"

@@ -1,5 +1,6 @@
 """`fleet exporter`: the fleet as metrics for Prometheus."""
 
+import errno
 import json
 import threading
 
@@ -45,9 +46,9 @@ def exporter(*, port: int, address: str, prints_board: bool, connect: str | None
         try:
             port, close = served.serve(address, port)
         except OSError as error:
-            raise click.ClickException(
-                f"{address}:{port} cannot be used: {error.strerror or error}. `fleet exporter --port 0` takes any."
-            ) from None
+            hint = " `fleet exporter --port 0` takes any." if error.errno == errno.EADDRINUSE else ""
+            words = f"{address}:{port} cannot be used: {error.strerror or error}.{hint}"
+            raise click.ClickException(words) from None
         click.echo(f"Metrics: http://{address}:{port}/metrics (Ctrl-C ends it)")
         try:
             served.run(stop.is_set)

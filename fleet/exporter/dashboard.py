@@ -5,7 +5,7 @@ Pure. The data source is an input of the board, which Grafana asks for when the 
 
 from typing import Any, Final
 
-from fleet.exporter.metrics import METRICS, CarMetric, Metric, MetricKind, Unit
+from fleet.exporter.metrics import METRICS, Metric, MetricKind, Unit
 
 _SOURCE: Final = {"type": "prometheus", "uid": "${DS_PROMETHEUS}"}
 _COLUMNS: Final = 24  # of Grafana's grid
@@ -83,13 +83,9 @@ def _unit(metric: Metric) -> str:
     return metric.unit
 
 
-def _label_names(metric: Metric) -> tuple[str, ...]:
-    return metric.label_names if isinstance(metric, CarMetric) else metric.labels
-
-
 def _expression(metric: Metric) -> str:
     """Return what is drawn: a counter's growth, else the value; of words only the one that is so."""
-    names = _label_names(metric)
+    names = metric.label_names
     selected = f'{metric.sample}{{car=~"$car"}}' if "car" in names else metric.sample
     if metric.kind is MetricKind.COUNTER:
         grown = f"rate({selected}[1m])" if metric.unit is Unit.BYTES else f"increase({selected}[1m])"
@@ -98,7 +94,7 @@ def _expression(metric: Metric) -> str:
 
 
 def _legend(metric: Metric, *, shared: bool) -> str:
-    words = [f"{{{{{name}}}}}" for name in _label_names(metric)]
+    words = [f"{{{{{name}}}}}" for name in metric.label_names]
     if shared or not words:
         words.append(metric.name.removeprefix("fleet_").removeprefix("car_").replace("_", " "))
     return " ".join(words)

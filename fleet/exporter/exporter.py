@@ -13,7 +13,7 @@ from prometheus_client.registry import Collector
 from fleet.client.client import Fleet
 from fleet.coordinator.inbox import Inbox, QueriedSample
 from fleet.exporter.fleet_metrics import EVENTS, STATUS, FleetMetrics
-from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, CarMetric, Metric, MetricKind
+from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, Metric, MetricKind
 from schemas import keys
 from schemas.bus import Sample
 
@@ -84,6 +84,5 @@ class Exporter(Collector):
 
 
 def _family(metric: Metric) -> _Family:
-    names = metric.label_names if isinstance(metric, CarMetric) else metric.labels
     made = CounterMetricFamily if metric.kind is MetricKind.COUNTER else GaugeMetricFamily
-    return made(metric.name, metric.about, labels=names)
+    return made(metric.name, metric.about, labels=metric.label_names)

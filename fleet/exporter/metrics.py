@@ -50,6 +50,11 @@ class Metric:
     """Title of the panel of the board that shows it. Metrics of one title share a panel."""
 
     @property
+    def label_names(self) -> tuple[str, ...]:
+        """Return the names of the labels."""
+        return self.labels
+
+    @property
     def sample(self) -> str:
         """Return the name of its samples."""
         return f"{self.name}_total" if self.kind is MetricKind.COUNTER else self.name

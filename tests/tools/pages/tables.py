@@ -9,6 +9,7 @@ from typing import Any
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions.fields import LAST, fields_of
+from fleet.exporter.metrics import METRICS
 from gateway.control.driver import STALL_S
 from gateway.control.senders import SENDER_GONE_S
 from gateway.control.trust import TRANSITIONS, TrustEvent, TrustState
@@ -48,6 +49,14 @@ def key_table() -> str:
             f"`{topic.entity}`" if topic.entity else "",
         )
         rows.append(f"| {' | '.join(cell or '-' for cell in cells)} |")
+    return "\n".join(rows)
+
+
+def metric_table() -> str:
+    """Return the table of metrics, with the labels of each."""
+    rows = ["| metric | labels | what |", "|---|---|---|"]
+    for metric in METRICS:
+        rows.append(f"| `{metric.sample}` | {', '.join(metric.label_names) or '-'} | {metric.about} |")
     return "\n".join(rows)
 
 
