@@ -17,6 +17,7 @@ package=zenoh-car-fleet
 user='car-fleet'
 prefix=''
 wheel=''
+clone=''
 car=''
 link=''
 platform=auto
@@ -32,7 +33,8 @@ needs_ble='bleak>=3.1,<4'
 
 usage() {
     cat <<'END'
-usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [--ble] [--all] [--wheel FILE]
+usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [--ble] [--all]
+                      [--wheel FILE | --clone]
        install-car.sh --uninstall
 
   --car NAME        the gateway of this car starts with the computer; once for each run of this script
@@ -42,6 +44,7 @@ usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [
   --ble             also what Bluetooth links need
   --all             also hub, recorder, console and exporter: for the computer of the hub
   --wheel FILE      install this file (default: the newest version from PyPI)
+  --clone           install the clone that this script is in
   --uninstall       remove what this script has made, apart from files that were changed since
   --prefix DIR      put everything below DIR, and start nothing (for tests)
 END
@@ -68,6 +71,7 @@ while [ $# -gt 0 ]; do
             ;;
         --ble) ble=yes ;;
         --all) all=yes ;;
+        --clone) clone=yes ;;
         --uninstall) uninstall=yes ;;
         -h | --help)
             usage
@@ -180,6 +184,8 @@ fi
 case $car in
     *[!a-z0-9_-]* | [_-]*) fail "--car $car: allowed are a-z, 0-9, _ and -, beginning with a letter or digit" 2 ;;
 esac
+[ -z "$clone" ] || [ -f "$here/../pyproject.toml" ] || fail "--clone: this script is in no clone" 2
+[ -z "$clone" ] || [ -z "$wheel" ] || fail "either --clone or --wheel" 2
 [ -z "$wheel" ] || [ -f "$wheel" ] || fail "there is no $wheel" 2
 python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || fail "it needs Python 3.11 or newer"
 python3 -c 'import ensurepip, venv' 2>/dev/null || fail "it needs venv: sudo apt install python3-venv"
@@ -198,6 +204,16 @@ note "d$tab$opt"
 pip() {
     "$opt/bin/python" -m pip --disable-pip-version-check --no-input "$@"
 }
+if [ -n "$clone" ]; then
+    # A build leaves files beside the sources.
+    copy=$(mktemp -d)
+    trap 'rm -rf -- "$copy"' EXIT
+    for each in pyproject.toml README.md LICENSE fleet gateway schemas; do
+        cp -R -- "$here/../$each" "$copy/"
+    done
+    pip wheel --quiet --no-deps --wheel-dir "$copy" "$copy"
+    wheel=$(echo "$copy"/*.whl)
+fi
 what=${wheel:-$package}
 if [ -n "$all" ]; then
     pip install --quiet --upgrade "${what}[secure,console,metrics]"

@@ -43,6 +43,7 @@ def test_it_is_clean_for_any_posix_shell() -> None:
         ("--car", "Red", "--link", "/dev/ttyUSB0"),
         ("--car", "red/../x", "--link", "/dev/ttyUSB0"),
         ("--car", "red", "--link", "/dev/ttyUSB0", "--wheel", "/no/such.whl"),
+        ("--wheel", __file__, "--clone"),
     ],
 )
 def test_wrong_use_makes_nothing(words: tuple[str, ...], tmp_path: Path) -> None:

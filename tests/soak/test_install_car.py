@@ -47,7 +47,7 @@ def test_installed_twice_it_joins_and_drives_and_removed_it_leaves_nothing(tmp_p
         said = install(root, *options)
         assert "fleet join HOST CODE" in said
         before = paths(root)
-        install(root, *options)
+        install(root, "--clone", *options[2:])
         assert paths(root) == before
         used = subprocess.run(["du", "-sm", str(root / "opt")], capture_output=True, text=True, check=True).stdout
         print(f"installed: {used.split()[0]} MB")
