@@ -1,6 +1,8 @@
 """`fleet hub`, `fleet join`, `fleet leave`: a bus with certificates and rules, on one computer or on several."""
 
 import json
+import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,18 +13,22 @@ import click
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import show_table
+from fleet.commands.params import Number
 from fleet.hub import local_hub
 from fleet.hub.addresses import own_addresses
 from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import Bus, is_secure, resolve_endpoint, router_settings
+from schemas.bus import Bus, is_loopback, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
 from schemas.identity import IdentityRole, Service
 from schemas.printable import printable
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
+LOOPBACK: Final = "127.0.0.1"
+HUB_RESTART_S: Final = 2.0
+"""Time in which gateways are back after a restart of the hub: half a second for it to look, and 0.5 s for a retry."""
 
 
 @click.group(
@@ -41,7 +47,8 @@ def hub() -> None:
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub init\n  fleet hub init --car red")
 @click.option("--car", "cars", multiple=True, metavar="CAR", help="Also for this car, whose gateway runs here.")
-def init(cars: tuple[str, ...]) -> None:
+@click.option("--local", is_flag=True, help="Listen on loopback only, as `fleet up --secure` does.")
+def init(cars: tuple[str, ...], *, local: bool) -> None:
     """Make this computer the hub that other computers may join.
 
     It gets an authority, and a certificate for you and for each service; `fleet up` adds those of its cars. It listens
@@ -50,7 +57,10 @@ def init(cars: tuple[str, ...]) -> None:
     """
     with cli_errors(), _disk_errors():
         names = [keys.check_name(each) for each in cars]
-        store = local_hub.ensure_hub_here(local_hub.SECURE_ENDPOINT, names, listens=(local_hub.EVERYWHERE,))
+        endpoint = resolve_endpoint()
+        endpoint = endpoint if is_secure(endpoint) else local_hub.SECURE_ENDPOINT
+        listens = endpoint if local else local_hub.everywhere(endpoint)
+        store = local_hub.ensure_hub_here(endpoint, take=names, listens=(listens,))
     name = store.credentials.me.partition(".")[2]
     click.echo(
         f"This computer is a hub now, and you are {name} there. Its authority is in {store.directory}: keep a copy of "
@@ -61,11 +71,11 @@ def init(cars: tuple[str, ...]) -> None:
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub invite mia\n  fleet hub invite --car red")
 @click.argument("person", required=False)
-@click.option("--car", help="Invite a computer that runs the gateway of this car.")
+@click.option("--car", metavar="CAR", help="Invite a computer that runs the gateway of this car.")
 @click.option(
     "--service", type=click.Choice([each.value for each in Service]), help="Invite a computer that runs this service."
 )
-@click.option("--port", type=click.IntRange(1, 65535), default=JOIN_PORT, show_default=True, help="Listen here.")
+@click.option("--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen here (default: {JOIN_PORT}).")
 @click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
 @json_option
 def invite(
@@ -73,7 +83,7 @@ def invite(
 ) -> None:
     """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
 
-    The hub restarts first, since it gets another rule: drives end, modes go on, and all are back after a second.
+    The hub restarts first, since it gets another rule: drives may end, modes go on, and all are back after a second.
     """
     if [person, car, service].count(None) != 2:
         raise click.UsageError("say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME")
@@ -82,13 +92,15 @@ def invite(
         invited = identity.person(name) if person else identity.car(name) if car else f"{IdentityRole.SERVICE}.{name}"
         endpoint = resolve_endpoint()
         store = _own_store(endpoint)
+        here = host or next(iter(own_addresses()), LOOPBACK)
+        if here != LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
+            raise click.ClickException("This hub listens on loopback only: `fleet hub init` opens it to the network.")
         store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed
         store.reserve(invited)
         text = DEFAULT_FLEET_FILE.read_text(encoding="utf-8") if DEFAULT_FLEET_FILE.is_file() else ""
         hub_port = int(endpoint.rpartition(":")[2])
         invitation = Invitation(store, invited, hub_port=hub_port, port=port, fleet_file=text)
     try:
-        here = host or next(iter(own_addresses()), "127.0.0.1")
         if port != JOIN_PORT:
             here = f"{here}:{port}"
         if as_json:
@@ -154,11 +166,11 @@ def join_hub(host: str, code: str) -> None:
     """
     with cli_errors(), _disk_errors():
         parsed = JoinCode.parse(code)
-        name, _, port = host.rpartition(":") if host.rpartition(":")[2].isdigit() else (host, "", "")
-        joined = join(name or host, parsed, int(port or JOIN_PORT))
-        endpoint = local_hub.store_joined(name or host, joined)
+        name, port = _address(host)
+        joined = join(name, parsed, port)
+        endpoint = local_hub.store_joined(name, joined)
         with Bus.open(endpoint) as bus:
-            cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
+            cars = _cars_on(bus)
     click.echo(f"You are {joined.identity} at {endpoint} now. Cars: {', '.join(cars) or 'none is on'}.")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
         DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
@@ -174,6 +186,24 @@ def leave() -> None:
         raise click.ClickException("this computer has joined no hub")
     words = f"; its authority stays in {kept}, for the next `fleet up --secure`" if kept else ""
     click.echo(f"{endpoint} is no longer used{words}")
+
+
+def _address(written: str) -> tuple[str, int]:
+    """Return host and port of HOST, HOST:PORT, or an IPv6 address in brackets. Raises click.UsageError."""
+    found = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]:/]+)(?::(\d{1,5}))?", written)
+    if found is None or not 0 < int(found[2] or JOIN_PORT) < 65536:
+        raise click.UsageError(f"{printable(written)} is not allowed: write HOST, HOST:PORT or [IPV6]:PORT")
+    return found[1], int(found[2] or JOIN_PORT)
+
+
+def _cars_on(bus: Bus) -> list[str]:
+    """Return the cars that are on. The hub may have restarted with its new rules just now."""
+    deadline = time.monotonic() + HUB_RESTART_S
+    while True:
+        cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
+        if cars or time.monotonic() > deadline:
+            return cars
+        time.sleep(0.1)
 
 
 def _own_store(endpoint: str) -> HubStore:

@@ -29,7 +29,7 @@ from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
 from schemas import keys
-from schemas.bus import accepts, check_listening, is_secure, resolve_endpoint
+from schemas.bus import ENDPOINT_VARIABLE, accepts, check_listening, is_secure, resolve_endpoint
 from schemas.local_time import clock
 from schemas.process import signals, startup, stdio
 from schemas.yaml_document.document import read_text
@@ -163,6 +163,8 @@ def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
     from fleet.hub import local_hub  # needs an extra
 
     if secure and not is_secure(endpoint):
+        if not spec.endpoint and os.environ.get(ENDPOINT_VARIABLE):  # the next command would look there
+            raise click.UsageError(f"{ENDPOINT_VARIABLE} names a bus without certificates, {endpoint}: unset it")
         endpoint = f"tls/{endpoint.partition('/')[2]}"
     if secure or local_hub.is_hub_here(endpoint):
         try:

@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from typing import Any, Final
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -97,6 +98,24 @@ def is_due(certificate: bytes, now: datetime, addresses: Iterable[str] = ()) -> 
 def expires(certificate: bytes) -> datetime:
     """Return when a certificate ends. Raises ValueError if it is none."""
     return x509.load_pem_x509_certificate(certificate).not_valid_after_utc
+
+
+def belong(certificate: bytes, key: bytes) -> bool:
+    """Return True if a private key is that of a certificate. False if one of them is none."""
+    try:
+        found: Any = serialization.load_pem_private_key(key, None)
+        public = x509.load_pem_x509_certificate(certificate).public_key()
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        return False
+    return bool(found.public_key() == public)
+
+
+def only_certificate(text: bytes) -> bytes:
+    """Return the one certificate in a text, and nothing else of it, PEM. Raises ValueError if there is not just one."""
+    found = x509.load_pem_x509_certificates(text)
+    if len(found) != 1:
+        raise ValueError(f"{len(found)} certificates where there is one")
+    return _pem(found[0])
 
 
 def fingerprint(certificate: bytes) -> bytes:

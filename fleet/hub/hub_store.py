@@ -6,22 +6,28 @@ earlier certificate stays worthless.
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Self
 
 from fleet.hub import authority
-from fleet.hub.authority import KeyPair
+from fleet.hub.authority import BadRequestForCertificate, KeyPair
 from fleet.hub.rules import access_control
 from schemas.atomic_file import write_atomically
-from schemas.bus import BusError, Credentials
+from schemas.bus import BusError, Credentials, NoCredentials
 from schemas.bus.credentials import CA_FILE, HUB, HUB_FILE, ME_FILE
 from schemas.identity import parse
 
 CA_KEY_FILE: Final = "ca.key"
 IDENTITIES_FILE: Final = "identities.json"
+LOCK_FILE: Final = "lock"
+LOCK_TIMEOUT_S: Final = 10.0
+"""Age of a lock whose owner is gone: a change takes some milliseconds."""
+LOCK_POLL_S: Final = 0.02
 
 
 class BrokenHub(BusError):
@@ -61,18 +67,42 @@ class HubStore:
     def load(cls, credentials: Credentials) -> Self:
         """Return the files of a hub. Raises BrokenHub."""
         store = cls(credentials)
-        path = store.directory / IDENTITIES_FILE
+        store._read_known()
+        return store
+
+    def _read_known(self) -> None:
+        path = self.directory / IDENTITIES_FILE
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
-            store.known = {name: KnownIdentity(**each) for name, each in found.items()}
+            self.known = {name: KnownIdentity(**each) for name, each in found.items()}
         except FileNotFoundError:
             pass
         except (OSError, ValueError, TypeError, AttributeError) as error:
             raise BrokenHub(
-                f"{path} is damaged: {error}. Restore it from a copy, or begin anew: move {store.directory} away, "
+                f"{path} is damaged: {error}. Restore it from a copy, or begin anew: move {self.directory} away, "
                 "`fleet hub init`, and let everyone join again."
             ) from None
-        return store
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Keep other programs from changing the files, and see what they have changed. Raises OSError, BrokenHub."""
+        path, deadline = self.directory / LOCK_FILE, time.monotonic() + LOCK_TIMEOUT_S
+        while True:
+            try:
+                os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o600))
+                break
+            except FileExistsError:
+                with suppress(FileNotFoundError):
+                    if time.time() - path.stat().st_mtime > LOCK_TIMEOUT_S:  # whoever made it was killed
+                        path.unlink()
+                if time.monotonic() > deadline:
+                    raise BrokenHub(f"another program changes the hub: {path}. Delete it if there is none.") from None
+                time.sleep(LOCK_POLL_S)
+        try:
+            self._read_known()
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
     @property
     def directory(self) -> Path:
@@ -92,62 +122,86 @@ class HubStore:
         addresses: Iterable[str],
         listens: Iterable[str] = (),
         now: datetime | None = None,
+        take: bool = False,
     ) -> None:
         """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
 
         addresses: IP addresses and names under which others reach the hub. listens: its endpoints; empty: as before.
+        take: also identities whose certificate another computer has, which is worthless then.
         Raises OSError, BrokenHub.
         """
         now = datetime.now(UTC) if now is None else now
         self.directory.mkdir(parents=True, exist_ok=True)
         os.chmod(self.directory, 0o700)  # noqa: PTH101 - it has keys
-        if not self.is_hub:
-            if self.credentials.exist:
-                raise BrokenHub(
-                    f"{self.directory} has the certificate of the hub's authority, and not its key: this computer has "
-                    "joined another one's hub (`fleet leave` ends that), or the key is lost. Then restore it from a "
-                    "copy, or move the directory away, and let everyone join again."
-                )
-            self._write_pair("ca", authority.make_authority(now))
-        names = tuple(dict.fromkeys(("localhost", "127.0.0.1", *addresses)))
-        if authority.is_due(self._read(HUB), now, names):
-            self._write_pair(HUB, authority.issue(self._authority(), HUB, now, names))
-        for identity in dict.fromkeys((*identities, me)):
-            self._ensure_local(identity, now)
-        write_atomically(self.directory / ME_FILE, me.encode(), private=True)
-        self._save(listens)
+        if not self.is_hub and self.credentials.exist:
+            raise BrokenHub(
+                f"{self.directory} has the certificate of the hub's authority, and not its key: this computer has "
+                "joined another one's hub (`fleet leave` ends that), or the key is lost. Then restore it from a "
+                "copy, or move the directory away, and let everyone join again."
+            )
+        with self._changing():
+            if not self.is_hub:
+                self._write_pair("ca", authority.make_authority(now))
+            names = tuple(dict.fromkeys(("localhost", "127.0.0.1", *addresses)))
+            is_whole = authority.belong(self._read(HUB), self._read(HUB, "key"))
+            if not is_whole or authority.is_due(self._read(HUB), now, names):
+                self._write_pair(HUB, authority.issue(self._authority(), HUB, now, names))
+            for identity in dict.fromkeys((*identities, me)):
+                self._ensure_local(identity, now, take=take or identity == me)
+            write_atomically(self.directory / ME_FILE, me.encode(), private=True)
+            self._save(listens)
 
     def reserve(self, identity: str, now: datetime | None = None) -> None:
         """Write the rules for an identity of another computer, which has no certificate yet. Raises OSError.
 
-        Its earlier certificate, if it had one, is worthless from now on.
+        Its earlier certificate, if it had one, is worthless from now on, also one on this computer. Raises BrokenHub
+        for whoever uses this computer: nothing could be undone then.
         """
-        self.known[identity] = self._next(identity, datetime.now(UTC) if now is None else now)
-        self._save()
+        if identity == self.credentials.me:
+            raise BrokenHub(f"{identity} uses the hub's own computer: invite somebody under another name")
+        with self._changing():
+            self.known[identity] = self._next(identity, datetime.now(UTC) if now is None else now)
+            self._forget_local(identity)
+            self._save()
 
     def sign(self, request: bytes, identity: str, now: datetime) -> bytes:
-        """Return the certificate of a reserved identity, PEM. Raises BadRequestForCertificate, OSError."""
-        entry = self.known[identity]
-        certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
-        entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
-        self._save()
+        """Return the certificate of a reserved identity, PEM.
+
+        Raises BadRequestForCertificate, also if the identity was revoked or invited again meanwhile, and OSError.
+        """
+        reserved = self.known[identity]
+        with self._changing():
+            entry = self.known.get(identity)
+            if entry is None or entry.revoked or entry.generation != reserved.generation:
+                raise BadRequestForCertificate(f"{identity} was revoked, or invited again, meanwhile")
+            certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
+            entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+            self._save()
         return certificate
 
     def revoke(self, identity: str) -> bool:
         """Deny everything to an identity. Return False if it has no certificate. Raises OSError."""
-        entry = self.known.get(identity)
-        if entry is None or entry.revoked:
-            return False
-        entry.revoked = True
-        for ending in (".pem", ".key"):
-            (self.directory / f"{identity}{ending}").unlink(missing_ok=True)
-        self._save()
+        with self._changing():
+            entry = self.known.get(identity)
+            if entry is None or entry.revoked:
+                return False
+            entry.revoked = True
+            self._forget_local(identity)
+            self._save()
         return True
 
-    def _ensure_local(self, identity: str, now: datetime) -> None:
+    def _forget_local(self, identity: str) -> None:
+        for ending in (".pem", ".key"):
+            (self.directory / f"{identity}{ending}").unlink(missing_ok=True)
+
+    def _ensure_local(self, identity: str, now: datetime, *, take: bool) -> None:
         assert parse(identity) is not None, identity
         entry = self.known.get(identity)
-        if entry is not None and entry.local and not entry.revoked and not authority.is_due(self._read(identity), now):
+        if entry is not None and not entry.local and not entry.revoked and not take:
+            return  # another computer has it
+        is_whole = authority.belong(self._read(identity), self._read(identity, "key"))
+        is_due = not is_whole or authority.is_due(self._read(identity), now)
+        if entry is not None and entry.local and not entry.revoked and not is_due:
             return
         if entry is None or entry.revoked or not entry.local:
             entry = self._next(identity, now)
@@ -167,18 +221,27 @@ class HubStore:
         stored: Mapping[str, object] = {name: asdict(each) for name, each in sorted(self.known.items())}
         write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)
         path = self.directory / HUB_FILE
-        chosen = list(listens) or (self.credentials.listens if path.exists() else [])
+        chosen = list(listens)
+        if not chosen:
+            with suppress(NoCredentials):  # there is none yet, or it is damaged: loopback then
+                chosen = self.credentials.listens
         allowed = [(name, each.common_name(name)) for name, each in self.known.items() if not each.revoked]
         made = json.dumps({"listen": chosen, "access_control": access_control(sorted(allowed))}, indent=1).encode()
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
 
     def _authority(self) -> KeyPair:
-        return KeyPair((self.directory / CA_FILE).read_bytes(), (self.directory / CA_KEY_FILE).read_bytes())
+        found = KeyPair((self.directory / CA_FILE).read_bytes(), (self.directory / CA_KEY_FILE).read_bytes())
+        if not authority.belong(found.certificate, found.key):
+            raise BrokenHub(
+                f"{self.directory / CA_KEY_FILE} is not the key of {CA_FILE}: restore both from a copy, or move the "
+                "directory away, `fleet hub init`, and let everyone join again."
+            )
+        return found
 
-    def _read(self, name: str) -> bytes:
+    def _read(self, name: str, ending: str = "pem") -> bytes:
         try:
-            return (self.directory / f"{name}.pem").read_bytes()
+            return (self.directory / f"{name}.{ending}").read_bytes()
         except FileNotFoundError:
             return b""
 

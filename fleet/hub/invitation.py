@@ -22,6 +22,8 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
 from schemas.bus import BusError
 from schemas.bus.credentials import CA_FILE, HUB
+from schemas.identity import parse
+from schemas.printable import printable
 
 JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
@@ -160,11 +162,14 @@ def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], f
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code says whether it is the right one
-    ca = str(_ask(where, anyone, "GET", None)["ca"]).encode()
+    found = _ask(where, anyone, "GET", None)
+    ca, fits = b"", False
     try:
+        # Just one: OpenSSL would trust each of several, and the code is about the first.
+        ca = authority.only_certificate(str(found.get("ca")).encode())
         fits = code.fits(authority.fingerprint(ca))
     except ValueError:
-        fits = False
+        pass
     if not fits:
         raise NotJoined(
             f"{where} is not the hub that made this code, or the code is mistyped. Nothing was sent. If the code is "
@@ -176,6 +181,8 @@ def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], f
     found = _ask(where, known, "POST", json.dumps(asked).encode())
     try:
         certificate = str(found["certificate"]).encode()
+        if parse(str(found["identity"])) is None:  # it becomes the name of a file
+            raise NotJoined(f"{where} gave no identity: {printable(str(found['identity']))}")
         if authority.expires(certificate).timestamp() <= clock():
             raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")
         return Joined(str(found["identity"]), int(found["port"]), ca, certificate, key, str(found["fleet_file"]))
@@ -194,7 +201,10 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
             raise NotJoined(f"{where}: {found['error']}")
         return dict(found)
     except ssl.SSLCertVerificationError as error:
-        raise NotJoined(f"{where} has a certificate for other addresses: {error.verify_message}") from None
+        raise NotJoined(
+            f"the certificate of {where} does not fit: {error.verify_message}. Is the clock of this computer right, and "
+            "is this the address that `fleet hub invite` shows?"
+        ) from None
     except (OSError, http.client.HTTPException) as error:
         raise NotJoined(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
     except (ValueError, KeyError, TypeError):

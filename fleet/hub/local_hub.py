@@ -10,7 +10,7 @@ from typing import Final
 
 from fleet.hub.addresses import own_addresses, own_names
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Joined
+from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
 from schemas.bus import Credentials, is_secure
@@ -21,8 +21,6 @@ from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 
 SECURE_ENDPOINT: Final = "tls/127.0.0.1:7447"
 """Where the programs of the hub's own computer find it."""
-EVERYWHERE: Final = "tls/0.0.0.0:7447"
-"""Where a hub listens that other computers may join."""
 SOMEBODY: Final = "operator"
 """The name of a user whose login is no name of a person."""
 
@@ -38,18 +36,29 @@ def local_person() -> str:
     return name if is_name(name) else SOMEBODY
 
 
-def ensure_hub_here(endpoint: str, cars: Iterable[str] = (), *, listens: Iterable[str] = ()) -> HubStore:
+def ensure_hub_here(
+    endpoint: str, cars: Iterable[str] = (), *, listens: Iterable[str] = (), take: Iterable[str] = ()
+) -> HubStore:
     """Make this computer the hub at `endpoint`, or bring its certificates up to date. Raises BusError, OSError.
 
-    cars: those whose gateways run on this computer.
+    cars: those whose gateways run on this computer, unless another computer has their certificates. take: those whose
+    gateways run here from now on.
     """
     store = HubStore.of(endpoint)
     name = identity.parse(store.credentials.me)
     me = store.credentials.me if name is not None else identity.person(local_person())
     wanted = [*map(identity.car, cars), *map(identity.service, Service)]
-    store.ensure(wanted, me, addresses=(*own_addresses(), *own_names()), listens=listens)
+    addresses = (*own_addresses(), *own_names())
+    store.ensure(wanted, me, addresses=addresses, listens=listens)
+    if taken := [*map(identity.car, take)]:
+        store.ensure(taken, me, addresses=addresses, take=True)
     use(endpoint)
     return store
+
+
+def everywhere(endpoint: str) -> str:
+    """Return where a hub listens that other computers may join."""
+    return f"{endpoint.partition('/')[0]}/0.0.0.0:{endpoint.rpartition(':')[2]}"
 
 
 def is_hub_here(endpoint: str) -> bool:
@@ -65,8 +74,10 @@ def use(endpoint: str) -> None:
 
 
 def store_joined(host: str, joined: Joined) -> str:
-    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError."""
+    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined."""
     endpoint = f"tls/{host}:{joined.port}"
+    if is_hub_here(endpoint):
+        raise NotJoined(f"this computer is the hub at {endpoint}: its user is {Credentials.of(endpoint).me}")
     directory = Credentials.of(endpoint).directory
     directory.mkdir(parents=True, exist_ok=True)
     os.chmod(directory, 0o700)  # noqa: PTH101 - it has a key

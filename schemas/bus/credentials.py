@@ -66,7 +66,10 @@ class Credentials:
         role, _, own = (wanted or "person.NAME").partition(".")
         option = "" if role == IdentityRole.PERSON else f"--{role} "
         if (self.directory / f"{HUB}.key").is_file():
-            words = f"The hub's computer has no certificate for {wanted}: `fleet hub init {option}{own}` makes it"
+            local = "" if any("127.0.0.1" not in each for each in self.listens) else "--local "
+            words = (
+                f"The hub's computer has no certificate for {wanted}: `fleet hub init {local}{option}{own}` makes it"
+            )
         else:
             words = (
                 f"This computer has no certificate for {wanted or 'you'} at {self.endpoint}. On the hub's computer, "

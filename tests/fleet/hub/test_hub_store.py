@@ -1,7 +1,9 @@
 """The files of a hub: made once, renewed when due, and what is lost or damaged is named."""
 
 import json
+import os
 import stat
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -116,3 +118,76 @@ def test_damaged_rules_are_said(tmp_path: Path) -> None:
     (tmp_path / "hub.json").write_text(json.dumps({"listen": []}))
     with pytest.raises(NoCredentials, match=r"hub\.json"):
         _ = credentials.access_control
+
+
+def test_who_was_revoked_stays_so_if_another_one_joins_meanwhile(tmp_path: Path) -> None:
+    """One program waits for eve to join. Another one revokes bob."""
+    one = store_in(tmp_path)
+    one.reserve(person("bob"), NOW)
+    one.reserve(person("eve"), NOW)
+    assert HubStore.load(one.credentials).revoke(person("bob"))
+    _, request = authority.new_request("eve")
+    one.sign(request, person("eve"), NOW)
+    assert HubStore.load(one.credentials).known[person("bob")].revoked
+    assert common_names(one) == {"car.red", ME, "person.eve"}
+
+
+@pytest.mark.parametrize("change", [HubStore.revoke, HubStore.reserve])
+def test_who_was_revoked_or_invited_again_meanwhile_gets_no_certificate(
+    change: Callable[[HubStore, str], object], tmp_path: Path
+) -> None:
+    one = store_in(tmp_path)
+    _, request = authority.new_request("eve")
+    one.reserve(person("eve"), NOW)
+    change(HubStore.load(one.credentials), person("eve"))
+    with pytest.raises(authority.BadRequestForCertificate):
+        one.sign(request, person("eve"), NOW)
+
+
+def test_whoever_uses_the_hubs_computer_is_not_invited_away(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    with pytest.raises(BrokenHub, match="another name"):
+        store.reserve(ME, NOW)
+    assert store.credentials.identity() == ME
+
+
+def test_what_another_computer_has_is_left_to_it_unless_taken(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    store.reserve(car("red"), NOW)
+    assert not (tmp_path / "car.red.key").exists()
+    store.ensure([car("red")], ME, addresses=[], now=NOW)
+    assert "car.red.2" in common_names(store)
+    with pytest.raises(NoCredentials):
+        store.credentials.identity(car("red"))
+    store.ensure([car("red")], ME, addresses=[], now=NOW, take=True)
+    assert "car.red.3" in common_names(store)
+    assert store.credentials.identity(car("red")) == car("red")
+
+
+@pytest.mark.parametrize("name", [f"{ME}.key", f"{ME}.pem", "car.red.key", "hub.key", "hub.pem", "hub.json"])
+@pytest.mark.parametrize("text", ["", "junk"])
+def test_a_damaged_file_is_made_again(name: str, text: str, tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    (tmp_path / name).write_text(text)
+    HubStore.load(store.credentials).ensure([car("red")], ME, addresses=["192.0.2.1"], now=NOW)
+    for each in (ME, "car.red", "hub"):
+        assert authority.belong((tmp_path / f"{each}.pem").read_bytes(), (tmp_path / f"{each}.key").read_bytes())
+    assert common_names(store) == {"car.red", ME}
+
+
+@pytest.mark.parametrize("name", ["ca.key", "ca.pem"])
+def test_a_damaged_authority_is_named(name: str, tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    (tmp_path / name).write_text("junk")
+    store.reserve(person("eve"), NOW)
+    _, request = authority.new_request("eve")
+    with pytest.raises(BrokenHub, match=r"ca\.key"):
+        store.sign(request, person("eve"), NOW)
+
+
+def test_a_lock_whose_owner_was_killed_holds_up_nobody(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    (tmp_path / "lock").touch()
+    os.utime(tmp_path / "lock", (1, 1))
+    store.reserve(person("eve"), NOW)
+    assert not (tmp_path / "lock").exists()

@@ -73,6 +73,11 @@ def test_five_wrong_codes_end_it(invitation: Invitation) -> None:
     assert invitation.joined_from == ""
 
 
+@pytest.mark.parametrize("guess", ["\\ud800", "\\u0000", "x" * 9000])
+def test_a_guess_of_any_characters_counts(guess: str, invitation: Invitation) -> None:
+    assert post(invitation, f'{{"secret": "{guess}", "request": ""}}'.encode())[0] == 403
+
+
 def test_a_thousand_guesses_at_once_are_five(invitation: Invitation) -> None:
     answers = [invitation._take("2" * 12, b"", "192.0.2.1")[0] for _ in range(1000)]
     assert answers == [403] * MAX_GUESSES + [410] * (1000 - MAX_GUESSES)
@@ -86,6 +91,27 @@ def test_a_false_hub_gets_nothing(invitation: Invitation, tmp_path: Path) -> Non
         assert false._wrong == 0, "the secret was not sent"
     finally:
         false.close()
+
+
+def test_a_false_hub_that_shows_the_right_authority_beside_its_own_gets_nothing(
+    invitation: Invitation, tmp_path: Path
+) -> None:
+    """Anybody can read the certificate of the authority. OpenSSL trusts each one of a text."""
+    false = Invitation(made(tmp_path / "false"), person("mia"), hub_port=7447, address="127.0.0.1", port=free_port())
+    try:
+        right, own = invitation._ca, false._ca
+        for false._ca in (right + own, own + right):
+            with pytest.raises(NotJoined, match="pretends"):
+                join("127.0.0.1", invitation.code, false.port)
+        assert false._wrong == 0, "the secret was not sent"
+    finally:
+        false.close()
+
+
+def test_an_identity_that_is_none_is_refused(invitation: Invitation) -> None:
+    invitation._answer["identity"] = "../../escaped"
+    with pytest.raises(NotJoined, match="identity"):
+        join("127.0.0.1", invitation.code, invitation.port)
 
 
 @pytest.mark.parametrize(
