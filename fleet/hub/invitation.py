@@ -202,8 +202,8 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
         return dict(found)
     except ssl.SSLCertVerificationError as error:
         raise NotJoined(
-            f"the certificate of {where} does not fit: {error.verify_message}. Is the clock of this computer right, and "
-            "is this the address that `fleet hub invite` shows?"
+            f"the certificate of {where} does not fit: {error.verify_message}. Is the clock of this computer right, "
+            "and is this the address that `fleet hub invite` shows?"
         ) from None
     except (OSError, http.client.HTTPException) as error:
         raise NotJoined(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
