@@ -20,7 +20,7 @@ from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import Bus, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus import Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
 from schemas.identity import IdentityRole, Service
 from schemas.printable import printable
@@ -169,8 +169,7 @@ def join_hub(host: str, code: str) -> None:
         name, port = _address(host)
         joined = join(name, parsed, port)
         endpoint = local_hub.store_joined(name, joined)
-        with Bus.open(endpoint) as bus:
-            cars = _cars_on(bus)
+        cars = _cars_on(endpoint)
     click.echo(f"You are {joined.identity} at {endpoint} now. Cars: {', '.join(cars) or 'none is on'}.")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
         DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
@@ -196,12 +195,19 @@ def _address(written: str) -> tuple[str, int]:
     return found[1], int(found[2] or JOIN_PORT)
 
 
-def _cars_on(bus: Bus) -> list[str]:
-    """Return the cars that are on. The hub may have restarted with its new rules just now."""
+def _cars_on(endpoint: str) -> list[str]:
+    """Return the cars that are on. The hub may be restarting with its new rules just now. Raises BusError."""
     deadline = time.monotonic() + HUB_RESTART_S
     while True:
-        cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
-        if cars or time.monotonic() > deadline:
+        is_last = time.monotonic() > deadline
+        try:
+            with Bus.open(endpoint) as bus:
+                cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
+        except BusError:
+            if is_last:
+                raise
+            cars = []
+        if cars or is_last:
             return cars
         time.sleep(0.1)
 

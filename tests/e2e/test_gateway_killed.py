@@ -5,12 +5,15 @@ The simulator's truth is the judge, with its own stamps. tests/soak/test_kills.p
 
 from pathlib import Path
 
+import pytest
+
 from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S, cut_links
 from tests.support.processes import FleetProcesses, wait_for
 
 
+@pytest.mark.soak
 def test_a_cut_link_that_is_back_stops_the_car_at_once(fleet: FleetProcesses, tmp_path: Path) -> None:
     found = cut_links(fleet, tmp_path)
     late = {what: str(took) for what, took in found.items() if took.took_s > took.limit_s + BUSY_S}

@@ -4,6 +4,8 @@ import json
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from schemas.state_dir import JOINED_FILE
 from tests.support.ports import free_port
 from tests.support.processes import GatewayProcess, wait_for
@@ -16,6 +18,8 @@ plan: plan.yaml
 """
 
 
+@pytest.mark.soak
+@pytest.mark.timeout(240)
 def test_one_computer_and_another_that_joins(tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     endpoint = f"tls/127.0.0.1:{free_port()}"
