@@ -21,12 +21,13 @@ from schemas.atomic_file import write_atomically
 from schemas.bus import BusError, Credentials, NoCredentials
 from schemas.bus.credentials import CA_FILE, HUB, HUB_FILE, ME_FILE
 from schemas.identity import parse
+from schemas.process.file_lock import FileLock
 
 CA_KEY_FILE: Final = "ca.key"
 IDENTITIES_FILE: Final = "identities.json"
 LOCK_FILE: Final = "lock"
 LOCK_TIMEOUT_S: Final = 10.0
-"""Age of a lock whose owner is gone: a change takes some milliseconds."""
+"""Maximum wait for another program's change, which takes some milliseconds."""
 LOCK_POLL_S: Final = 0.02
 
 
@@ -87,22 +88,16 @@ class HubStore:
     def _changing(self) -> Iterator[None]:
         """Keep other programs from changing the files, and see what they have changed. Raises OSError, BrokenHub."""
         path, deadline = self.directory / LOCK_FILE, time.monotonic() + LOCK_TIMEOUT_S
-        while True:
-            try:
-                os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o600))
-                break
-            except FileExistsError:
-                with suppress(FileNotFoundError):
-                    if time.time() - path.stat().st_mtime > LOCK_TIMEOUT_S:  # whoever made it was killed
-                        path.unlink()
-                if time.monotonic() > deadline:
-                    raise BrokenHub(f"another program changes the hub: {path}. Delete it if there is none.") from None
-                time.sleep(LOCK_POLL_S)
+        lock = FileLock(path)
+        while not lock.try_take():
+            if time.monotonic() > deadline:
+                raise BrokenHub(f"another program changes the hub, and holds {path}: try again")
+            time.sleep(LOCK_POLL_S)
         try:
             self._read_known()
             yield
         finally:
-            path.unlink(missing_ok=True)
+            lock.release()
 
     @property
     def directory(self) -> Path:

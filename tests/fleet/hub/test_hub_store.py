@@ -1,8 +1,9 @@
 """The files of a hub: made once, renewed when due, and what is lost or damaged is named."""
 
 import json
-import os
 import stat
+import subprocess
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -185,9 +186,22 @@ def test_a_damaged_authority_is_named(name: str, tmp_path: Path) -> None:
         store.sign(request, person("eve"), NOW)
 
 
-def test_a_lock_whose_owner_was_killed_holds_up_nobody(tmp_path: Path) -> None:
+def test_a_change_waits_for_another_ones_and_not_for_one_that_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = store_in(tmp_path)
-    (tmp_path / "lock").touch()
-    os.utime(tmp_path / "lock", (1, 1))
+    monkeypatch.setattr("fleet.hub.hub_store.LOCK_TIMEOUT_S", 0.1)
+    holder = (
+        "import sys, time; from pathlib import Path; from schemas.process.file_lock import FileLock;"
+        "lock = FileLock(Path(sys.argv[1])); print(lock.try_take(), flush=True); time.sleep(1e6)"
+    )
+    command = [sys.executable, "-c", holder, str(tmp_path / "lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "True\n"
+        with pytest.raises(BrokenHub, match="lock"):
+            store.reserve(person("eve"), NOW)
+        other.kill()
+        other.wait()
     store.reserve(person("eve"), NOW)
-    assert not (tmp_path / "lock").exists()
+    assert "person.eve" in common_names(store)
