@@ -2,7 +2,6 @@
 
 import fcntl
 import hashlib
-import ipaddress
 import os
 import ssl
 from collections.abc import Iterable
@@ -14,13 +13,12 @@ from typing import Any, Final
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from fleet.hub.x509_parts import builder, common_name, end_entity, new_key, pem, private_pem
 from schemas.atomic_file import write_atomically
 from schemas.state_dir import default_directory
 
-LIFETIME: Final = timedelta(days=397)
-"""Lifetime of a certificate. Browsers refuse much longer ones."""
 RENEWAL_BEFORE: Final = timedelta(days=30)
 MAX_NAMES: Final = 24
 """Maximum number of names and addresses in a certificate."""
@@ -79,11 +77,7 @@ def ensure_certificate(names: Iterable[str], now: datetime | None = None, direct
 
 def _ensure_key(path: Path) -> Any:
     if not path.exists():
-        made = ec.generate_private_key(ec.SECP256R1())
-        words = made.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-        write_atomically(path, words, sync=True, private=True)
+        write_atomically(path, private_pem(new_key()), sync=True, private=True)
     if path.stat().st_mode & 0o077:
         os.chmod(path, 0o600)  # noqa: PTH101 - also on what a link names
     try:
@@ -110,38 +104,7 @@ def _read(path: Path, key_path: Path, key: Any) -> Certificate | None:
     return Certificate(path, key_path, tuple(listed), found.not_valid_after_utc, fingerprint)
 
 
-def _signed(key: Any, names: Iterable[str], now: datetime) -> bytes:
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fleet console")])
-    usage = x509.KeyUsage(
-        digital_signature=True,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=False,
-        crl_sign=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))  # clocks of phones differ
-        .not_valid_after(now + LIFETIME)
-        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(usage, critical=True)
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    return bytes(made.public_bytes(serialization.Encoding.PEM))
-
-
-def _general_name(name: str) -> Any:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(name))
-    except ValueError:
-        return x509.DNSName(name)
+def _signed(key: ec.EllipticCurvePrivateKey, names: tuple[str, ...], now: datetime) -> bytes:
+    subject = common_name("fleet console")
+    begun = builder(subject, subject, key.public_key(), now)
+    return pem(end_entity(begun, ExtendedKeyUsageOID.SERVER_AUTH, names).sign(key, hashes.SHA256()))

@@ -17,6 +17,7 @@ from typing import Final, Self
 from fleet.hub import authority
 from fleet.hub.authority import BadRequestForCertificate, KeyPair
 from fleet.hub.rules import access_control
+from fleet.hub.x509_parts import LIFETIME
 from schemas.atomic_file import write_atomically
 from schemas.bus import BusError, Credentials, NoCredentials
 from schemas.bus.credentials import CA_FILE, HUB, HUB_FILE, ME_FILE
@@ -170,7 +171,7 @@ class HubStore:
             if entry is None or entry.revoked or entry.generation != reserved.generation:
                 raise BadRequestForCertificate(f"{identity} was revoked, or invited again, meanwhile")
             certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
-            entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+            entry.until = (now + LIFETIME).isoformat(timespec="seconds")
             self._save()
         return certificate
 
@@ -201,14 +202,14 @@ class HubStore:
         if entry is None or entry.revoked or not entry.local:
             entry = self._next(identity, now)
         entry.local = True
-        entry.until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+        entry.until = (now + LIFETIME).isoformat(timespec="seconds")
         self._write_pair(identity, authority.issue(self._authority(), entry.common_name(identity), now))
         self.known[identity] = entry
 
     def _next(self, identity: str, now: datetime) -> KnownIdentity:
         """Return the entry of a new certificate. An earlier certificate of this identity is worthless then."""
         before = self.known.get(identity)
-        until = (now + authority.LIFETIME).isoformat(timespec="seconds")
+        until = (now + LIFETIME).isoformat(timespec="seconds")
         return KnownIdentity(until, 1 if before is None else before.generation + 1)
 
     def _save(self, listens: Iterable[str] = ()) -> None:

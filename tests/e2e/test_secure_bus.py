@@ -16,6 +16,7 @@ import zenoh
 from fleet.client.client import Fleet as Client
 from fleet.hub import authority
 from fleet.hub.hub_store import HubStore
+from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
 from schemas.bus import Bus
 from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS, Verb
@@ -201,7 +202,7 @@ def foreign(directory: Path) -> dict[str, dict[str, Any]]:
     ca = authority.KeyPair(own["ca"], (directory / "ca.key").read_bytes())
     made = {
         "another authority": authority.issue(authority.make_authority(now), ANN, now),
-        "expired": authority.issue(ca, ANN, now - authority.LIFETIME - timedelta(days=2)),
+        "expired": authority.issue(ca, ANN, now - LIFETIME - timedelta(days=2)),
         "not yet": authority.issue(ca, ANN, now + timedelta(days=30)),
     }
     found: dict[str, dict[str, Any]] = {"no certificate": {}}

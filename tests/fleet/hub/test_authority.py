@@ -11,6 +11,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleet.hub import authority
 from fleet.hub.authority import BadRequestForCertificate
+from fleet.hub.x509_parts import LIFETIME
 
 NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
 
@@ -68,8 +69,8 @@ def test_a_request_with_another_ones_signature_is_refused(ca: authority.KeyPair)
     ("after", "names", "is_due"),
     [
         (timedelta(0), ["127.0.0.1"], False),
-        (authority.LIFETIME - authority.RENEWAL_BEFORE - timedelta(days=1), ["127.0.0.1"], False),
-        (authority.LIFETIME - authority.RENEWAL_BEFORE + timedelta(days=1), ["127.0.0.1"], True),
+        (LIFETIME - authority.RENEWAL_BEFORE - timedelta(days=1), ["127.0.0.1"], False),
+        (LIFETIME - authority.RENEWAL_BEFORE + timedelta(days=1), ["127.0.0.1"], True),
         (timedelta(0), ["127.0.0.1", "192.0.2.7"], True),
         (timedelta(0), [], False),
     ],

@@ -12,6 +12,7 @@ import pytest
 
 from fleet.hub import authority
 from fleet.hub.hub_store import BrokenHub, HubStore
+from fleet.hub.x509_parts import LIFETIME
 from schemas.bus import Credentials, NoCredentials
 from schemas.identity import car, person
 
@@ -48,7 +49,7 @@ def test_a_second_time_changes_nothing(tmp_path: Path) -> None:
 def test_due_certificates_are_renewed_and_the_authority_stays(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     before = files(store.directory)
-    store.ensure([], ME, addresses=["192.0.2.1"], now=NOW + authority.LIFETIME - timedelta(days=30))
+    store.ensure([], ME, addresses=["192.0.2.1"], now=NOW + LIFETIME - timedelta(days=30))
     changed = {name for name, data in files(store.directory).items() if before[name] != data}
     assert changed == {"hub.pem", "hub.key", f"{ME}.pem", f"{ME}.key", "identities.json"}
     assert store.credentials.listens == ["tls/0.0.0.0:7447"], "as before"
