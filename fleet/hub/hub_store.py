@@ -117,13 +117,13 @@ class HubStore:
         *,
         addresses: Iterable[str],
         listens: Iterable[str] = (),
+        take: Iterable[str] = (),
         now: datetime | None = None,
-        take: bool = False,
     ) -> None:
         """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
 
         addresses: IP addresses and names under which others reach the hub. listens: its endpoints; empty: as before.
-        take: also identities whose certificate another computer has, which is worthless then.
+        take: more identities, also if another computer has their certificate, which is worthless then.
         Raises OSError, BrokenHub.
         """
         now = datetime.now(UTC) if now is None else now
@@ -139,11 +139,11 @@ class HubStore:
             if not self.is_hub:
                 self._write_pair("ca", authority.make_authority(now))
             names = tuple(dict.fromkeys(("localhost", "127.0.0.1", *addresses)))
-            is_whole = authority.belong(self._read(HUB), self._read(HUB, "key"))
-            if not is_whole or authority.is_due(self._read(HUB), now, names):
+            if self._is_due(HUB, now, names):
                 self._write_pair(HUB, authority.issue(self._authority(), HUB, now, names))
-            for identity in dict.fromkeys((*identities, me)):
-                self._ensure_local(identity, now, take=take or identity == me)
+            taken = {me, *take}
+            for identity in dict.fromkeys((*identities, *take, me)):
+                self._ensure_local(identity, now, take=identity in taken)
             write_atomically(self.directory / ME_FILE, me.encode(), private=True)
             self._save(listens)
 
@@ -171,7 +171,7 @@ class HubStore:
             if entry is None or entry.revoked or entry.generation != reserved.generation:
                 raise BadRequestForCertificate(f"{identity} was revoked, or invited again, meanwhile")
             certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
-            entry.until = (now + LIFETIME).isoformat(timespec="seconds")
+            entry.until = _until(now)
             self._save()
         return certificate
 
@@ -195,22 +195,24 @@ class HubStore:
         entry = self.known.get(identity)
         if entry is not None and not entry.local and not entry.revoked and not take:
             return  # another computer has it
-        is_whole = authority.belong(self._read(identity), self._read(identity, "key"))
-        is_due = not is_whole or authority.is_due(self._read(identity), now)
-        if entry is not None and entry.local and not entry.revoked and not is_due:
-            return
         if entry is None or entry.revoked or not entry.local:
             entry = self._next(identity, now)
-        entry.local = True
-        entry.until = (now + LIFETIME).isoformat(timespec="seconds")
+        elif not self._is_due(identity, now):
+            return
+        entry.local, entry.until = True, _until(now)
         self._write_pair(identity, authority.issue(self._authority(), entry.common_name(identity), now))
         self.known[identity] = entry
 
     def _next(self, identity: str, now: datetime) -> KnownIdentity:
         """Return the entry of a new certificate. An earlier certificate of this identity is worthless then."""
         before = self.known.get(identity)
-        until = (now + LIFETIME).isoformat(timespec="seconds")
-        return KnownIdentity(until, 1 if before is None else before.generation + 1)
+        return KnownIdentity(_until(now), 1 if before is None else before.generation + 1)
+
+    def _is_due(self, name: str, now: datetime, addresses: Iterable[str] = ()) -> bool:
+        """Return True if a certificate on this computer must be made: it is missing, damaged, or must be renewed."""
+        certificate = self._read(name)
+        is_whole = authority.belong(certificate, self._read(name, "key"))
+        return not is_whole or authority.is_due(certificate, now, addresses)
 
     def _save(self, listens: Iterable[str] = ()) -> None:
         """Write the identities, and the rules if they changed: the hub restarts then."""
@@ -244,3 +246,8 @@ class HubStore:
     def _write_pair(self, name: str, pair: KeyPair) -> None:
         write_atomically(self.directory / f"{name}.key", pair.key, private=True)
         write_atomically(self.directory / f"{name}.pem", pair.certificate, private=True)
+
+
+def _until(now: datetime) -> str:
+    """Return when a certificate ends that is made now."""
+    return (now + LIFETIME).isoformat(timespec="seconds")

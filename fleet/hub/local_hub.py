@@ -49,9 +49,7 @@ def ensure_hub_here(
     me = store.credentials.me if name is not None else identity.person(local_person())
     wanted = [*map(identity.car, cars), *map(identity.service, Service)]
     addresses = (*own_addresses(), *own_names())
-    store.ensure(wanted, me, addresses=addresses, listens=listens)
-    if taken := [*map(identity.car, take)]:
-        store.ensure(taken, me, addresses=addresses, take=True)
+    store.ensure(wanted, me, addresses=addresses, listens=listens, take=[*map(identity.car, take)])
     use(endpoint)
     return store
 
@@ -63,7 +61,7 @@ def everywhere(endpoint: str) -> str:
 
 def is_hub_here(endpoint: str) -> bool:
     """Return True if this computer is the hub with certificates at `endpoint`."""
-    return is_secure(endpoint) and HubStore.of(endpoint).is_hub
+    return is_secure(endpoint) and HubStore(Credentials.of(endpoint)).is_hub
 
 
 def use(endpoint: str) -> None:

@@ -161,7 +161,7 @@ def test_what_another_computer_has_is_left_to_it_unless_taken(tmp_path: Path) ->
     assert "car.red.2" in common_names(store)
     with pytest.raises(NoCredentials):
         store.credentials.identity(car("red"))
-    store.ensure([car("red")], ME, addresses=[], now=NOW, take=True)
+    store.ensure([], ME, addresses=[], now=NOW, take=[car("red")])
     assert "car.red.3" in common_names(store)
     assert store.credentials.identity(car("red")) == car("red")
 
