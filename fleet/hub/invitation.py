@@ -27,6 +27,8 @@ from schemas.printable import printable
 
 JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
+_MAX_DISCARDED_BYTES: Final = 4 * MAX_JOIN_REQUEST_BYTES
+"""Of a request that is too long: more of it is left unread, and the answer may be lost then."""
 SOCKET_TIMEOUT_S: Final = 10.0
 """Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
 
@@ -133,6 +135,8 @@ class Invitation:
                 try:
                     length = int(self.headers.get("Content-Length", "0"))
                     if not 0 < length <= MAX_JOIN_REQUEST_BYTES:
+                        # Unread bytes would reset the connection when it closes, and the answer could be lost.
+                        self.rfile.read(min(max(length, 0), _MAX_DISCARDED_BYTES))
                         self._send(413, {"error": f"a request has 1 to {MAX_JOIN_REQUEST_BYTES} bytes"})
                         return
                     asked = json.loads(self.rfile.read(length))
