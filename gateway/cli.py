@@ -184,6 +184,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.drivers import check_platform
     from gateway.link import BadUrl, LinkError, parse_url
+    from schemas import identity
     from schemas.bus import BadEndpoint, Bus, BusError
 
     try:
@@ -210,7 +211,7 @@ def _run(arguments: argparse.Namespace) -> int:
         )
         return _failed(message, 2)
     try:
-        with Bus.open(arguments.connect, start_hub=True, identity=f"car.{car}") as opened:
+        with Bus.open(arguments.connect, start_hub=True, identity=identity.car(car)) as opened:
             service = CarService(opened, fleet, car)
             # The car is on the bus now. The following imports take as long again.
             import asyncio

@@ -2,7 +2,7 @@
 
 An identity is `person.mia`, `car.red` or `service.recorder`. It is the common name of a certificate, and a part of the
 keys of its commands (`keys.command_key`). The hub's rules let nobody use another's. The name of a sender in a command
-is only text, so whoever carries out a command asks `speaks_for`.
+is only text, so whoever carries out a command asks `speaks_for`, and a service `sender_for`.
 """
 
 from enum import StrEnum
@@ -32,8 +32,8 @@ class Service(StrEnum):
     SIMULATOR = "sim"
 
 
-AS_THE_USER: Final = frozenset({f"{IdentityRole.SERVICE}.{name}" for name in (Service.CONSOLE, Service.SIMULATOR)})
-"""The services that also run with the certificate of the user: the page is that person's then, and no truth is told."""
+ANONYMOUS: Final = "anonymous"
+"""The sender of a command that names none, on a hub without certificates."""
 _FORWARDED: Final = frozenset({Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE})
 """What gateways tell one another in the name of whoever told one of them."""
 
@@ -51,6 +51,14 @@ def car(name: str) -> str:
 def service(name: Service) -> str:
     """Return the identity of a service."""
     return f"{IdentityRole.SERVICE}.{name}"
+
+
+AS_THE_USER: Final = frozenset({service(Service.CONSOLE), service(Service.SIMULATOR)})
+"""The services that also run with the certificate of the user: the page is that person's then, and no truth is told."""
+
+
+class NotTheSender(Exception):
+    """A command names a sender for whom the owner of the certificate may not speak."""
 
 
 def parse(identity: str) -> tuple[IdentityRole, str] | None:
@@ -84,3 +92,14 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
             if name == Service.SUPERVISOR:
                 return verb in STOPS or verb not in COMMANDS  # and the verbs of services, such as a new plan
             return name == Service.CONSOLE and not is_coordinator
+
+
+def sender_for(identity: str, sender: str, verb: str) -> str:
+    """Return the sender of a person's command to a service: as it is named, else the owner of the certificate.
+
+    identity: empty on a hub without certificates; every name is believed there. Raises NotTheSender.
+    """
+    sender = sender or identity.partition(".")[2] or ANONYMOUS
+    if identity and not speaks_for(identity, sender, Rank.PERSON, verb):
+        raise NotTheSender(f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only.")
+    return sender

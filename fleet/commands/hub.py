@@ -22,7 +22,7 @@ from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
 from schemas.bus import Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
-from schemas.identity import IdentityRole, Service
+from schemas.identity import Service
 from schemas.printable import printable
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
@@ -89,7 +89,10 @@ def invite(
         raise click.UsageError("say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME")
     with cli_errors(), _disk_errors():
         name = keys.check_name(person or car or service or "", "car name" if car else "person")
-        invited = identity.person(name) if person else identity.car(name) if car else f"{IdentityRole.SERVICE}.{name}"
+        if service:
+            invited = identity.service(Service(service))
+        else:
+            invited = identity.car(name) if car else identity.person(name)
         endpoint = resolve_endpoint()
         store = _own_store(endpoint)
         here = host or next(iter(own_addresses()), LOOPBACK)

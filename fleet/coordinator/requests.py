@@ -8,12 +8,11 @@ from fleet.policy.requests import RequestRefused
 from schemas import keys, messages, topics
 from schemas.bus import reply_message
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.identity import speaks_for
-from schemas.words import Phase, Rank, Reason
+from schemas.identity import NotTheSender, sender_for
+from schemas.words import Phase, Reason
 
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
-_ANONYMOUS: Final = "anonymous"
 
 
 def reply_result(query: zenoh.Query, result: pb.Result) -> None:
@@ -56,11 +55,7 @@ def sender_of(query: zenoh.Query, message_type: str) -> str:
 def _proven(query: zenoh.Query, sender: str) -> str:
     """Return the sender, or the owner of the certificate if none is named. Raises RequestRefused for another's name."""
     key = str(query.key_expr)
-    identity, verb = keys.identity_of(key), key.rpartition("/")[2]
-    if not identity:
-        return sender or _ANONYMOUS
-    sender = sender or identity.partition(".")[2]
-    if not speaks_for(identity, sender, Rank.PERSON, verb):
-        words = f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only."
-        raise RequestRefused(words, Reason.NOT_ALLOWED)
-    return sender
+    try:
+        return sender_for(keys.identity_of(key), sender, key.rpartition("/")[2])
+    except NotTheSender as error:
+        raise RequestRefused(str(error), Reason.NOT_ALLOWED) from None

@@ -25,7 +25,7 @@ from schemas.bus import (
 )
 from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.identity import speaks_for
+from schemas.identity import NotTheSender, sender_for
 from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason
 
@@ -193,12 +193,11 @@ class SupervisorService:
 
 def _proven(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
     """Return the sender of a command. Raises ReloadRefused if a certificate names another one, or one who may not."""
-    sender = sender or identity.partition(".")[2] or "anonymous"
-    if not identity:
-        return sender
-    if not speaks_for(identity, sender, Rank.PERSON, verb):
-        raise ReloadRefused(f"{identity} asks in the name of {sender}. Each certificate speaks for its owner only.")
-    if words := refusal(keys.person_of(sender)):
+    try:
+        sender = sender_for(identity, sender, verb)
+    except NotTheSender as error:
+        raise ReloadRefused(str(error)) from None
+    if identity and (words := refusal(keys.person_of(sender))):
         raise ReloadRefused(words)
     return sender
 

@@ -5,7 +5,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.commands import COMMANDS, STOPS, Verb
-from schemas.identity import IdentityRole, Service, car, parse, person, service, speaks_for
+from schemas.identity import (
+    ANONYMOUS,
+    IdentityRole,
+    NotTheSender,
+    Service,
+    car,
+    parse,
+    person,
+    sender_for,
+    service,
+    speaks_for,
+)
 from schemas.words import Rank
 
 FORWARDED = {Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE}
@@ -53,3 +64,23 @@ def test_in_whose_name(verb: str) -> None:
 def test_what_is_no_identity_speaks_for_nobody(identity: str, sender: str, kind: Rank, verb: str) -> None:
     if parse(identity) is None:
         assert not speaks_for(identity, sender, kind, verb)
+
+
+@pytest.mark.parametrize(
+    ("identity", "sender", "expected"),
+    [
+        ("", "", ANONYMOUS),
+        ("", MIA, MIA),
+        (person("mia"), "", "mia"),
+        (person("mia"), MIA, MIA),
+        (service(Service.CONSOLE), MIA, MIA),
+    ],
+)
+def test_a_service_knows_who_asks(identity: str, sender: str, expected: str) -> None:
+    assert sender_for(identity, sender, "plan") == expected
+
+
+@pytest.mark.parametrize("identity", [person("eve"), car("red"), service(Service.RECORDER), "junk"])
+def test_nobody_asks_in_the_name_of_another(identity: str) -> None:
+    with pytest.raises(NotTheSender):
+        sender_for(identity, MIA, "plan")
