@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -47,9 +48,16 @@ sessions.add_command(vector)
 
 _COLUMNS: Final = ("session", "start", "state", "length", "size", "messages", "lost", "stops", "marks", "cars")
 
-out_option = click.option(
-    "-o", "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="The new session's directory."
+_new_session = partial(
+    click.option,
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="The new session's directory.",
 )
+out_option = _new_session()
+required_out_option = _new_session(required=True)
 
 
 @contextmanager
@@ -277,14 +285,7 @@ example:
 """,
 )
 @click.argument("several", nargs=-1, required=True, type=SessionPath(), metavar="SESSION SESSION...")
-@click.option(
-    "-o",
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="The new session's directory.",
-)
+@required_out_option
 def merge(several: tuple[Path, ...], out: Path) -> None:
     """Merge what several recorders of one fleet have recorded at the same time, such as on two sites.
 
@@ -312,14 +313,7 @@ examples:
 @from_option
 @to_option
 @car_option
-@click.option(
-    "-o",
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="The new session's directory.",
-)
+@required_out_option
 def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
     """Copy a part of a session into a new one."""
     from fleet.recording.tools.transform import cut as make
