@@ -64,7 +64,9 @@ def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int,
             raise NoSession(f"{session.path} has no intact message: {words or 'it is empty'}")
         if session.lacking(count) or (session.description is not None and not session.description.closed):
             words = "; ".join(filter(None, (words, session.lacking(count) or "its recorder did not close it")))
-        _describe(session, new, count, {"by": "recover", "lost": words, "missing": _missing(session, count, words)})
+        origin = {"by": "recover", "lost": words, "missing": _missing(session, count, words)}
+        _described(session, new, count, origin).write(new)
+        _copy_others(session, new)
     return count, words
 
 
@@ -112,7 +114,8 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
             raise NoSession(f"nothing of {session.path} lies there")
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
         about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
-        _describe(session, new, count, about, selection)
+        _described(session, new, count, about, selection).write(new)
+        _copy_others(session, new)
     return count
 
 
@@ -157,13 +160,12 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
         marks = sorted((mark for each in described for mark in each.marks), key=lambda mark: str(mark.get("time")))
         pins = [pin for each in described for pin in each.pins]
         about = {"by": "merge", "of": ", ".join(each.name for each in sessions), "lost": lost}
-        _describe(sessions[0], new, count, about)
-        if (made := session_dir.SessionInfo.read(new)) is not None:
-            started = min((each.started for each in described), default=made.started)
-            missing = None if lost else 0
-            origin = {**made.origin, "of": about["of"], "lost": lost, "missing": missing}
-            kept = any(each.kept for each in described)
-            replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin).write(new)
+        made = _described(sessions[0], new, count, about)
+        started = min((each.started for each in described), default=made.started)
+        origin = {**made.origin, "of": about["of"], "lost": lost, "missing": None if lost else 0}
+        kept = any(each.kept for each in described)
+        replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin).write(new)
+        _copy_others(sessions[0], new)
     return count, twice, lost
 
 
@@ -196,10 +198,10 @@ def _copy(rows: Iterable[Row], new: Path, session: Session, extras: Sequence[Ext
     return count
 
 
-def _describe(
+def _described(
     session: Session, new: Path, count: int, origin: Mapping[str, object], selection: Selection = EVERYTHING
-) -> None:
-    """Write `session.json`, and copy the other files of the old session."""
+) -> session_dir.SessionInfo:
+    """Return the description of the new session, whose segments are in `new` already."""
     first = last = None
     fleet = ""
     for index in Session(new).indexes().values():
@@ -225,7 +227,7 @@ def _describe(
     origin = {"by": origin["by"], "of": session.name, **origin}
     marks = [mark for mark in base.marks if _has(selection, mark.get("time"), mark.get("time"))]
     pins = [pin for pin in base.pins if _has(selection, pin.get("from"), pin.get("to"))]
-    replace(
+    return replace(
         base,
         marks=marks,
         kept=base.kept and (bool(marks) or not base.marks),
@@ -239,7 +241,11 @@ def _describe(
         stops=None,  # of the old session
         format=session_dir.FORMAT_VERSION,
         origin=origin,
-    ).write(new)
+    )
+
+
+def _copy_others(session: Session, new: Path) -> None:
+    """Copy the files of the old session that are neither segments nor its description."""
     if session.path.is_dir():
         for name in COPIED:
             if (session.path / name).is_file():
