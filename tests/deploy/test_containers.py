@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any, Final
@@ -57,7 +56,7 @@ def test_the_image_is_made_of_what_the_context_lets_through() -> None:
     assert all((DEPLOY.parent / name).exists() for name in copied)
 
 
-@pytest.mark.skipif(shutil.which("docker-compose") is None, reason="needs docker-compose")
+@pytest.mark.soak  # needs docker-compose
 def test_compose_takes_the_file(tmp_path: Path) -> None:
     words = ["docker-compose", "-f", str(DEPLOY / "compose.yaml"), "config", "-q"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)

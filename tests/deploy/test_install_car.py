@@ -1,7 +1,6 @@
 """Tests the script that makes a computer that of a car, without installing. tests/soak/test_install_car.py installs."""
 
 import re
-import shutil
 import subprocess
 import tomllib
 from pathlib import Path
@@ -27,7 +26,7 @@ def run(*words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(["sh", str(SCRIPT), *words], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="needs shellcheck")
+@pytest.mark.soak  # needs shellcheck
 def test_it_is_clean_for_any_posix_shell() -> None:
     done = subprocess.run(["shellcheck", "--shell=sh", str(SCRIPT)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "")

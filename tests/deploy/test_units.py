@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Final
@@ -22,8 +21,6 @@ SERVICES: Final = sorted(path.name for path in DEPLOY.glob("car-*.service"))
 PREFIX: Final = "/opt/car-fleet/bin/"
 EXPOSURE: Final = 30
 """Maximum exposure by `systemd-analyze security`, tenths."""
-
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 
 
 def settings(name: str) -> dict[str, list[str]]:
@@ -77,7 +74,7 @@ def test_all_are_locked_in_alike() -> None:
     assert [name for name in SERVICES if settings(name).get("PrivateDevices") != ["yes"]] == [GATEWAY]
 
 
-@needs_systemd
+@pytest.mark.soak  # needs systemd-analyze
 def test_systemd_takes_them_as_they_are(tmp_path: Path) -> None:
     """The tool looks whether each program exists, so the units get the path of one."""
     for path in DEPLOY.glob("car-*"):
@@ -100,7 +97,7 @@ def test_systemd_takes_them_as_they_are(tmp_path: Path) -> None:
     assert (done.returncode, ours) == (0, [])  # an unknown key only prints
 
 
-@needs_systemd
+@pytest.mark.soak  # needs systemd-analyze
 @pytest.mark.parametrize("name", SERVICES)
 def test_little_is_exposed(name: str) -> None:
     done = subprocess.run(
