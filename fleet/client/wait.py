@@ -7,12 +7,10 @@ from typing import Final
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
 from fleet.conditions import value_in
-from fleet.conditions.holding import Holding
+from fleet.conditions.holding import CLOCK_STEP_S, Holding
 from schemas import topics
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-CLOCK_STEP_S: Final = 60.0
-"""Minimum difference between stamps and arrivals that is a step of a clock, and no delay of a network."""
 
 
 class NotInTime(TimeoutError):

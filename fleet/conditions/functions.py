@@ -1,7 +1,7 @@
 """The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. One row is all that one needs.
 
 To conditions `rate(range.range_m)` is a name like any other, with the range of its row; the snapshot evaluates it. A
-message alone has no past, so `watch`, `wait` and `find` know no functions.
+message alone has no past, so `watch` and `wait` know no functions.
 """
 
 from collections.abc import Callable, Sequence

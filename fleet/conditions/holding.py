@@ -9,9 +9,12 @@ it alone, it has ended with the last reading that showed it.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from fleet.conditions.expression import Expression, Lookup
+
+CLOCK_STEP_S: Final = 60.0
+"""Minimum difference between stamps and arrivals that is a step of a clock, and no delay of a network."""
 
 
 class HeldSpan(NamedTuple):
@@ -33,6 +36,8 @@ class HeldStep(NamedTuple):
     """The condition now; None if it is not decided."""
     ended: HeldSpan | None
     """The span that has ended with this reading, or before it."""
+    has_begun: bool
+    """True if a span begins with this reading."""
 
 
 @dataclass(slots=True)
@@ -61,9 +66,9 @@ class Holding:
         value = self._value(at_ns)
         if value is not True:
             ended = self.end() or ended
-        else:
-            self.span = HeldSpan(at_ns if self.span is None else self.span.begin_ns, at_ns)
-        return HeldStep(value, ended)
+            return HeldStep(value, ended, has_begun=False)
+        begun, self.span = self.span, HeldSpan(at_ns if self.span is None else self.span.begin_ns, at_ns)
+        return HeldStep(value, ended, has_begun=begun is None)
 
     def end(self) -> HeldSpan | None:
         """End the span, and return it. The next reading that shows the condition begins another one."""

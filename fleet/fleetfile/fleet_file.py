@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from fleet.conditions import BadExpression, Expression
-from fleet.conditions.functions import FUNCTIONS
 from fleet.fleetfile.models import (
     CAPABILITIES,
     ConsoleEntry,
@@ -212,7 +211,7 @@ def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
 
 
 def _resolve_pin(pin: PinEntry) -> PinRule:
-    return PinRule(parse_condition(pin.when, FUNCTIONS), parse_duration(pin.before), parse_duration(pin.after))
+    return PinRule(parse_condition(pin.when), parse_duration(pin.before), parse_duration(pin.after))
 
 
 def _resolve_people(file: FileEntry) -> Mapping[str, FleetPerson]:
@@ -293,7 +292,7 @@ def _find_pin_faults(tree: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
         when = _as_mapping(pin).get("when")
         if isinstance(when, str):
             try:
-                condition = parse_condition(when, FUNCTIONS)
+                condition = parse_condition(when)
             except BadExpression as error:
                 yield ("pin", index, "when"), error.words
             else:

@@ -1,31 +1,72 @@
 """Conditions over the readings of one car, for `find` and the pins of recordings. Pure.
 
-The names are those of plans, and the meaning is that of `Holding`.
+The names are those of plans, and the meaning is that of `Holding`. `CarCondition` is fed live by the recorder, and from
+files by `find`.
 """
 
 from collections.abc import Collection
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final
 
 from fleet.conditions import BadExpression, Expression, parse
-from fleet.conditions.holding import Holding
+from fleet.conditions.functions import FUNCTIONS, KEPT_READINGS
+from fleet.conditions.holding import CLOCK_STEP_S, HeldSpan, HeldStep, Holding
 from fleet.conditions.satisfiability import explain_impossible
-from fleet.policy.snapshot import ALIASES, NAMES, topic_of
+from fleet.policy.snapshot import ALIASES, NAMES, topic_of, value_of
+from schemas.messages import Observation
 from schemas.topics import TOPICS
 
+_CLOCK_STEP_NS: Final = round(CLOCK_STEP_S * 1e9)
 _STALE_NS: Final = {
     topic_of(name): None if (after_s := TOPICS[topic_of(name)].stale_after_s) is None else round(after_s * 1e9)
     for name in NAMES
 }
 
 
-def parse_condition(text: str, functions: Collection[str] = ()) -> Expression:
+def parse_condition(text: str) -> Expression:
     """Return a condition over the names of plans. Raises BadExpression, also if it can never be true."""
-    expression = parse(text, NAMES, ALIASES, functions)
+    expression = parse(text, NAMES, ALIASES, FUNCTIONS)
     if never := explain_impossible(expression):
         raise BadExpression(text, 1, never)
     return expression
 
 
-def holding_of(expression: Expression) -> Holding:
-    """Return an evaluator over the readings of one car. Their sources are topics."""
-    return Holding(expression, topic_of, _STALE_NS.__getitem__)
+class CarCondition:
+    """A condition over the messages of one car. They come in the order in which they were published, by topic."""
+
+    def __init__(self, expression: Expression) -> None:
+        self._expression = expression
+        self._holding = Holding(expression, topic_of, _STALE_NS.__getitem__)
+        self._newest: dict[str, tuple[int, Observation]] = {}
+        """Time and message by topic."""
+        self.topics: Collection[str] = frozenset(map(topic_of, expression.names))
+        """The topics whose messages it takes."""
+
+    @property
+    def span(self) -> HeldSpan | None:
+        """The time for which it has held, if that has not ended."""
+        return self._holding.span
+
+    def add(self, topic: str, message: Any, at_ns: int) -> HeldStep | None:
+        """Take in a message of a topic that it takes. None: it is older than the newest one, and does not count.
+
+        at_ns: its own time. If it is older by more than CLOCK_STEP_S, somebody has set the clock back, and all begins
+        again.
+        """
+        newest_ns, before = self._newest.get(topic, (at_ns, None))
+        ended = None
+        if at_ns < newest_ns - _CLOCK_STEP_NS:
+            ended, before = self.end(), None
+            self._holding = Holding(self._expression, topic_of, _STALE_NS.__getitem__)
+            self._newest.clear()
+        elif at_ns < newest_ns:
+            return None
+        earlier = () if before is None else (*before.earlier, replace(before, earlier=()))
+        seen = Observation(message, at_ns / 1e9, earlier[1 - KEPT_READINGS :])
+        self._newest[topic] = at_ns, seen
+        step = self._holding.add(topic, lambda name: value_of(name, seen), at_ns)
+        return step._replace(ended=step.ended or ended)
+
+    def end(self) -> HeldSpan | None:
+        """End the time for which it has held, and return it."""
+        return self._holding.end()

@@ -13,6 +13,7 @@ from typing import Any, Final
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.conditions import Expression, aliases_of
+from fleet.conditions.expression import KINDS
 from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
 from gateway import drivers
 from schemas import messages, topics
@@ -29,7 +30,6 @@ class _Field:
     topic: str
     member: str
     kind: type
-    optional: bool
     function: ConditionFunction | None = None
 
     def value(self, seen: Observation) -> Any:
@@ -40,9 +40,12 @@ class _Field:
         return self._measured(seen)
 
     def _measured(self, seen: Observation) -> Any:
-        if self.optional and not seen.message.HasField(self.member):
+        # The schema may be that of a recording: another version's, or somebody else's.
+        described = seen.message.DESCRIPTOR.fields_by_name.get(self.member)
+        if described is None or (described.has_presence and not seen.message.HasField(self.member)):
             return None
-        return getattr(seen.message, self.member)
+        value = getattr(seen.message, self.member)
+        return value if KINDS.get(type(value)) is KINDS[self.kind] else None
 
 
 class _Fields(dict[str, _Field]):
@@ -67,7 +70,7 @@ def _fields() -> _Fields:
         for each in descriptors:
             if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
                 kind = kinds.get(each.cpp_type, float)
-                result[f"{name.partition('/')[2]}.{each.name}"] = _Field(name, each.name, kind, each.has_presence)
+                result[f"{name.partition('/')[2]}.{each.name}"] = _Field(name, each.name, kind)
     return result
 
 

@@ -9,76 +9,44 @@ only one if there are no others.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
-from fleet.client.wait import CLOCK_STEP_S
-from fleet.conditions.functions import KEPT_READINGS
-from fleet.conditions.holding import Holding
 from fleet.fleetfile.fleet_file import PinRule
-from fleet.policy.car_condition import holding_of
-from fleet.policy.snapshot import topic_of, value_of
+from fleet.policy.car_condition import CarCondition
+from fleet.policy.snapshot import topic_of
 from fleet.recording.pins import Pin, minute_of
 from fleet.recording.stop_count import MAX_RECENT_IDS
 from fleet.recording.tools.car_timeline import message_time_ns
 from fleet.recording.tools.stop_findings import asked_by, failed_stop_code
 from schemas import keys, messages
 from schemas.commands import STOPPING_VERBS, Verb
-from schemas.messages import Observation
 from schemas.topics import TOPICS
 from schemas.words import PinCause
 
-CLOCK_STEP_NS: Final = round(CLOCK_STEP_S * 1e9)
 _EVENTS: Final = ("event/command", "event/log")
-
-
-@dataclass(slots=True)
-class _CarConditions:
-    """The conditions over the readings of one car."""
-
-    holdings: dict[int, Holding] = field(default_factory=dict)
-    """By the number of the rule."""
-    readings: dict[str, Observation] = field(default_factory=dict)
-    """The newest by topic."""
-    times_ns: dict[str, int] = field(default_factory=dict)
-    """Their times."""
 
 
 class ConditionPins:
     """The pins of conditions, from readings that come in the order of their times; those out of order do not count."""
 
     def __init__(self, rules: Sequence[PinRule]) -> None:
-        self._rules: dict[str, list[tuple[int, PinRule]]] = {}
-        for number, rule in enumerate(rules):
-            for topic in dict.fromkeys(map(topic_of, rule.condition.names)):
-                self._rules.setdefault(topic, []).append((number, rule))
-        self._cars: dict[str, _CarConditions] = {}
-
-    @property
-    def topics(self) -> Collection[str]:
+        self._rules = rules
+        self._cars: dict[str, list[CarCondition]] = {}
+        """The conditions of the rules, by car."""
+        self.topics: Collection[str] = {topic_of(name) for rule in rules for name in rule.condition.names}
         """The topics that they use."""
-        return self._rules.keys()
 
     def add(self, car: str, topic: str, message: Any, at_ns: int, came_ns: int) -> Iterable[Pin]:
         """Take in a reading, and yield pins. at_ns: its own time; came_ns: the recorder's time that belongs to it."""
-        state = self._cars.setdefault(car, _CarConditions())
-        newest_ns = state.times_ns.get(topic, at_ns)
-        if at_ns < newest_ns - CLOCK_STEP_NS:
-            state = self._cars[car] = _CarConditions()
-        elif at_ns < newest_ns:
-            return
-        before = state.readings.get(topic)
-        earlier = () if before is None else (*before.earlier, replace(before, earlier=()))
-        seen = Observation(message, at_ns / 1e9, earlier[1 - KEPT_READINGS :])
-        state.readings[topic], state.times_ns[topic] = seen, at_ns
-        for number, rule in self._rules.get(topic, ()):
-            holding = state.holdings.get(number)
-            if holding is None:
-                holding = state.holdings[number] = holding_of(rule.condition)
-            holding.add(topic, lambda name: value_of(name, seen), at_ns)
-            if (span := holding.span) is not None:
+        if car not in self._cars:
+            self._cars[car] = [CarCondition(rule.condition) for rule in self._rules]
+        for rule, condition in zip(self._rules, self._cars[car], strict=True):
+            if topic not in condition.topics or condition.add(topic, message, at_ns) is None:
+                continue
+            if (span := condition.span) is not None:
                 begin_ns = came_ns - max(at_ns - span.begin_ns, 0) - round(rule.before_s * 1e9)
                 end_ns = came_ns + round(rule.after_s * 1e9)
                 yield Pin(begin_ns, end_ns, PinCause.CONDITION, str(rule.condition), (car,))

@@ -43,19 +43,23 @@ class Made:
         self.counts: Counter[str] = Counter()
 
     def put(self, key: str, message: Message, at_s: float) -> None:
+        """Write a message with the next number of its key, received 1 ms after this time."""
         at_ns = START_NS + int(at_s * 1e9)
+        if message.DESCRIPTOR.full_name.startswith("fleet.v1."):
+            given: Any = message
+            given.stamp.FromNanoseconds(at_ns)
+            given.car, given.seq, given.boot_id = key.split("/")[1], self.counts[key] + 1, "b"
+        self.put_as_is(key, message, at_ns, at_ns + 1_000_000)
+
+    def put_as_is(self, key: str, message: Message, publish_ns: int, log_ns: int) -> None:
         name = message.DESCRIPTOR.full_name
         if name not in self._schemas:
             self._schemas[name] = self._writer.register_schema(name, "protobuf", messages.descriptor_set(name))
         if key not in self._channels:
             self._channels[key] = self._writer.register_channel(key, "protobuf", self._schemas[name])
         self.counts[key] += 1
-        given: Any = message
-        if name.startswith("fleet.v1."):
-            given.stamp.FromNanoseconds(at_ns)
-            given.car, given.seq, given.boot_id = key.split("/")[1], self.counts[key], "b"
         payload = message.SerializeToString()
-        self._writer.add_message(self._channels[key], at_ns + 1_000_000, payload, at_ns, self.counts[key])
+        self._writer.add_message(self._channels[key], log_ns, payload, publish_ns, self.counts[key])
 
     def close(self) -> None:
         self._writer.finish()

@@ -6,6 +6,7 @@ import json
 import random
 import shutil
 import subprocess
+from collections import Counter
 from collections.abc import Iterable
 from copy import deepcopy
 from datetime import datetime
@@ -21,11 +22,14 @@ from fleet.client.reading import Reading
 from fleet.client.wait import ConditionWait
 from fleet.conditions import BadExpression
 from fleet.console import DEFAULT_PORT
+from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.car_condition import parse_condition
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SESSION_FILE
 from fleet.recording.tools.find import ConditionRun, find_in
 from fleet.recording.tools.summary import overview
+from fleet.recording.writing.pin_watch import PinWatch
+from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, Made
@@ -35,15 +39,18 @@ S = 1_000_000_000
 NEAR = "range_m < 0.3"
 
 
-def spans(condition: str, rows: Iterable[tuple[float, str, dict[str, object]]], for_s: float = 0.0) -> list[Any]:
+MESSAGES: dict[str, Any] = {"range": pb.Range, "light": pb.Light}
+
+
+def spans(condition: str, rows: Iterable[tuple[float, str, dict[str, Any]]], for_s: float = 0.0) -> list[Any]:
     run = ConditionRun(parse_condition(condition), "red", for_s)
     for at_s, topic, fields in rows:
-        run.add(f"sensor/{topic}", fields, round(at_s * S))
+        run.add(f"sensor/{topic}", MESSAGES[topic](**fields), round(at_s * S))
     return [(hit.begin_ns / S, hit.end_ns / S) for hit in run.close()]
 
 
-def distances(*rows: tuple[float, float | None]) -> list[tuple[float, str, dict[str, object]]]:
-    return [(at_s, "range", {} if value is None else {"range.range_m": value}) for at_s, value in rows]
+def distances(*rows: tuple[float, float | None]) -> list[tuple[float, str, dict[str, Any]]]:
+    return [(at_s, "range", {} if value is None else {"range_m": value}) for at_s, value in rows]
 
 
 def test_a_hit_lasts_from_its_first_reading_to_its_last() -> None:
@@ -61,17 +68,17 @@ def test_neither_a_gap_nor_what_was_not_measured_is_true() -> None:
 
 
 def test_one_known_part_decides_until_it_is_stale() -> None:
-    rows: list[tuple[float, str, dict[str, object]]] = [
-        (0.0, "light", {"light.left": True}),
+    rows: list[tuple[float, str, dict[str, Any]]] = [
+        (0.0, "light", {"left": True}),
         (1.0, "range", {}),
         (2.0, "range", {}),
         (4.0, "range", {}),
-        (5.0, "light", {"light.left": True}),
-        (6.0, "range", {"range.range_m": 1.0}),
+        (5.0, "light", {"left": True}),
+        (6.0, "range", {"range_m": 1.0}),
     ]
     assert spans("light.left or range_m < 0.3", rows) == [(0, 2), (5, 6)]
     assert spans("light.left and range_m > 0.3", rows) == [(6, 6)]
-    at_its_limit: list[tuple[float, str, dict[str, object]]] = [rows[0], (3.0, "range", {"range.range_m": 1.0})]
+    at_its_limit: list[tuple[float, str, dict[str, Any]]] = [rows[0], (3.0, "range", {"range_m": 1.0})]
     assert spans("light.left and range_m > 0.3", at_its_limit) == [(3, 3)]
 
 
@@ -93,7 +100,7 @@ def test_it_is_true_when_a_wait_ends(seed: int) -> None:
         message.stamp.FromNanoseconds(at_ns)
         reading = Reading.of("fleet/red/sensor/range", message, at_ns)
         ended = wait.ends(reading, reading.time, at_ns / S) or ended
-        run.add("sensor/range", {} if value is None else {"range.range_m": value}, at_ns)
+        run.add("sensor/range", message, at_ns)
         hits = deepcopy(run).close()
         # Both feed one evaluator: this is what it must say, in other words.
         if value != 0.1:
@@ -102,6 +109,74 @@ def test_it_is_true_when_a_wait_ends(seed: int) -> None:
             near_ns = at_ns
         expected = expected or (near_ns is not None and at_ns - near_ns >= for_s * S)
         assert bool(hits) == ended == expected
+
+
+TOPIC_OF = {pb.Range: "sensor/range", pb.Light: "sensor/light", pb.Mode: "state/mode"}
+CONDITIONS = (
+    NEAR,
+    f"not {NEAR}",
+    f"light.left and {NEAR}",
+    f"light.left or not {NEAR}",
+    "rate(range_m) < -0.1",
+    f"mode.asked == 'tracking' and {NEAR}",
+)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_live_and_from_disk_the_hits_are_the_same(seed: int, tmp_path: Path) -> None:
+    """A session with gaps, restarts, drops and a clock that is set back, seen by who listened, and found in its file.
+
+    What the recorder dropped for a while is in the file later than its number. What it dropped forever nobody saw.
+    """
+    rng = random.Random(seed)
+    expression = parse_condition(rng.choice(CONDITIONS))
+    for_s = rng.choice([0.0, 0.5, 2.0])
+    live, pins = ConditionRun(expression, "red", for_s), PinWatch([PinRule(expression, 0, 0)])
+    made = Made(tmp_path / "made.mcap", Writer)
+    waiting: list[tuple[str, Any, int]] = []
+    numbers: Counter[str] = Counter()
+    pinned: dict[int, int] = {}
+    boot, at_ns, log_ns = 1, START_NS, START_NS
+    for _ in range(rng.choice([60, 200])):
+        passed_ns = rng.choice([20, 100, 100, 500, 1000, 3000, 9000]) * 1_000_000
+        at_ns, log_ns = at_ns + passed_ns, log_ns + passed_ns
+        if not waiting and rng.random() < 0.02:  # the gateway starts again
+            boot, numbers = boot + 1, Counter()
+        if not waiting and rng.random() < 0.01:  # somebody sets the clock of its computer back
+            at_ns -= rng.randrange(300, 4000) * S
+        now: list[Any] = [
+            rng.choice([pb.Range(range_m=0.1), pb.Range(range_m=0.5), pb.Range(no_echo=True)]),
+            pb.Light(left=rng.random() < 0.7),
+        ]
+        if passed_ns >= S or len(numbers) < 3:  # gateways repeat states each second
+            now.append(pb.Mode(asked=rng.choice(["tracking", "tracking", "manual"])))
+        for message in now:
+            at_ns, log_ns = at_ns + 1_000_000, log_ns + 1_000_000
+            topic = TOPIC_OF[type(message)]
+            key = f"fleet/red/{topic}"
+            numbers[key] += 1
+            if rng.random() < 0.05:
+                continue  # nobody got it
+            message.stamp.FromNanoseconds(at_ns)
+            message.car, message.seq, message.boot_id = "red", numbers[key], f"boot-{boot}"
+            live.add(topic, message, at_ns)
+            encoding = messages.encoding_of(message.DESCRIPTOR.full_name)
+            for pin in pins.add(key, encoding, message.SerializeToString(), at_ns, at_ns):
+                pinned[pin.begin_ns] = pin.end_ns
+            waiting.append((key, message, at_ns))
+        if rng.random() < 0.9:  # else the recorder is away, and asks for it later
+            for key, message, stamp_ns in sorted(waiting, key=lambda each: each[2] < at_ns - 5_000_000):
+                made.put_as_is(key, message, stamp_ns, log_ns)
+            waiting.clear()
+    for key, message, stamp_ns in waiting:
+        made.put_as_is(key, message, stamp_ns, log_ns)
+    made.close()
+    hits = live.close()
+    assert find_in(Session(tmp_path / "made.mcap"), expression, ["red"], for_s) == sorted(
+        hits, key=lambda hit: hit.begin_ns
+    )
+    if not for_s:
+        assert {hit.begin_ns: hit.end_ns for hit in hits} == pinned
 
 
 @pytest.mark.parametrize("text", ["rang_m < 1", "range_m <", "range_m < 'a'", "left", "range_m < 0", "hold.by == 'x'"])

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from fleet.conditions.functions import FUNCTIONS
 from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.car_condition import parse_condition
 from fleet.recording.pins import MAX_PINS, Pin, PinList, minute_of, pins_of
@@ -17,7 +16,7 @@ START_NS = 1_790_000_000 * S
 
 
 def watch(*conditions: str) -> PinWatch:
-    return PinWatch([PinRule(parse_condition(each, FUNCTIONS), 10, 20) for each in conditions])
+    return PinWatch([PinRule(parse_condition(each), 10, 20) for each in conditions])
 
 
 def put(

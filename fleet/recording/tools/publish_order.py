@@ -1,0 +1,71 @@
+"""Puts recorded messages into the order in which they were published. Pure.
+
+The order in the file is that of receiving: a recorder that was away gets later from the publishers what it has missed.
+Stamps alone do not tell the order, either: if somebody sets the clock of a computer back by an hour, two hours have the
+same stamps. But each publisher numbers its messages. Where the numbers go on and the stamps go back, the clock was set.
+
+Such a step is seen by each key at its next message. So a step is known to lie between two times of receiving, and the
+fewest steps that explain all keys are those that happened. Between two steps the stamps tell the order. Nothing
+tells to which side of a step a message belongs if its key was silent for longer than the clock was set back, or if the
+recorder was away.
+"""
+
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, Generic, TypeVar
+
+from fleet.conditions.holding import CLOCK_STEP_S
+
+_CLOCK_STEP_NS: Final = round(CLOCK_STEP_S * 1e9)
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedMessage(Generic[Item]):
+    """A recorded message. Times: ns since the epoch."""
+
+    log_ns: int
+    """When it was received."""
+    at_ns: int
+    """Its stamp."""
+    stream: tuple[str, str]
+    """Its key, and the start of its publisher that numbered it."""
+    number: int
+    item: Item
+
+
+def as_published(messages: Iterable[RecordedMessage[Item]]) -> list[RecordedMessage[Item]]:
+    """Return the messages of one computer in the order in which they were published."""
+    streams: defaultdict[tuple[str, str], list[RecordedMessage[Item]]] = defaultdict(list)
+    for each in messages:
+        streams[each.stream].append(each)
+    keys: defaultdict[str, list[tuple[int, RecordedMessage[Item]]]] = defaultdict(list)
+    for (key, _), stream in streams.items():
+        stream.sort(key=lambda each: each.number)
+        keys[key] += zip(_received_at_latest(stream), stream, strict=True)
+    bounds = [bound for key in keys.values() for bound in _steps_between(sorted(key, key=lambda each: each[0]))]
+    steps: list[int] = []
+    for first_ns, last_ns in sorted(bounds, key=lambda bound: bound[1]):
+        if not steps or steps[-1] <= first_ns:
+            steps.append(last_ns)
+    every = [(bisect_right(steps, latest_ns), each) for key in keys.values() for latest_ns, each in key]
+    return [each for _, each in sorted(every, key=lambda one: (one[0], one[1].at_ns))]
+
+
+def _received_at_latest(stream: list[RecordedMessage[Item]]) -> list[int]:
+    """Return when each message, or one of a higher number, was first received. `stream`: sorted by number."""
+    found, latest_ns = [], stream[-1].log_ns
+    for each in reversed(stream):
+        latest_ns = min(latest_ns, each.log_ns)
+        found.append(latest_ns)
+    return found[::-1]
+
+
+def _steps_between(key: list[tuple[int, RecordedMessage[Item]]]) -> Iterable[tuple[int, int]]:
+    """Yield the times of receiving between which the clock was set back. `key`: messages in the order of publishing."""
+    for (before_ns, before), (latest_ns, each) in pairwise(key):
+        if each.at_ns < before.at_ns - _CLOCK_STEP_NS:
+            yield before_ns, latest_ns
