@@ -7,9 +7,10 @@ import os
 import shutil
 import sys
 import time
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain, islice
+from itertools import chain, islice, repeat
 from typing import Any, Final, TypeVar
 
 import click
@@ -24,7 +25,7 @@ from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
-_CSV_ROWS_AT_ONCE: Final = 1024
+_ROWS_AT_ONCE: Final = 1024
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -73,10 +74,28 @@ def show_table(
         click.echo(f"{dot}{cells.rstrip()}")
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return one line for each row, with aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+def aligned(rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield one line for each row, with aligned columns.
+
+    It looks at a block of rows at a time: a million rows would not fit into memory. A later block widens a column if it
+    must, and narrows none.
+    """
+    left = iter(rows)
+    widths: Iterable[int] = repeat(0)
+    while block := list(islice(left, _ROWS_AT_ONCE)):
+        columns = zip(*block, strict=True)
+        widths = [max(width, *map(_width, column)) for width, column in zip(widths, columns, strict=False)]
+        for row in block:
+            cells = zip(row, widths, strict=True)
+            yield "  ".join(cell + " " * (width - _width(cell)) for cell, width in cells).rstrip()
+
+
+def _width(text: str) -> int:
+    """Return the number of columns of a terminal that a text takes. Chinese characters and emoji take two."""
+    if text.isascii():
+        return len(text)
+    wide = sum(unicodedata.east_asian_width(each) in "WF" for each in text)
+    return len(text) + wide - sum(unicodedata.combining(each) > 0 for each in text)
 
 
 def echo_safely(text: str, *, err: bool = False) -> None:
@@ -91,7 +110,7 @@ def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """
     on_terminal = sys.stdout.isatty()
     left = chain((header,), rows)
-    while block := [["" if cell is None else cell for cell in row] for row in islice(left, _CSV_ROWS_AT_ONCE)]:
+    while block := [["" if cell is None else cell for cell in row] for row in islice(left, _ROWS_AT_ONCE)]:
         lines = io.StringIO(newline="")
         csv.writer(lines, lineterminator="\n" if on_terminal else "\r\n").writerows(block)
         text = lines.getvalue()

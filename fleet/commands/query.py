@@ -4,7 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,15 +87,13 @@ def _write(header: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, as_csv: 
     elif as_csv:
         echo_csv(header, ([_cell(cell) for cell in row] for row in rows))
     else:
-        titles, left = tuple(printable(name, MAX_CELL) for name in header), iter(rows)
-        shown = [tuple(_short(cell) for cell in row) for row in islice(left, ROWS_AT_ONCE)]
-        if not shown:
+        left = iter(rows)
+        if (first := next(left, None)) is None:
             click.echo("No rows.", err=True)
-        for line in aligned([titles, *shown]) if shown else ():
+            return
+        titles = tuple(printable(name, MAX_CELL) for name in header)
+        for line in aligned(chain((titles,), (tuple(map(_short, row)) for row in chain((first,), left)))):
             echo_safely(line)
-        while shown := [tuple(_short(cell) for cell in row) for row in islice(left, ROWS_AT_ONCE)]:
-            for line in aligned(shown):
-                echo_safely(line)
 
 
 def _short(cell: Any) -> str:
