@@ -47,8 +47,15 @@ def hub() -> None:
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub init\n  fleet hub init --car red")
 @click.option("--car", "cars", multiple=True, metavar="CAR", help="Also for this car, whose gateway runs here.")
+@click.option(
+    "--service",
+    "services",
+    multiple=True,
+    type=click.Choice([each.value for each in Service]),
+    help="Take this service back, which another computer was invited for.",
+)
 @click.option("--local", is_flag=True, help="Listen on loopback only, as `fleet up --secure` does.")
-def init(cars: tuple[str, ...], *, local: bool) -> None:
+def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> None:
     """Make this computer the hub that other computers may join.
 
     It gets an authority, and a certificate for you and for each service; `fleet up` adds those of its cars. It listens
@@ -56,11 +63,11 @@ def init(cars: tuple[str, ...], *, local: bool) -> None:
     up --secure` does the same, and listens on loopback only.
     """
     with cli_errors(), _disk_errors():
-        names = [keys.check_name(each) for each in cars]
+        take = [*map(identity.car, map(keys.check_name, cars)), *map(identity.service, map(Service, services))]
         endpoint = resolve_endpoint()
         endpoint = endpoint if is_secure(endpoint) else local_hub.SECURE_ENDPOINT
         listens = endpoint if local else local_hub.everywhere(endpoint)
-        store = local_hub.ensure_hub_here(endpoint, take=names, listens=(listens,))
+        store = local_hub.ensure_hub_here(endpoint, take=take, listens=(listens,))
     name = store.credentials.me.partition(".")[2]
     click.echo(
         f"This computer is a hub now, and you are {name} there. Its authority is in {store.directory}: keep a copy of "

@@ -41,15 +41,15 @@ def ensure_hub_here(
 ) -> HubStore:
     """Make this computer the hub at `endpoint`, or bring its certificates up to date. Raises BusError, OSError.
 
-    cars: those whose gateways run on this computer, unless another computer has their certificates. take: those whose
-    gateways run here from now on.
+    cars: those whose gateways run on this computer, unless another computer has their certificates. take: identities
+    that are at home here from now on.
     """
     store = HubStore.of(endpoint)
     name = identity.parse(store.credentials.me)
     me = store.credentials.me if name is not None else identity.person(local_person())
     wanted = [*map(identity.car, cars), *map(identity.service, Service)]
     addresses = (*own_addresses(), *own_names())
-    store.ensure(wanted, me, addresses=addresses, listens=listens, take=[*map(identity.car, take)])
+    store.ensure(wanted, me, addresses=addresses, listens=listens, take=take)
     use(endpoint)
     return store
 
@@ -72,7 +72,10 @@ def use(endpoint: str) -> None:
 
 
 def store_joined(host: str, joined: Joined) -> str:
-    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined."""
+    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined.
+
+    A computer may join once more, for a car or a service: its user stays the person who has joined.
+    """
     endpoint = f"tls/{host}:{joined.port}"
     if is_hub_here(endpoint):
         raise NotJoined(f"this computer is the hub at {endpoint}: its user is {Credentials.of(endpoint).me}")
@@ -83,12 +86,18 @@ def store_joined(host: str, joined: Joined) -> str:
         CA_FILE: joined.ca,
         f"{joined.identity}.key": joined.key,
         f"{joined.identity}.pem": joined.certificate,
-        ME_FILE: joined.identity.encode(),
     }
+    if _is_person(joined.identity) or not _is_person(Credentials.of(endpoint).me):
+        files[ME_FILE] = joined.identity.encode()
     for name, data in files.items():
         write_atomically(directory / name, data, sync=True, private=True)
     use(endpoint)
     return endpoint
+
+
+def _is_person(name: str) -> bool:
+    known = identity.parse(name)
+    return known is not None and known[0] is identity.IdentityRole.PERSON
 
 
 def leave() -> tuple[str, Path | None]:

@@ -40,7 +40,7 @@ class NetworkStage:
 
     def __init__(self, made: Machines) -> None:
         self.made = made
-        self.hub = made.make_hub()
+        self.hub = made.make_hub("red")
         made.join(PI, "--car", "blue")
         made.join(OPERATOR, "mia")
         self.sims: dict[str, GatewayProcess] = {}

@@ -14,11 +14,17 @@ from typing import Any
 import psutil
 
 from fleet.hub.local_hub import SECURE_ENDPOINT
+from tests.support import bad_link
 from tests.support.processes import GatewayProcess, wait_for
 
 HUB, PI, OPERATOR = "fleet-hub", "fleet-pi", "fleet-operator"
+WIRE = "fleet-wire"
+"""Where the links lose and delay."""
 SUBNETS = {PI: "10.77.1", OPERATOR: "10.77.2"}
 _EXEC = "import os, sys; os.execvp('ip', ['ip', 'netns', 'exec', sys.argv[1], sys.executable, *sys.argv[2:]])"
+
+
+_WITHOUT_OFFLOADS = "import sys; from tests.support.bad_link import without_offloads; without_offloads(sys.argv[1])"
 
 
 def _ip(*words: str) -> None:
@@ -27,21 +33,29 @@ def _ip(*words: str) -> None:
 
 
 class Machines:
-    """The three machines. `close` ends their processes and removes them."""
+    """The three machines. `close` ends their processes and removes them.
 
-    def __init__(self, directory: Path) -> None:
+    loss: share of the frames that each link loses, each way. delay_s: time that each link takes, each way, s.
+    """
+
+    def __init__(self, directory: Path, loss: float = 0.0, delay_s: float = 0.0) -> None:
         self.directory = directory
         self._started: list[GatewayProcess] = []
-        for name in (HUB, PI, OPERATOR):
+        for name in (HUB, PI, OPERATOR, WIRE):
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
             _ip("netns", "add", name)
             _ip("-n", name, "link", "set", "lo", "up")
         for number, (name, subnet) in enumerate(SUBNETS.items()):
-            here, there = f"fleet{number}a", f"fleet{number}b"
-            _ip("-n", HUB, "link", "add", here, "type", "veth", "peer", "name", there, "netns", name)
-            for place, device, address in ((HUB, here, f"{subnet}.1"), (name, there, f"{subnet}.2")):
+            ends = [(HUB, f"fleet{number}a", f"{subnet}.1"), (name, f"fleet{number}b", f"{subnet}.2")]
+            for place, device, address in ends:
+                _ip("-n", WIRE, "link", "add", f"{device}w", "type", "veth", "peer", "name", device, "netns", place)
                 _ip("-n", place, "addr", "add", f"{address}/24", "dev", device)
-                _ip("-n", place, "link", "set", device, "up")
+                for where, which in ((place, device), (WIRE, f"{device}w")):
+                    _ip("-n", where, "link", "set", which, "up")
+                off = self.start(place, "-c", _WITHOUT_OFFLOADS, device)
+                assert off.wait() == 0, off.stderr
+            wires = [f"{device}w" for _, device, _ in ends]
+            self.start(WIRE, bad_link.__file__, *wires, str(loss), str(delay_s), str(number)).line()
         self._devices = dict(zip(SUBNETS, ("fleet0a", "fleet1a"), strict=True))
 
     def start(self, machine: str, *arguments: str, **environment: str) -> GatewayProcess:
@@ -57,9 +71,10 @@ class Machines:
         code = process.wait()
         return code, process.lines(), process.stderr
 
-    def make_hub(self) -> GatewayProcess:
-        """Make the hub's machine the hub, and start it."""
-        code, _, words = self.run(HUB, "hub", "init", "--car", "red", FLEET_AS="ann")
+    def make_hub(self, *cars: str) -> GatewayProcess:
+        """Make the hub's machine the hub, also for these cars, and start it."""
+        options = [word for car in cars for word in ("--car", car)]
+        code, _, words = self.run(HUB, "hub", "init", *options, FLEET_AS="ann")
         assert code == 0, words
         hub = self.start(HUB, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
         wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the hub is up")
@@ -97,7 +112,7 @@ class Machines:
             if process.popen.poll() is None:
                 process.popen.kill()
             process.wait()
-        for name in (HUB, PI, OPERATOR):
+        for name in (HUB, PI, OPERATOR, WIRE):
             listed = subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True, check=False)
             for pid in listed.stdout.split():
                 subprocess.run(["kill", "-9", pid], check=False)
@@ -105,9 +120,9 @@ class Machines:
 
 
 @contextlib.contextmanager
-def machines(directory: Path) -> Iterator[Machines]:
+def machines(directory: Path, loss: float = 0.0, delay_s: float = 0.0) -> Iterator[Machines]:
     """Yield three machines, and remove them afterwards."""
-    made = Machines(directory)
+    made = Machines(directory, loss, delay_s)
     try:
         yield made
     finally:

@@ -8,7 +8,7 @@ numbers, and when it continues an interrupted session.
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 import zenoh
@@ -22,6 +22,8 @@ QUERY_AFTER_START_S: Final = (1.0,)
 QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 """Delays of the queries after a reconnect: others retry within half a second, and a loaded machine delays them."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
+GAP_MARGIN_S: Final = 1.0
+"""Time that the network may have taken for the last message before a gap."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
 MAX_SINGLE_KEYS: Final = 16
@@ -38,7 +40,8 @@ class Backfill:
         # Clients that send command streams have no cache.
         self._all = tuple(expression for expression in expressions if "@cmd" not in expression)
         self._lock = threading.Lock()
-        self._gaps: set[str] = set()
+        self._gaps: dict[str, float] = {}
+        """Keys with the time from which messages are missing, s, monotonic."""
         self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recall")
@@ -57,10 +60,15 @@ class Backfill:
         self._closing.set()
         self._thread.join()
 
-    def request(self, keys: Collection[str]) -> None:
-        """Request a backfill of these keys."""
+    def request(self, keys: Mapping[str, float]) -> None:
+        """Request a backfill of these keys. Values: age of the last message before the gap, s.
+
+        A car may have been cut off for long. Its gateway goes on, and others hear it again only after that.
+        """
+        now = time.monotonic()
         with self._lock:
-            self._gaps.update(keys)
+            for key, age_s in keys.items():
+                self._gaps[key] = min(now - age_s, self._gaps.get(key, now))
 
     def take_answers(self) -> list[zenoh.Sample]:
         """Return the answers since the last call. Some may be recorded already."""
@@ -75,9 +83,9 @@ class Backfill:
         while not self._closing.wait(BACKFILL_POLL_INTERVAL_S):
             now, connected = time.monotonic(), self._bus.hubs
             with self._lock:
-                gaps, self._gaps = self._gaps, set()
+                gaps, self._gaps = self._gaps, {}
             if gaps:
-                self._plan(QUERY_AFTER_GAP_S, polls[0], gaps)
+                self._plan(QUERY_AFTER_GAP_S, min([polls[0], *gaps.values()]) - GAP_MARGIN_S, gaps)
             if connected and connected != hubs:
                 self._plan(QUERY_AFTER_RECONNECT_S, connected_since, None)
             hubs = connected
@@ -92,17 +100,17 @@ class Backfill:
         with self._lock:
             gaps = self._gaps
         if gaps or self._due:
-            self._plan((), polls[0], gaps or None)
+            self._plan((), min([polls[0], *gaps.values()]) - GAP_MARGIN_S, gaps or None)
             self._query()
 
-    def _plan(self, after: Sequence[float], since: float, keys: set[str] | None) -> None:
+    def _plan(self, after: Sequence[float], since: float, keys: Collection[str] | None) -> None:
         now = time.monotonic()
         self._missing_since = min(self._missing_since, since) if self._due else since
         self._due = sorted([*self._due, *(now + each for each in after)])
         if keys is None:
             self._query_all = True
         else:
-            self._keys |= keys
+            self._keys.update(keys)
 
     def _query(self) -> None:
         last_s = time.monotonic() - self._missing_since

@@ -312,7 +312,8 @@ class Recorder:
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
             if self._session.gaps and has_room:  # a writer that is behind would only fall behind further
-                self._backfill.request(self._session.gaps)
+                now_ns = self._now()
+                self._backfill.request({key: (now_ns - before) / 1e9 for key, before in self._session.gaps.items()})
                 self._session.gaps.clear()
         # Only now: messages count against the limit until they are written.
         with self._lock:

@@ -17,7 +17,7 @@ _EVENT_CLASS: Final = messages.message_class(EVENTS.message)
 class KeyState:
     """Counters of one key and encoding in one segment."""
 
-    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "tracker")
+    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "seen_ns", "tracker")
 
     def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
         self.key = key
@@ -25,6 +25,8 @@ class KeyState:
         self.tracker = tracker
         self.channel = channel
         self.count = self.first = self.final = 0
+        self.seen_ns = 0
+        """When its newest message was received, also in an earlier segment; 0: none was."""
         self.has_events = messages.name_in(str(encoding)) == EVENTS.message
         """True for the events of commands, in which stops are counted."""
 

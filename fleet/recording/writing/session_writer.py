@@ -81,8 +81,9 @@ class SessionWriter:
         self._trackers: dict[str, SequenceTracker] = {}
         self._irregular_keys: set[str] = set()
         """Keys whose sequence numbers were not always consecutive."""
-        self.gaps: set[str] = set()
-        """Keys with new gaps. The recorder requests a backfill and clears them."""
+        self.gaps: dict[str, int] = {}
+        """Keys with new gaps, each with the time of the last message before, 0 if there was none. The recorder requests
+        a backfill and clears them."""
         self._drops: dict[str, int] = {}
         """Messages by key that a full disk cost, or a full queue if they had no number."""
         self._overflows: dict[str, int] = {}
@@ -137,7 +138,8 @@ class SessionWriter:
                     return
                 self._irregular_keys.add(key)
                 if state.tracker.has_gaps:
-                    self.gaps.add(key)
+                    self.gaps.setdefault(key, state.seen_ns)
+        state.seen_ns = received_ns
         self._unflushed.append((state, received_ns, payload, published_ns, sequence))
         if self.full:
             self._limit_buffer()
@@ -462,7 +464,7 @@ class SessionWriter:
         self._overflows[key] = self._overflows.get(key, 0) + count
         self._irregular_keys.add(key)
         if tracker.has_gaps:
-            self.gaps.add(key)
+            self.gaps.setdefault(key, self._states[key].seen_ns if key in self._states else 0)
 
     def _drop_buffered(self) -> int:
         """Drop the buffer, and return the number of its messages."""

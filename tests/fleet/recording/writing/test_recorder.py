@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections import Counter
+from contextlib import closing
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
+from fleet.recording.writing.backfill import BACKFILL_POLL_INTERVAL_S, LEASE_POLLS
 from fleet.recording.writing.recorder import AnotherRecorder, Recorder
 from schemas import keys, messages
 from schemas.bus import Bus, Sample, router_config
@@ -22,6 +24,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.fleet.recording.conftest import heard, publisher, wait_for
 from tests.support.ports import free_endpoint
+from tests.support.tap import Tap
 
 
 def stock(segment: Path) -> list[Any]:
@@ -138,6 +141,29 @@ def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
     assert not outcome.drops
     assert json.loads(metadata(session / "0001.mcap")["recording"]["missed"]) == {key: 2}
     assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
+
+
+def test_what_a_car_said_while_it_was_cut_off_is_had_when_it_is_back(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    """The recorder stays connected, so it hears of the gap only after it, with the next message of the car."""
+    tap = Tap(endpoint.replace("tcp/", "tcp://"))
+    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+        recorder = Recorder(own, "fleet", tmp_path)
+        session = recorder.start()
+        ranges = publisher(car, "red", "sensor/range")
+        ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        heard(car._session)
+        tap.reset()
+        wait_for(lambda: not car.hubs, "the car is cut off")
+        for _ in range(20):
+            ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        time.sleep(2 * LEASE_POLLS * BACKFILL_POLL_INTERVAL_S)  # not a wait: how long it is cut off
+        tap.accept()
+        wait_for(lambda: car.hubs, "the car is back")
+        ranges.put(pb.Range(range_m=3.0), time.time_ns())
+        heard(car._session)
+        outcome = recorder.close()
+    assert outcome.missed == {}
+    assert Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))["fleet/red/sensor/range"] == 22
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])

@@ -1,0 +1,44 @@
+"""What a computer stores that is a hub or joins one: for its user, a car, a service."""
+
+import pytest
+
+from fleet.hub.hub_store import HubStore
+from fleet.hub.invitation import Joined
+from fleet.hub.local_hub import SECURE_ENDPOINT, store_joined
+from schemas.bus import Credentials
+from schemas.identity import Service, service
+from tests.support import in_process
+
+
+@pytest.mark.parametrize(
+    ("joins", "user"),
+    [
+        (["person.mia", "car.red", "service.recorder"], "person.mia"),
+        (["car.red", "person.mia"], "person.mia"),
+        (["person.mia", "person.eve"], "person.eve"),
+        (["car.red", "car.blue"], "car.blue"),
+    ],
+)
+def test_a_computers_user_is_the_person_who_joined_last(
+    joins: list[str], user: str, monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    for identity in joins:
+        endpoint = store_joined("192.0.2.1", Joined(identity, 7447, b"ca", b"certificate", b"key", ""))
+    credentials = Credentials.of(endpoint)
+    assert credentials.me == user
+    assert [credentials.identity(each) for each in joins] == joins
+
+
+def test_a_service_that_another_computer_was_invited_for_is_taken_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    recorder = service(Service.RECORDER)
+    assert in_process.fleet("hub", "init", "--local").returncode == 0
+    store = HubStore.of(SECURE_ENDPOINT)
+    store.reserve(recorder)
+    refused = in_process.fleet("record", "run", "--connect", SECURE_ENDPOINT)
+    assert (refused.returncode, "fleet hub init --local --service recorder" in refused.stderr) == (1, True)
+    assert in_process.fleet("hub", "init", "--local", "--service", "recorder").returncode == 0
+    assert Credentials.of(SECURE_ENDPOINT).identity(recorder) == recorder
