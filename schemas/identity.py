@@ -20,6 +20,8 @@ class IdentityRole(StrEnum):
     CAR = "car"
     """The gateway of a car."""
     SERVICE = "service"
+    SITE = "site"
+    """The hub of another site, which is linked to this one."""
 
 
 class Service(StrEnum):
@@ -51,6 +53,11 @@ def car(name: str) -> str:
 def service(name: Service) -> str:
     """Return the identity of a service."""
     return f"{IdentityRole.SERVICE}.{name}"
+
+
+def site(name: str) -> str:
+    """Return the identity of the hub of another site."""
+    return f"{IdentityRole.SITE}.{name}"
 
 
 AS_THE_USER: Final = frozenset({service(Service.CONSOLE), service(Service.SIMULATOR)})
@@ -92,6 +99,8 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
             if name == Service.SUPERVISOR:
                 return verb in STOPS or verb not in COMMANDS  # and the verbs of services, such as a new plan
             return name == Service.CONSOLE and not is_coordinator
+        case IdentityRole.SITE:
+            return False  # it passes on what others send under their own identities
 
 
 def sender_for(identity: str, sender: str, verb: str) -> str:

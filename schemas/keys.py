@@ -15,6 +15,8 @@ SIMULATOR: Final = "@sim"
 OPERATOR: Final = "@operator"
 BY: Final = "@by"
 """Part of a command's key before the identity that the rules of the hub have checked."""
+HUB_RULES: Final = "@hub/rules"
+"""Where the first hub of several sites answers with the rules for the others."""
 REPLAY: Final = "@replay"
 """`<fleet>/@replay/<session>` is the token of a fleet that is a replay."""
 

@@ -15,7 +15,7 @@ from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
 from fleet.hub import local_hub
-from fleet.hub.addresses import own_addresses
+from fleet.hub.addresses import own_addresses, own_names
 from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
@@ -26,7 +26,6 @@ from schemas.identity import Service
 from schemas.printable import printable
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
-LOOPBACK: Final = "127.0.0.1"
 HUB_RESTART_S: Final = 2.0
 """Time in which gateways are back after a restart of the hub: half a second for it to look, and 0.5 s for a retry."""
 
@@ -76,34 +75,51 @@ def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> No
     )
 
 
-@hub.command(epilog="\b\nexamples:\n  fleet hub invite mia\n  fleet hub invite --car red")
+@hub.command(
+    epilog="""\b
+examples:
+  fleet hub invite mia
+  fleet hub invite --car red
+  fleet hub invite --site north"""
+)
 @click.argument("person", required=False)
 @click.option("--car", metavar="CAR", help="Invite a computer that runs the gateway of this car.")
 @click.option(
     "--service", type=click.Choice([each.value for each in Service]), help="Invite a computer that runs this service."
 )
+@click.option("--site", metavar="SITE", help="Invite the computer that is the hub of another site.")
 @click.option("--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen here (default: {JOIN_PORT}).")
 @click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
 @json_option
 def invite(
-    person: str | None, car: str | None, service: str | None, port: int, host: str | None, *, as_json: bool
+    person: str | None,
+    car: str | None,
+    service: str | None,
+    site: str | None,
+    port: int,
+    host: str | None,
+    *,
+    as_json: bool,
 ) -> None:
     """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
 
     The hub restarts first, since it gets another rule: drives may end, modes go on, and all are back after a second.
     """
-    if [person, car, service].count(None) != 2:
-        raise click.UsageError("say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME")
+    if [person, car, service, site].count(None) != 3:
+        raise click.UsageError(
+            "say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME, or --site NAME"
+        )
     with cli_errors(), _disk_errors():
-        name = keys.check_name(person or car or service or "", "car name" if car else "person")
+        what = "car name" if car else "site" if site else "person"
+        name = keys.check_name(person or car or service or site or "", what)
         if service:
             invited = identity.service(Service(service))
         else:
-            invited = identity.car(name) if car else identity.person(name)
+            invited = identity.car(name) if car else identity.site(name) if site else identity.person(name)
         endpoint = resolve_endpoint()
         store = _own_store(endpoint)
-        here = host or next(iter(own_addresses()), LOOPBACK)
-        if here != LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
+        here = host or next(iter(own_addresses()), local_hub.LOOPBACK)
+        if here != local_hub.LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
             raise click.ClickException("This hub listens on loopback only: `fleet hub init` opens it to the network.")
         store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed
         store.reserve(invited)
@@ -166,19 +182,40 @@ def revoke(who: str) -> None:
     click.echo(f"{who} is revoked. Its cars may still move: stop them with `fleet stop`.")
 
 
-@click.command("join", epilog="\b\nexample:\n  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ")
+@click.command(
+    "join",
+    epilog="""\b
+examples:
+  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ
+  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ --at 192.168.7.2""",
+)
 @click.argument("host")
 @click.argument("code")
-def join_hub(host: str, code: str) -> None:
+@click.option(
+    "--at",
+    "site",
+    metavar="HOST[:PORT]",
+    help="Use the hub of a site at this address. On its own computer: 127.0.0.1.",
+)
+def join_hub(host: str, code: str, site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.
 
-    From then on every program of yours uses that hub, until `fleet leave`.
+    From then on every program of yours uses that hub, until `fleet leave`. With the code of `fleet hub invite --site`,
+    this computer becomes the hub of another site, which is linked to the first one.
     """
     with cli_errors(), _disk_errors():
         parsed = JoinCode.parse(code)
-        name, port = _address(host)
-        joined = join(name, parsed, port)
-        endpoint = local_hub.store_joined(name, joined)
+        name, port = _address(host, JOIN_PORT)
+        at, at_port = _address(site, 0) if site else ("", 0)
+        joined = join(name, parsed, port, addresses=(*own_addresses(), *own_names()))
+        endpoint = local_hub.store_joined(name, joined, at, at_port)
+        if joined.rules:
+            click.echo(
+                f"This computer is the hub of {joined.identity} now, linked to {name}. `fleet up` starts it. Who uses "
+                f"it is invited on {name}, and joins with --at: on this computer, `fleet join {host} CODE --at "
+                "127.0.0.1`."
+            )
+            return
         cars = _cars_on(endpoint)
     click.echo(f"You are {joined.identity} at {endpoint} now. Cars: {', '.join(cars) or 'none is on'}.")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
@@ -197,12 +234,12 @@ def leave() -> None:
     click.echo(f"{endpoint} is no longer used{words}")
 
 
-def _address(written: str) -> tuple[str, int]:
+def _address(written: str, default: int) -> tuple[str, int]:
     """Return host and port of HOST, HOST:PORT, or an IPv6 address in brackets. Raises click.UsageError."""
     found = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]:/]+)(?::(\d{1,5}))?", written)
     if found is None or not 0 < int(found[2] or JOIN_PORT) < 65536:
         raise click.UsageError(f"{printable(written)} is not allowed: write HOST, HOST:PORT or [IPV6]:PORT")
-    return found[1], int(found[2] or JOIN_PORT)
+    return found[1], int(found[2] or default)
 
 
 def _cars_on(endpoint: str) -> list[str]:

@@ -1,7 +1,7 @@
 """The certificate authority of a hub: one key, and the certificates that it signs.
 
-Keys are on the curve P-256. A certificate names one identity. Only the certificate of the hub may be that of a server,
-so nobody who has joined can be the hub for others.
+Keys are on the curve P-256. A certificate names one identity. Only the certificates of hubs may be those of servers, so
+nobody else who has joined can be the hub for others.
 """
 
 import hashlib
@@ -21,6 +21,9 @@ from fleet.hub.x509_parts import LIFETIME, builder, common_name, end_entity, key
 CA_LIFETIME: Final = timedelta(days=3650)
 RENEWAL_BEFORE: Final = LIFETIME / 3
 """Time before its end from which a certificate is renewed."""
+
+
+_SERVER: Final = ExtendedKeyUsageOID.SERVER_AUTH
 
 
 class BadRequestForCertificate(ValueError):
@@ -54,10 +57,11 @@ def new_request(name: str) -> tuple[bytes, bytes]:
     return private_pem(key), request.public_bytes(serialization.Encoding.PEM)
 
 
-def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime) -> bytes:
+def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
     """Return the certificate of an identity for the key of a request. Raises BadRequestForCertificate.
 
-    The name in the request does not count: whoever asks does not choose who it is.
+    The name in the request does not count: whoever asks does not choose who it is. With `addresses`, it is that of the
+    hub of another site.
     """
     try:
         asked = x509.load_pem_x509_csr(request)
@@ -66,15 +70,21 @@ def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime) -
     key = asked.public_key()
     if not asked.is_signature_valid or not isinstance(key, ec.EllipticCurvePublicKey):
         raise BadRequestForCertificate("the request is not signed with its own key, or the key is not on a curve")
-    return _signed(authority, key, name, now, ExtendedKeyUsageOID.CLIENT_AUTH)
+    names, usages = tuple(addresses), [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if names:
+        usages.append(_SERVER)
+    try:
+        return _signed(authority, key, name, now, usages, names)
+    except ValueError:
+        raise BadRequestForCertificate("these are no names of a computer") from None
 
 
 def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str] = ()) -> KeyPair:
     """Return a new key and its certificate. With `addresses`, IP addresses and host names, it is that of the hub."""
     key = new_key()
     names = tuple(addresses)
-    usage = ExtendedKeyUsageOID.SERVER_AUTH if names else ExtendedKeyUsageOID.CLIENT_AUTH
-    return KeyPair(_signed(authority, key.public_key(), name, now, usage, names), private_pem(key))
+    usage = _SERVER if names else ExtendedKeyUsageOID.CLIENT_AUTH
+    return KeyPair(_signed(authority, key.public_key(), name, now, (usage,), names), private_pem(key))
 
 
 def is_due(certificate: bytes, now: datetime, addresses: Iterable[str] = ()) -> bool:
@@ -121,9 +131,14 @@ def fingerprint(certificate: bytes) -> bytes:
 
 
 def _signed(
-    authority: KeyPair, key: Any, name: str, now: datetime, usage: x509.ObjectIdentifier, names: tuple[str, ...] = ()
+    authority: KeyPair,
+    key: Any,
+    name: str,
+    now: datetime,
+    usages: Iterable[x509.ObjectIdentifier],
+    names: tuple[str, ...] = (),
 ) -> bytes:
     ca_key: Any = serialization.load_pem_private_key(authority.key, None)
     ca = x509.load_pem_x509_certificate(authority.certificate)
     begun = builder(common_name(name), ca.subject, key, now)
-    return pem(end_entity(begun, usage, names).sign(ca_key, hashes.SHA256()))
+    return pem(end_entity(begun, usages, names).sign(ca_key, hashes.SHA256()))

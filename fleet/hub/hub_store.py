@@ -20,7 +20,7 @@ from fleet.hub.rules import access_control
 from fleet.hub.x509_parts import LIFETIME
 from schemas.atomic_file import write_atomically
 from schemas.bus import BusError, Credentials, NoCredentials
-from schemas.bus.credentials import CA_FILE, HUB, HUB_FILE, ME_FILE
+from schemas.bus.credentials import ACCESS_CONTROL, CA_FILE, HUB, HUB_FILE, LISTEN, ME_FILE, OF_SITES
 from schemas.identity import parse
 from schemas.process.file_lock import FileLock
 
@@ -160,8 +160,8 @@ class HubStore:
             self._forget_local(identity)
             self._save()
 
-    def sign(self, request: bytes, identity: str, now: datetime) -> bytes:
-        """Return the certificate of a reserved identity, PEM.
+    def sign(self, request: bytes, identity: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
+        """Return the certificate of a reserved identity, PEM. addresses: of the computer, if it is to be a hub.
 
         Raises BadRequestForCertificate, also if the identity was revoked or invited again meanwhile, and OSError.
         """
@@ -170,7 +170,9 @@ class HubStore:
             entry = self.known.get(identity)
             if entry is None or entry.revoked or entry.generation != reserved.generation:
                 raise BadRequestForCertificate(f"{identity} was revoked, or invited again, meanwhile")
-            certificate = authority.sign_request(self._authority(), request, entry.common_name(identity), now)
+            certificate = authority.sign_request(
+                self._authority(), request, entry.common_name(identity), now, addresses
+            )
             entry.until = _until(now)
             self._save()
         return certificate
@@ -224,7 +226,12 @@ class HubStore:
             with suppress(NoCredentials):  # there is none yet, or it is damaged: loopback then
                 chosen = self.credentials.listens
         allowed = [(name, each.common_name(name)) for name, each in self.known.items() if not each.revoked]
-        made = json.dumps({"listen": chosen, "access_control": access_control(sorted(allowed))}, indent=1).encode()
+        settings = {
+            LISTEN: chosen,
+            ACCESS_CONTROL: access_control(sorted(allowed)),
+            OF_SITES: access_control(sorted(allowed), first_hub=HUB),
+        }
+        made = json.dumps(settings, indent=1).encode()
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
 

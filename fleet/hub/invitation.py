@@ -10,8 +10,8 @@ import json
 import ssl
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
@@ -21,14 +21,15 @@ from fleet.hub.authority import BadRequestForCertificate
 from fleet.hub.hub_store import HubStore
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
 from schemas.bus import BusError
-from schemas.bus.credentials import CA_FILE, HUB
-from schemas.identity import parse
+from schemas.bus.credentials import CA_FILE, HUB, OF_SITES
+from schemas.identity import IdentityRole, parse
 from schemas.printable import printable
 
 JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
 _MAX_DISCARDED_BYTES: Final = 4 * MAX_JOIN_REQUEST_BYTES
 """Of a request that is too long: more of it is left unread, and the answer may be lost then."""
+MAX_HUB_NAMES: Final = 32
 SOCKET_TIMEOUT_S: Final = 10.0
 """Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
 
@@ -48,6 +49,8 @@ class Joined:
     certificate: bytes
     key: bytes
     fleet_file: str = ""
+    rules: Mapping[str, Any] = field(default_factory=dict)
+    """The rules for the hub of another site; empty for all others."""
 
 
 class Invitation:
@@ -101,8 +104,9 @@ class Invitation:
         self._server.server_close()
         self._thread.join()
 
-    def _take(self, guess: str, request: bytes, source: str) -> tuple[int, dict[str, Any]]:
-        """Return the answer to a request to join: HTTP status and fields."""
+    def _take(self, guess: str, request: bytes, addresses: list[str], source: str) -> tuple[int, dict[str, Any]]:
+        """Return the answer to a request to join: HTTP status and fields. addresses: of the computer that asks."""
+        is_site = parse(self._identity) is not None and self._identity.startswith(f"{IdentityRole.SITE}.")
         with self._lock:
             if self._over.is_set():
                 return 410, {"error": "this code is used or over: `fleet hub invite` makes another one"}
@@ -112,14 +116,17 @@ class Invitation:
                     self._over.set()
                 return 403, {"error": "the code is wrong"}
             try:
-                certificate = self._store.sign(request, self._identity, datetime.now(UTC))
+                names = ("localhost", "127.0.0.1", *addresses) if is_site else ()
+                certificate = self._store.sign(request, self._identity, datetime.now(UTC), names)
+                rules = self._store.credentials.hub_settings()[OF_SITES] if is_site else {}
             except BadRequestForCertificate as error:
                 return 400, {"error": str(error)}
             except OSError as error:
                 return 500, {"error": f"the hub cannot store it: {error.strerror or error}"}
             self.joined_from = source
             self._over.set()
-            return 200, {**self._answer, "certificate": certificate.decode(), "ca": self._ca.decode()}
+            own = {"certificate": certificate.decode(), "ca": self._ca.decode(), "rules": rules}
+            return 200, {**self._answer, **own}
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         invitation = self
@@ -141,10 +148,11 @@ class Invitation:
                         return
                     asked = json.loads(self.rfile.read(length))
                     guess, request = str(asked["secret"]), base64.b64decode(asked["request"], validate=True)
+                    addresses = [str(each) for each in list(asked.get("addresses", ()))[:MAX_HUB_NAMES]]
                 except (ValueError, KeyError, TypeError):
                     self._send(400, {"error": "it is no request to join"})
                     return
-                self._send(*invitation._take(guess, request, str(self.client_address[0])))
+                self._send(*invitation._take(guess, request, addresses, str(self.client_address[0])))
 
             def log_message(self, *_: object) -> None:
                 """Log nothing: strangers would fill the terminal."""
@@ -161,8 +169,14 @@ class Invitation:
         return Handler
 
 
-def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], float] = time.time) -> Joined:
-    """Join the hub on another computer. Raises NotJoined."""
+def join(
+    host: str,
+    code: JoinCode,
+    port: int = JOIN_PORT,
+    clock: Callable[[], float] = time.time,
+    addresses: Iterable[str] = (),
+) -> Joined:
+    """Join the hub on another computer. addresses: of this one, if it may be a hub itself. Raises NotJoined."""
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code says whether it is the right one
@@ -181,7 +195,8 @@ def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], f
         )
     known = ssl.create_default_context(cadata=ca.decode())
     key, request = authority.new_request("joins")
-    asked = {"secret": code.secret, "request": base64.b64encode(request).decode()}
+    own = {"addresses": list(addresses)[:MAX_HUB_NAMES]}
+    asked = {"secret": code.secret, "request": base64.b64encode(request).decode(), **own}
     found = _ask(where, known, "POST", json.dumps(asked).encode())
     try:
         certificate = str(found["certificate"]).encode()
@@ -189,8 +204,9 @@ def join(host: str, code: JoinCode, port: int = JOIN_PORT, clock: Callable[[], f
             raise NotJoined(f"{where} gave no identity: {printable(str(found['identity']))}")
         if authority.expires(certificate).timestamp() <= clock():
             raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")
-        return Joined(str(found["identity"]), int(found["port"]), ca, certificate, key, str(found["fleet_file"]))
-    except (KeyError, ValueError):
+        rules, text = dict(found.get("rules", {})), str(found["fleet_file"])
+        return Joined(str(found["identity"]), int(found["port"]), ca, certificate, key, text, rules)
+    except (KeyError, ValueError, TypeError):
         raise NotJoined(f"{where} gave no certificate") from None
 
 

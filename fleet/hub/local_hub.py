@@ -1,6 +1,7 @@
 """Makes this computer the hub, lets it join another one's, and ends that."""
 
 import getpass
+import json
 import os
 import re
 import shutil
@@ -14,12 +15,13 @@ from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
 from schemas.bus import Credentials, is_secure
-from schemas.bus.credentials import CA_FILE, ME_FILE
+from schemas.bus.credentials import ACCESS_CONTROL, CA_FILE, CONNECT, HUB, HUB_FILE, LISTEN, ME_FILE
 from schemas.identity import Service
 from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 
-SECURE_ENDPOINT: Final = "tls/127.0.0.1:7447"
+LOOPBACK: Final = "127.0.0.1"
+SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Where the programs of the hub's own computer find it."""
 SOMEBODY: Final = "operator"
 """The name of a user whose login is no name of a person."""
@@ -71,23 +73,26 @@ def use(endpoint: str) -> None:
     write_atomically(directory / JOINED_FILE, f"{endpoint}\n".encode())
 
 
-def store_joined(host: str, joined: Joined) -> str:
+def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:
     """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined.
 
-    A computer may join once more, for a car or a service: its user stays the person who has joined.
+    A computer may join once more, for a car or a service: its user stays the person who has joined. site: the address
+    of the hub that it uses, if that is not the one it has joined at; site_port: its port, if it is another one.
     """
-    endpoint = f"tls/{host}:{joined.port}"
+    first = f"tls/{host}:{joined.port}"
+    at = LOOPBACK if joined.rules else site or host
+    endpoint = f"tls/{at}:{site_port or joined.port}"
     if is_hub_here(endpoint):
         raise NotJoined(f"this computer is the hub at {endpoint}: its user is {Credentials.of(endpoint).me}")
     directory = Credentials.of(endpoint).directory
     directory.mkdir(parents=True, exist_ok=True)
     os.chmod(directory, 0o700)  # noqa: PTH101 - it has a key
-    files = {
-        CA_FILE: joined.ca,
-        f"{joined.identity}.key": joined.key,
-        f"{joined.identity}.pem": joined.certificate,
-    }
-    if _is_person(joined.identity) or not _is_person(Credentials.of(endpoint).me):
+    name = HUB if joined.rules else joined.identity
+    files = {CA_FILE: joined.ca, f"{name}.key": joined.key, f"{name}.pem": joined.certificate}
+    if joined.rules:
+        settings = {LISTEN: [everywhere(endpoint)], CONNECT: [first], ACCESS_CONTROL: dict(joined.rules)}
+        files[HUB_FILE] = json.dumps(settings, indent=1).encode()
+    elif _is_person(joined.identity) or not _is_person(Credentials.of(endpoint).me):
         files[ME_FILE] = joined.identity.encode()
     for name, data in files.items():
         write_atomically(directory / name, data, sync=True, private=True)

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from schemas import keys
+from schemas.bus.credentials import HUB
 from schemas.identity import IdentityRole, Service, parse
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
@@ -47,16 +48,26 @@ _OWN_SERVICE: Final = {
 }
 
 
-def access_control(names: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Return the rules for identities, each with the common name of its certificate."""
+def access_control(names: Iterable[tuple[str, str]], *, first_hub: str = "") -> dict[str, Any]:
+    """Return the rules for identities, each with the common name of its certificate.
+
+    first_hub: for the hub of another site, the common name of the hub to which it links. A hub passes on what it has
+    checked by the same rules, so all of it is allowed to another hub.
+    """
     rules = [
+        _rule("passes on", "ingress", _READS + _TELLS, (*_PUBLIC, *_COMMANDS, keys.HUB_RULES)),
+        _rule("gets", "egress", _READS + _TELLS, (*_PUBLIC, *_COMMANDS, keys.HUB_RULES)),
         _rule("read", "ingress", _READS, _PUBLIC),
         _rule("see drives", "ingress", ("declare_subscriber",), _COMMANDS),
         _rule("answers", "egress", _TELLS, (*_PUBLIC, *_COMMANDS)),
     ]
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for identity, common_name in names:
+    for identity, common_name in (*names, *([(HUB, first_hub)] if first_hub else ())):
+        if identity == HUB or ((known := parse(identity)) and known[0] is IdentityRole.SITE):
+            subjects.append({"id": identity, "cert_common_names": [common_name]})
+            policies.append({"subjects": [identity], "rules": ["passes on", "gets"]})
+            continue
         own = [*_speaks(identity), *_answers(identity)]
         rules += own
         subjects.append({"id": identity, "cert_common_names": [common_name]})

@@ -1,6 +1,7 @@
 """Parts of the certificates that we make: keys on the curve P-256, names, lifetimes, and their forms as text."""
 
 import ipaddress
+from collections.abc import Iterable
 from datetime import datetime, timedelta
 from typing import Any, Final
 
@@ -48,13 +49,13 @@ def builder(
 
 
 def end_entity(
-    begun: x509.CertificateBuilder, usage: x509.ObjectIdentifier, names: tuple[str, ...] = ()
+    begun: x509.CertificateBuilder, usages: Iterable[x509.ObjectIdentifier], names: tuple[str, ...] = ()
 ) -> x509.CertificateBuilder:
     """Add the extensions of a certificate that signs no others. names: IP addresses and host names."""
     made = (
         begun.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(key_usage(signs=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
     )
     if not names:
         return made

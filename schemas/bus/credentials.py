@@ -22,7 +22,12 @@ ME_FILE: Final = "me"
 HUB: Final = "hub"
 """Name of the hub's certificate."""
 HUB_FILE: Final = "hub.json"
-"""File with the addresses that the hub listens on, and its rules."""
+"""File with the addresses that the hub listens on, and its rules. The hub of another site also has the address of the
+first one, and the first one also has the rules of the others."""
+LISTEN: Final = "listen"
+ACCESS_CONTROL: Final = "access_control"
+CONNECT: Final = "connect"
+OF_SITES: Final = "access_control_of_sites"
 
 
 class NoCredentials(BusError):
@@ -65,7 +70,12 @@ class Credentials:
                 return name
         role, _, own = (wanted or "person.NAME").partition(".")
         option = "" if role == IdentityRole.PERSON else f"--{role} "
-        if (self.directory / f"{HUB}.key").is_file():
+        if first := self.first_hubs:
+            words = (
+                f"This computer has no certificate for {wanted or 'you'}. On the computer of {first[0]}, `fleet hub "
+                f"invite {option}{own}` prints a code; here, `fleet join HOST CODE --at 127.0.0.1` takes it"
+            )
+        elif (self.directory / f"{HUB}.key").is_file():
             local = "" if any("127.0.0.1" not in each for each in self.listens) else "--local "
             words = (
                 f"The hub's computer has no certificate for {wanted}: `fleet hub init {local}{option}{own}` makes it"
@@ -89,23 +99,41 @@ class Credentials:
                 f"This computer has no certificate to be the hub at {self.endpoint}. `fleet up --secure` or "
                 "`fleet hub init` makes one."
             )
-        return self._link({"listen_certificate": self._path(HUB), "listen_private_key": self._path(HUB, ".key")})
+        own, key = self._path(HUB), self._path(HUB, ".key")
+        settings = {"listen_certificate": own, "listen_private_key": key}
+        if self.first_hubs:
+            settings |= {"connect_certificate": own, "connect_private_key": key}
+        return self._link(settings)
 
     @property
     def listens(self) -> list[str]:
         """Return the endpoints that the hub listens on. Raises NoCredentials."""
-        return list(self._hub()["listen"])
+        return list(self.hub_settings()[LISTEN])
 
     @property
     def access_control(self) -> dict[str, Any]:
         """Return the rules of the hub, in Zenoh's form. Raises NoCredentials."""
-        return dict(self._hub()["access_control"])
+        return dict(self.hub_settings()[ACCESS_CONTROL])
 
-    def _hub(self) -> dict[str, Any]:
+    @property
+    def first_hubs(self) -> list[str]:
+        """Return the endpoints of the hub to which the hub of this site links; none if it is the first one itself."""
+        try:
+            return list(self.hub_settings()[CONNECT])
+        except NoCredentials:
+            return []
+
+    def hub_settings(self) -> dict[str, Any]:
+        """Return what the hub's file has. Raises NoCredentials."""
         path = self.directory / HUB_FILE
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
-            return {"listen": list(found["listen"]), "access_control": dict(found["access_control"])}
+            return {
+                LISTEN: list(found[LISTEN]),
+                ACCESS_CONTROL: dict(found[ACCESS_CONTROL]),
+                CONNECT: list(found.get(CONNECT, ())),
+                OF_SITES: dict(found.get(OF_SITES, {})),
+            }
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise NoCredentials(f"{path} has no rules of a hub: {error!r}. `fleet hub init` writes them.") from None
 

@@ -19,6 +19,7 @@ from schemas.state_dir import DEFAULT_ENDPOINT, joined_endpoint
 ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
+_RETRY: Final = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
@@ -87,6 +88,8 @@ def router_settings(endpoint: str) -> dict[str, Any]:
     credentials = Credentials.of(endpoint)
     listen["endpoints"] = credentials.listens or [endpoint]
     own = {"mode": "router", "listen": listen, "access_control": credentials.access_control}
+    if first := credentials.first_hubs:
+        own["connect"] = {"endpoints": first, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY}
     return {**own, **_common(credentials.of_hub())}
 
 
@@ -101,7 +104,7 @@ def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.
         "endpoints": [endpoint],
         "timeout_ms": int(timeout_s * 1000),
         "exit_on_failure": True,
-        "retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
+        "retry": _RETRY,
     }
     link = Credentials.of(endpoint).of_client(identity) if is_secure(endpoint) else {}
     return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_common(link)}))

@@ -14,14 +14,19 @@ from typing import Final
 
 import zenoh
 
+from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
-from schemas.bus.credentials import HUB, HUB_FILE
+from schemas.bus.credentials import ACCESS_CONTROL, CONNECT, HUB, HUB_FILE, LISTEN, OF_SITES
+from schemas.identity import IdentityRole
 from schemas.process import signals
 
 IDLE_S: Final = 10.0
 """Time from the last link until the hub exits."""
 _POLL_S: Final = 0.5
+RULES_POLL_S: Final = 2.0
+"""Interval at which the hub of another site asks for the rules."""
+RULES_TIMEOUT_S: Final = 1.0
 LINKS_FILE: Final = "links.json"
 """File with the addresses from which each identity is connected."""
 
@@ -36,13 +41,54 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
     while not stop.is_set():
         rules = _rules_changed_at(endpoint)
         with zenoh.open(router_config(endpoint)) as session:
+            asked = -RULES_POLL_S
+            _answer_sites(endpoint, session)
             while not stop.wait(_POLL_S) and _rules_changed_at(endpoint) == rules:
                 links = _tell_links(endpoint, session, links)
                 now = time.monotonic()
-                if session.info.transports():
+                if now - asked >= RULES_POLL_S:
+                    asked = now
+                    _take_rules(endpoint, session)
+                if _has_clients(session):
                     last_link = now
                 elif now - last_link > idle_s:
                     return
+
+
+def _has_clients(session: zenoh.Session) -> bool:
+    """Return True if anybody is linked but the hubs of other sites, which would keep one another up."""
+    hubs = (HUB, f"{IdentityRole.SITE}.")
+    return any(not (link.auth_identifier or "").startswith(hubs) for link in session.info.links())
+
+
+def _answer_sites(endpoint: str, session: zenoh.Session) -> None:
+    """Answer the hubs of other sites with the rules. Ends with the session."""
+    if not is_secure(endpoint) or not (rules := Credentials.of(endpoint).hub_settings()[OF_SITES]):
+        return
+    payload = json.dumps(rules)
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(keys.HUB_RULES, payload)
+
+    session.declare_queryable(keys.HUB_RULES, answer)
+
+
+def _take_rules(endpoint: str, session: zenoh.Session) -> None:
+    """Ask the first hub for its rules, if this is that of another site, and store them. Cut off, it keeps the last."""
+    if not is_secure(endpoint) or not (credentials := Credentials.of(endpoint)).first_hubs:
+        return
+    settings = credentials.hub_settings()
+    for reply in session.get(keys.HUB_RULES, timeout=RULES_TIMEOUT_S):
+        if reply.ok is None:
+            continue
+        with contextlib.suppress(ValueError):
+            rules = json.loads(reply.ok.payload.to_bytes())
+            if isinstance(rules, dict) and rules and rules != settings[ACCESS_CONTROL]:
+                path, own = credentials.directory / HUB_FILE, (LISTEN, CONNECT)
+                made = {**{name: settings[name] for name in own}, ACCESS_CONTROL: rules}
+                with contextlib.suppress(OSError):  # asked again
+                    write_atomically(path, json.dumps(made, indent=1).encode(), private=True)
 
 
 def _rules_changed_at(endpoint: str) -> tuple[int, ...]:

@@ -79,7 +79,7 @@ def test_a_guess_of_any_characters_counts(guess: str, invitation: Invitation) ->
 
 
 def test_a_thousand_guesses_at_once_are_five(invitation: Invitation) -> None:
-    answers = [invitation._take("2" * 12, b"", "192.0.2.1")[0] for _ in range(1000)]
+    answers = [invitation._take("2" * 12, b"", [], "192.0.2.1")[0] for _ in range(1000)]
     assert answers == [403] * MAX_GUESSES + [410] * (1000 - MAX_GUESSES)
 
 

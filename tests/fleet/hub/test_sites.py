@@ -1,0 +1,154 @@
+"""Two sites, whose hubs link to one another: real routers, real certificates, invitations over real TLS."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet.hub.hub_store import HubStore
+from fleet.hub.invitation import Invitation, join
+from fleet.hub.local_hub import ensure_hub_here, store_joined
+from schemas import identity, keys
+from schemas.bus import Bus, BusError, hub
+from schemas.bus.hub import serve
+from tests.support.ports import free_port
+from tests.support.processes import wait_for
+
+NORTH = identity.site("north")
+ANN, EVE = identity.person("ann"), identity.person("eve")
+
+
+class Sites:
+    """The first site with ann and red, the second one with eve and blue."""
+
+    def __init__(self) -> None:
+        self.first = f"tls/127.0.0.1:{free_port()}"
+        self.second_port = free_port()
+        self.store = ensure_hub_here(self.first, ["red"], listens=(self.first,))
+        self._ended: dict[str, threading.Event] = {}
+        self._threads: list[threading.Thread] = []
+        self.second = self.join(NORTH)
+        for each in (EVE, identity.car("blue")):
+            assert self.join(each) == self.second
+
+    def join(self, invited: str) -> str:
+        self.store.reserve(invited)
+        port = int(self.first.rpartition(":")[2])
+        invitation = Invitation(self.store, invited, hub_port=port, address="127.0.0.1", port=free_port())
+        try:
+            joined = join("127.0.0.1", invitation.code, invitation.port, addresses=["127.0.0.1"])
+        finally:
+            invitation.close()
+        return store_joined("127.0.0.1", joined, "127.0.0.1", self.second_port)
+
+    def start(self, endpoint: str) -> None:
+        stop = self._ended[endpoint] = threading.Event()
+        self._threads.append(threading.Thread(target=serve, args=(endpoint, 3600.0, stop)))
+        self._threads[-1].start()
+        wait_for(lambda: self.is_up(endpoint), f"{endpoint} is up")
+
+    def is_up(self, endpoint: str) -> bool:
+        try:
+            Bus.open(endpoint, identity=ANN if endpoint == self.first else EVE).close()
+        except BusError:
+            return False
+        return True
+
+    def stop(self, endpoint: str) -> None:
+        self._ended[endpoint].set()
+
+    def close(self) -> None:
+        for each in self._ended.values():
+            each.set()
+        for thread in self._threads:
+            thread.join()
+
+
+@contextmanager
+def gateway(endpoint: str, car: str) -> Iterator[None]:
+    """Answer the commands to one car."""
+    with Bus.open(endpoint, identity=identity.car(car)) as bus:
+        for expression in keys.command_keys("fleet", car):
+            session, own = bus._session, keys.command_key("fleet", car, "stop", identity.car(car))
+
+            def answer(query: zenoh.Query, own: str = own) -> None:
+                with query:
+                    query.reply(own, car)
+
+            session.declare_queryable(expression, answer)
+        yield
+
+
+@pytest.fixture
+def sites(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Sites]:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    monkeypatch.setenv("FLEET_AS", "ann")
+    monkeypatch.setattr(hub, "RULES_POLL_S", 0.2)
+    made = Sites()
+    yield made
+    made.close()
+
+
+def reached(bus: Bus, key: str) -> list[str]:
+    replies = bus._session.get(
+        key,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        accept_replies=zenoh.ReplyKeyExpr.ANY,
+        timeout=1.0,
+    )
+    return sorted(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
+
+
+def test_each_side_goes_on_by_itself_and_both_are_one_fleet_when_linked(sites: Sites) -> None:
+    sites.start(sites.first)
+    sites.start(sites.second)
+    with ExitStack() as stack:
+        stack.enter_context(gateway(sites.first, "red"))
+        stack.enter_context(gateway(sites.second, "blue"))
+        people = {
+            name: stack.enter_context(Bus.open(endpoint, identity=name))
+            for name, endpoint in ((ANN, sites.first), (EVE, sites.second))
+        }
+        everyone = {name: keys.command_key("fleet", "*", "stop", name) for name in people}
+        for name, bus in people.items():
+            wait_for(lambda bus=bus, name=name: reached(bus, everyone[name]) == ["blue", "red"], f"{name} has both")
+            for other in people.keys() - {name}:
+                assert reached(bus, everyone[other]) == [], "nobody speaks as another one, on either side"
+            assert reached(bus, keys.HUB_RULES) == [], "the rules are for hubs"
+        sites.stop(sites.first)
+        wait_for(lambda: reached(people[EVE], everyone[EVE]) == ["blue"], "the second site goes on, cut off")
+        sites.start(sites.first)
+        for name, bus in people.items():
+            wait_for(
+                lambda bus=bus, name=name: reached(bus, everyone[name]) == ["blue", "red"], f"{name} has both again"
+            )
+
+
+def test_the_rules_of_the_first_hub_are_those_of_every_site(sites: Sites) -> None:
+    sites.start(sites.first)
+    sites.start(sites.second)
+    with gateway(sites.second, "blue"), Bus.open(sites.second, identity=EVE) as eve:
+        own = keys.command_key("fleet", "*", "stop", EVE)
+        wait_for(lambda: reached(eve, own) == ["blue"], "eve stops blue")
+        assert sites.store.revoke(EVE)
+        wait_for(lambda: reached(eve, own) == [], "eve stops nothing any more")
+    assert sites.join(identity.person("mia")) == sites.second
+    with gateway(sites.second, "blue"):
+        own = keys.command_key("fleet", "*", "stop", identity.person("mia"))
+
+        def mia_stops() -> bool:
+            try:
+                with Bus.open(sites.second, identity=identity.person("mia")) as bus:
+                    return reached(bus, own) == ["blue"]
+            except BusError:  # the hub takes the new rules just now
+                return False
+
+        wait_for(mia_stops, "mia does")
+
+
+def test_a_site_invites_nobody(sites: Sites) -> None:
+    assert not HubStore.of(sites.second).is_hub
