@@ -80,15 +80,21 @@ class Machines:
         wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the hub is up")
         return hub
 
-    def join(self, machine: str, *invited: str) -> None:
-        """Let a machine join, by the commands that people type."""
+    def join(self, machine: str, *invited: str, at: str = "") -> None:
+        """Let a machine join, by the commands that people type. at: the hub of the site that it uses."""
         address = f"{SUBNETS[machine]}.1"
         arguments = ("-m", "fleet.cli", "hub", "invite", *invited, "--json", "--as-hub", address)
         invitation = self.start(HUB, *arguments)
         said: Any = invitation.line()
-        code, _, words = self.run(machine, "join", said["host"], said["code"])
+        site = ("--at", at) if at else ()
+        code, _, words = self.run(machine, "join", said["host"], said["code"], *site)
         assert code == 0, words
         assert invitation.wait() == 0, invitation.stderr
+
+    def make_site(self, machine: str) -> GatewayProcess:
+        """Make a machine the hub of another site, and start it."""
+        self.join(machine, "--site", "north")
+        return self.start(machine, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
 
     def kill_hub(self) -> None:
         """Kill the hub, whoever has started it."""
