@@ -7,6 +7,7 @@ identity of its sender in its key, so a gateway knows who sent it.
 
 import json
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -86,6 +87,25 @@ class Credentials:
                 f"`fleet hub invite {option}{own}` prints a code; here, `fleet join HOST CODE` takes it"
             )
         raise NoCredentials(f"{words}.")
+
+    def why_invalid(self, identity: str, now: datetime) -> str:
+        """Return why a hub refuses the certificate of an identity here: it has ended, or not begun. Else empty."""
+        try:
+            from cryptography import x509
+
+            found = x509.load_pem_x509_certificate((self.directory / f"{identity}.pem").read_bytes())
+        except (ImportError, OSError, ValueError):
+            return ""
+        begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
+        if begins <= now < ends:
+            return ""
+        if now < begins:
+            return f"The certificate of {identity} begins on {begins:%Y-%m-%d}: is the clock of this computer right?"
+        return (
+            f"The certificate of {identity} ended on {ends:%Y-%m-%d}, so the hub refuses it: it cannot even stop a "
+            "car. `fleet hub invite` on the hub's computer and `fleet join` here make a new one; on the hub's own "
+            "computer, `fleet up` does."
+        )
 
     def of_client(self, wanted: str = "") -> dict[str, Any]:
         """Return Zenoh's settings of the link of a client. Raises NoCredentials."""

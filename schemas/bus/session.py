@@ -6,6 +6,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from datetime import UTC, datetime
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -82,6 +83,8 @@ class Bus:
             try:
                 session = zenoh.open(client_config(where, timeout_s, identity))
             except zenoh.ZError as error:
+                if identity and (why := Credentials.of(where).why_invalid(identity, datetime.now(UTC))):
+                    raise BusError(why) from error
                 may_be = f", or refuses the certificate of {identity}" if identity else ""
                 raise BusError(
                     f"{where} does not answer, or is no Zenoh router{may_be}. Name the fleet's address with --connect."

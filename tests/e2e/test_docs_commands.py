@@ -35,6 +35,7 @@ VECTORS: Final = ROOT / "tests/vectors/recorded"
 NOT_RUN: Final = {
     r"fleet (scan|bind|init --yes).*": "searches the USB ports and the radio of this machine",
     r".*/dev/ttyUSB0.*": "needs a car on USB",
+    r"gateway run .*ble://.*": "needs a car on Bluetooth; tests/gateway/link/test_ble_gateway.py has one",
     r".*192\.168\.1\.2:.*|ssh .*|zenohd .*": "needs a second computer",
     r"fleet replay|fleet replay (?!.*--save).*|fleet view( --web)?": "opens a window",
     r".*/media/disk.*": "needs a second disk",

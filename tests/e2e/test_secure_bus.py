@@ -18,7 +18,7 @@ from fleet.hub import authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
-from schemas.bus import Bus
+from schemas.bus import Bus, BusError
 from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS, Verb
 from schemas.identity import Service, car, person, service
 from schemas.words import Rank
@@ -221,6 +221,20 @@ def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
     settings = foreign(stage.store.directory)[why]
     with pytest.raises(zenoh.ZError), stranger(stage.store.credentials, **settings):
         pass
+
+
+@pytest.mark.parametrize(
+    ("begins", "words"), [(-LIFETIME - timedelta(days=2), "ended on"), (timedelta(9), "begins on")]
+)
+def test_whose_certificate_has_ended_reads_so(begins: timedelta, words: str, stage: SecureStage) -> None:
+    directory = stage.store.directory
+    ca = authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
+    late = person("late")
+    pair = authority.issue(ca, late, datetime.now(UTC) + begins)
+    for ending, data in (("pem", pair.certificate), ("key", pair.key)):
+        (directory / f"{late}.{ending}").write_bytes(data)
+    with pytest.raises(BusError, match=f"{late} {words}"):
+        Bus.open(stage.store.credentials.endpoint, timeout_s=0.5, identity=late)
 
 
 def test_a_certificate_that_no_rule_knows_gets_nothing(stage: SecureStage) -> None:
