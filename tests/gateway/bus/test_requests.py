@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.bus import requests
-from gateway.bus.requests import BadRequest, RawRequest, parse
+from gateway.bus.requests import BadRequest, parse
+from gateway.bus.service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,
@@ -44,9 +45,11 @@ from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedS
 NOW = 1_800_000_000_000_000_000
 
 
-def ask(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> Command:
+def ask(
+    verb: str, payload: Any, encoding: str = messages.JSON, *, longest_drive_s: float = 10.0, **more: Any
+) -> Command:
     data = payload if isinstance(payload, bytes | None) else json.dumps(payload).encode()
-    return parse(RawRequest(verb, data, encoding, NOW, **more))
+    return parse(Request(verb, data, encoding, **more), NOW, longest_drive_s=longest_drive_s)
 
 
 def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> BadRequest:
@@ -56,10 +59,10 @@ def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any)
     return caught.value
 
 
-def parsed(request: RawRequest) -> tuple[Command, str]:
+def parsed(request: Request) -> tuple[Command, str]:
     """Return the command. If the request is bad, return the known part of the command, and the reason."""
     try:
-        return parse(request), ""
+        return parse(request, NOW), ""
     except BadRequest as error:
         return error.command, error.words or "no words"
 
@@ -114,7 +117,7 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
 
 def test_every_verb_of_the_table_is_known_here() -> None:
     for verb in COMMANDS:
-        assert (verb, parsed(RawRequest(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
+        assert (verb, parsed(Request(verb, b"{}", messages.JSON))[0].verb) == (verb, verb)
     assert sorted([*requests._WHAT, *PLAIN_ACTIONS, "drive"]) == sorted(COMMANDS), "each verb once"
 
 
@@ -334,7 +337,7 @@ WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward",
 def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
     verb: str, payload: bytes | None, encoding: str, sampled_ns: int | None, by_wildcard: bool
 ) -> None:
-    request = RawRequest(verb, payload, encoding, NOW, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
+    request = Request(verb, payload, encoding, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
     command, words = parsed(request)
     assert words != "no words"
     assert command.verb == verb
