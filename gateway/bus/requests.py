@@ -30,8 +30,8 @@ from gateway.control.commands import (
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from schemas import messages
 from schemas.authority import Sender
@@ -170,11 +170,12 @@ def _action(verb: str, message: Any, car: str, longest_drive_s: float) -> Action
         return _drive(message, longest_drive_s, car)
     if verb in _WHAT:
         return _WHAT[verb](message)
+    row = COMMANDS[verb]
+    if row.signal:
+        most_s = row.max_duration_s
+        return Signal(row.verb, _seconds("duration_s", message.duration_s, most_s) if most_s else 0.0)
     plain = PLAIN_ACTIONS[verb]
-    values = {field.name: getattr(message, field.name) for field in fields(plain)}
-    if "duration_s" in values:
-        _seconds("duration_s", values["duration_s"], COMMANDS[verb].max_duration_s)
-    return plain(**values)
+    return plain(**{field.name: getattr(message, field.name) for field in fields(plain)})
 
 
 def _encoding(request: Request) -> str:
@@ -306,7 +307,6 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     Verb.LIGHT: lambda message: SetLight(_word("light", message.light, Light)),
     Verb.SERVO: _servo,
     Verb.ARM: _arm,
-    Verb.WHISTLE: lambda _: Whistle(),
     Verb.SPEED: lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     Verb.FAN: _fan,
     Verb.ESTOP: _estop,
