@@ -51,6 +51,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import car_token, command_key, person_of, topic_key
 from schemas.messages import encoding_of
 from schemas.topics import Qos
+from schemas.words import MODE_TEXTS
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
@@ -207,6 +208,7 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
     with teacher.socket() as page:
         hello = json.loads(page.recv())
     assert hello["person"] == {"name": "teacher", "rank": "lead"}
+    assert hello["modes"] == {mode: list(words) for mode, words in MODE_TEXTS.items()}
     stage.drive()
     assert device.ask("POST", "/stop", Origin="https://evil.example")[0] == 403
     assert device.ask("POST", "/stop", Host=f"evil.example:{stage.lan_port}")[0] == 403
