@@ -52,7 +52,7 @@ from schemas.keys import car_token, command_key, person_of, topic_key
 from schemas.messages import encoding_of
 from schemas.topics import Qos
 from schemas.words import MODE_TEXTS
-from tests.support.console import ConsoleProcess
+from tests.support.console import LEADS_ONLY, ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
 from tests.support.page_flood import HALF_REQUESTS, PLAN, half_request, start_flood
@@ -265,7 +265,7 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
     plan = "roles:\n  guide: {mode: trackin}\n"  # a good one would start
     for path in ("/recording/start", "/recording/stop", "/plan/set"):
-        refused = {"ok": False, "words": "Only a lead may (teacher)."}
+        refused = {"ok": False, "words": LEADS_ONLY}
         status, text = driver.ask("POST", path, plan)
         assert (status, json.loads(text)) == (403, refused), path
         assert answer(stage.console.port, "POST", path, plan, **own)[0] == 403, "this computer's person is no lead"
@@ -273,11 +273,11 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
         assert status == 200
         assert "Did you mean tracking?" in text.decode() or "is on the bus" in text.decode(), "passed on"
     with driver.socket() as page:
-        assert next_message(page, "rights")["manage"] == "Only a lead may (teacher)."
+        assert next_message(page, "rights")["manage"] == LEADS_ONLY
         page.send(json.dumps({"t": "plan", "id": 7, "verb": "stop"}))
-        assert next_message(page, "plan_done")["words"] == "Only a lead may (teacher)."
+        assert next_message(page, "plan_done")["words"] == LEADS_ONLY
         page.send(json.dumps({"t": "pause", "id": "p1", "why": "x"}))  # the page may not claim that all stopped
-        assert next_message(page, "bad")["words"] == "Only a lead may (teacher)."
+        assert next_message(page, "bad")["words"] == LEADS_ONLY
     for path in ("/recording/status", "/recording/mark", "/plan/check"):
         assert driver.ask("POST", path, plan)[0] == 200, "for everyone"
     assert driver.ask("GET", "/sessions")[0] == 200
