@@ -131,6 +131,7 @@ class CarGateway:
             longest_drive_s=settings.longest_drive_s,
             clock=self._loop.time,
             wake=self._wake.set,
+            on_gap=self._on_gap,
         )
         self._link = LinkLoop(
             url,
@@ -174,8 +175,7 @@ class CarGateway:
             self._loop,
             values=self._values_due,
             histories=self._histories_due,
-            command=self._on_query,
-            streamed=self._on_sample,
+            command=self._commands.on_request,
             senders=self._on_sender_tokens,
             cars=self._estop_sync.on_tokens,
         )
@@ -264,15 +264,6 @@ class CarGateway:
             except Exception:  # a bad query must not end the gateway
                 log.exception("a query could not be answered")
             await asyncio.sleep(0)
-
-    def _on_query(self, item: tuple[zenoh.Query, str]) -> None:
-        """Take a command. After a sleep of the computer the car is stopped before any command is taken."""
-        self._on_gap(self._loop.time())
-        self._commands.on_query(item)
-
-    def _on_sample(self, sample: bus.Sample) -> None:
-        self._on_gap(self._loop.time())
-        self._commands.on_sample(sample)
 
     def _flush(self) -> None:
         """Publish records and states, save the safety state, answer the pending queries."""

@@ -45,6 +45,8 @@ class CommandType:
     """True if it needs no payload, and stops the car even if the payload is invalid."""
     max_duration_s: float = 0.0
     """Maximum of its field `duration_s`. 0 if it has none, or if each gateway has a limit of its own."""
+    signal: bool = False
+    """True if the car gives a signal, and the verb and `duration_s` say all about it: control needs no class for it."""
     subcommand: str = ""
     """Its subcommand of `fleet`, if this row says all about it: cars, and `--for` if there is a maximum duration."""
     section: str = ""
@@ -73,7 +75,12 @@ _ROWS: Final = (
     CommandType(Verb.SERVO, "move a servo a step, or the front one to `deg` (0..180)", "servo angle sent"),
     CommandType(Verb.ARM, "six joints, 0..180 degrees each (option `+arm`)", "arm joints sent"),
     CommandType(
-        Verb.WHISTLE, "sound the whistle once", "whistle sent", subcommand="whistle", section="Lights and parts"
+        Verb.WHISTLE,
+        "sound the whistle once",
+        "whistle sent",
+        signal=True,
+        subcommand="whistle",
+        section="Lights and parts",
     ),
     CommandType(Verb.SPEED, "one step `up` or `down`: cars have no absolute speed", "speed step{detail} sent"),
     CommandType(Verb.FAN, "toggle; `on` or `off` while its state is known", "fan{detail} sent"),

@@ -45,6 +45,21 @@ class Mode(StrEnum):
     FOLLOWING = "following"
 
 
+MODE_TEXTS: Final = {
+    Mode.MANUAL: ("Manual", "Stops the car. Then you drive it."),
+    Mode.REMOTE_CONTROL: ("Infrared remote", "Only the infrared remote drives the car. It reports nothing."),
+    Mode.TRACKING: ("Line tracking", "Drives off at once, along a line on the floor."),
+    Mode.OBSTACLE_AVOIDANCE: (
+        "Obstacle avoidance",
+        "Drives off at once and avoids obstacles. It reports nothing. A stop may take 4 s.",
+    ),
+    Mode.COLOR_LED: ("Color LED", "Stands and shows colors. It reports nothing."),
+    Mode.LIGHT_SEEKING: ("Light seeking", "Drives toward light, as soon as there is some."),
+    Mode.FOLLOWING: ("Following", "Drives after what is in front of it."),
+}
+"""Each mode for a person: its name, and what the car does in it."""
+
+
 class Light(StrEnum):
     """A color of the light."""
 

@@ -46,7 +46,7 @@ from schemas.keys import person_of, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.topics import TOPICS
-from schemas.words import Phase, Rank, Reason, Scope
+from schemas.words import MODE_TEXTS, Phase, Rank, Reason, Scope
 
 MAX_PAGES: Final = 96
 """Maximum number of connected pages."""
@@ -356,7 +356,8 @@ class Console:
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
         names = {"sender": operator.sender, "fleet": self._fleet.sync.name}
-        page.answer(t="hello", page=page.number, **names, person=asdict(page.person), plottable=plottable())
+        words = {"plottable": plottable(), "modes": MODE_TEXTS}
+        page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
         for feed in self._feeds:
             feed.on_page(page)
         return page

@@ -6,21 +6,19 @@ Control decides about each command. Its answer goes out after control could writ
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
-
-import zenoh
 
 from gateway.bus import requests
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
+from gateway.bus.service import Request
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
 from gateway.control.events import LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
-from schemas.commands import Verb
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Level, Phase, Reason
 
@@ -34,19 +32,11 @@ _LOGGING_LEVELS: Final = {
 log = logging.getLogger("gateway")
 
 
-@dataclass(frozen=True, slots=True)
-class _PendingQuery:
-    """A command query whose answer is not sent yet."""
-
-    query: zenoh.Query
-    key: str
-    command_id: str
-    answer: Answer
-    as_json: bool
-
-
 class CommandHandler:
-    """The commands of one car. Use it in the loop: `clock` is the loop's, `wake` wakes the writer."""
+    """The commands of one car. Use it in the loop: `clock` is the loop's, `wake` wakes the writer.
+
+    `on_gap` looks for a gap of the loop: after a sleep of the computer the car is stopped before any command is taken.
+    """
 
     def __init__(
         self,
@@ -60,6 +50,7 @@ class CommandHandler:
         longest_drive_s: float,
         clock: Callable[[], float],
         wake: Callable[[], None],
+        on_gap: Callable[[float], None],
     ) -> None:
         self._fleet = fleet
         self._car = car
@@ -71,34 +62,25 @@ class CommandHandler:
         self._longest_drive_s = longest_drive_s
         self._clock = clock
         self._wake = wake
-        self._pending_queries: list[_PendingQuery] = []
+        self._on_gap = on_gap
+        self._unanswered: list[tuple[Request, str, Answer]] = []
+        """Queries with the id of their command and the answer to send."""
         self._sent: set[str] = set()
         """Ids of commands whose first frame was written since the last answers."""
 
-    def on_query(self, item: tuple[zenoh.Query, str]) -> None:
-        """Pass a command query to control. Queue its answer until control could write."""
-        query, unread = item
-        expression = str(query.key_expr)
-        verb = expression.rpartition("/")[2]
-        encoding = str(query.encoding) if query.encoding is not None and not unread else ""
-        payload = query.payload.to_bytes() if query.payload is not None and not unread else None
-        as_json = query.parameters.get("format") == "json" or not encoding.startswith(topics.PROTOBUF)
-        if "*" in verb:
-            bus.refuse(query, f"{expression}: name the command, there is no command {verb}")
-            return
-        request = requests.RawRequest(
-            verb,
-            payload,
-            encoding,
-            time.time_ns(),
-            longest_drive_s=self._longest_drive_s,
-            car=self._car,
-            by_wildcard="*" in expression,
-            unread=unread,
-            identity=keys.identity_of(expression),
-        )
+    def on_request(self, request: Request) -> None:
+        """Pass a command to control. Queue the answer to a query until control could write."""
+        self._on_gap(self._clock())
         before = self._control.safety.persisted
         command, answer = self._carry_out(request)
+        if request.query is not None:
+            if isinstance(command.what, EmergencyStop | Resume | Pause | Unpause):
+                self._share(request, command, answer, before)
+            self._unanswered.append((request, command.id, answer))
+        self._wake()
+
+    def _share(self, request: Request, command: Command, answer: Answer, before: PersistedSafety) -> None:
+        """Tell the other gateways what concerns the fleet. If they were asked, too, learn what this one has missed."""
         if not request.by_wildcard:
             self._estop_sync.forward(command, before, self._control.safety.persisted)
         elif (
@@ -107,33 +89,12 @@ class CommandHandler:
             or (isinstance(command.what, Resume) and answer.reason is Reason.ESTOPPED)
         ):
             self._estop_sync.sync_soon()  # this gateway may have missed an e-stop or a pause, or its end
-        key = keys.command_key(self._fleet, self._car, verb, request.identity)
-        self._pending_queries.append(_PendingQuery(query, key, command.id, answer, as_json))
-        self._wake()
 
-    def on_sample(self, sample: bus.Sample) -> None:
-        """Pass a drive of a stream to control."""
-        if not sample.deleted:
-            request = requests.RawRequest(
-                Verb.DRIVE,
-                sample.payload,
-                sample.encoding,
-                time.time_ns(),
-                sampled_ns=sample.time_ns,
-                longest_drive_s=self._longest_drive_s,
-                car=self._car,
-                by_wildcard="*" in sample.key,
-                unread=sample.unread,
-                identity=keys.identity_of(sample.key),
-            )
-            self._carry_out(request)
-            self._wake()
-
-    def _carry_out(self, request: requests.RawRequest) -> tuple[Command, Answer]:
+    def _carry_out(self, request: Request) -> tuple[Command, Answer]:
         """Parse a request and pass it to control. Its first record has the original request."""
         now = self._clock()
         try:
-            command = requests.parse(request)
+            command = requests.parse(request, time.time_ns(), car=self._car, longest_drive_s=self._longest_drive_s)
             answer = self._control.command(command, now)
         except requests.BadRequest as error:
             command = error.command
@@ -141,28 +102,30 @@ class CommandHandler:
         self._publish_records(command.id, request)
         return command, answer
 
-    def _reply(self, pending: _PendingQuery, sent: set[str]) -> None:
-        answer = pending.answer
-        status = Phase.SENT if pending.command_id in sent and answer.status is Phase.QUEUED else answer.status
+    def _reply(self, request: Request, command_id: str, answer: Answer, sent: set[str]) -> None:
+        status = Phase.SENT if command_id in sent and answer.status is Phase.QUEUED else answer.status
         result = pb.Result(
-            id=pending.command_id,
+            id=command_id,
             car=self._car,
             status=status,
             reason=answer.reason or "",
             words=answer.words,
             worst_case_s=answer.worst_case_s or None,  # only a stop has one
         )
-        with pending.query as query:
-            bus.reply_message(query, pending.key, result, as_json=pending.as_json)
+        assert request.query is not None
+        with request.query as query:
+            key = keys.command_key(self._fleet, self._car, request.verb, request.identity)
+            as_json = query.parameters.get("format") == "json" or not request.encoding.startswith(topics.PROTOBUF)
+            bus.reply_message(query, key, result, as_json=as_json)
 
     def flush(self) -> None:
         """Publish records, save the safety state, answer the pending queries."""
         self._publish_records()
         self._save()
         sent, self._sent = self._sent, set()
-        pending, self._pending_queries = self._pending_queries, []
-        for each in pending:
-            self._reply(each, sent)
+        unanswered, self._unanswered = self._unanswered, []
+        for request, command_id, answer in unanswered:
+            self._reply(request, command_id, answer, sent)
 
     def _save(self) -> None:
         """Save a changed safety state."""
@@ -176,11 +139,13 @@ class CommandHandler:
         except OSError as error:
             words = f"{self._car} loses its hold and e-stops at a restart of its gateway: {error}"
             self.log(Level.ERROR, "not_saved", words)
-            for index, each in enumerate(self._pending_queries):
-                answer = replace(each.answer, words="; ".join(filter(None, (each.answer.words, f"not saved: {error}"))))
-                self._pending_queries[index] = replace(each, answer=answer)
+            lost = f"not saved: {error}"
+            self._unanswered = [
+                (request, command_id, replace(answer, words=f"{answer.words}; {lost}" if answer.words else lost))
+                for request, command_id, answer in self._unanswered
+            ]
 
-    def _publish_records(self, command_id: str = "", request: requests.RawRequest | None = None) -> None:
+    def _publish_records(self, command_id: str = "", request: Request | None = None) -> None:
         for record in self._control.take_records():
             if isinstance(record, LogRecord):
                 self._print(record)

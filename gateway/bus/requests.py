@@ -8,9 +8,10 @@ import json
 import math
 import uuid
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, Final, TypeVar
 
+from gateway.bus.service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,
@@ -29,8 +30,8 @@ from gateway.control.commands import (
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from schemas import messages
 from schemas.authority import Sender
@@ -58,32 +59,6 @@ _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
 WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
 
 
-@dataclass(frozen=True, slots=True)
-class RawRequest:
-    """A request before parsing: the verb, the payload, and its times."""
-
-    verb: str
-    payload: bytes | None
-    encoding: str
-    now_ns: int
-    """Wall clock, ns since the epoch."""
-    sampled_ns: int | None = None
-    """Zenoh timestamp of a publication; None for a query."""
-    longest_drive_s: float = DEFAULT_MAX_DRIVE_S
-    car: str = "this car"
-    by_wildcard: bool = False
-    """True if one key expression addressed several cars."""
-    unread: str = ""
-    """Why the payload was not read; empty if it was."""
-    identity: str = ""
-    """Who sent it, proven by a certificate; empty on a bus without certificates."""
-
-    @property
-    def streamed(self) -> bool:
-        """Return True for a publication: nobody waits for an answer."""
-        return self.sampled_ns is not None
-
-
 class BadRequest(ValueError):
     """An invalid request. `command` has its readable part, so that the rejection is recorded under its id."""
 
@@ -94,10 +69,12 @@ class BadRequest(ValueError):
         self.command = command
 
 
-def parse(request: RawRequest) -> Command:
-    """Parse a request. Raises BadRequest."""
+def parse(
+    request: Request, now_ns: int, *, car: str = "this car", longest_drive_s: float = DEFAULT_MAX_DRIVE_S
+) -> Command:
+    """Parse a request. now_ns: wall clock, ns since the epoch. Raises BadRequest."""
     verb = request.verb
-    blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
+    blank = Command(_id(request, now_ns), verb, Sender(), Stop(), asked_ns=now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
         words = f"{verb!r} is no command. Commands: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
@@ -112,7 +89,7 @@ def parse(request: RawRequest) -> Command:
         words = f"{verb} without a payload: give {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
-        command = _parse_payload(blank, request)
+        command = _parse_payload(blank, request, car, longest_drive_s)
     except BadRequest as error:
         if verb not in STOPS:
             raise
@@ -133,21 +110,21 @@ def _proven(command: Command, identity: str) -> Command:
     raise BadRequest(Reason.NOT_ALLOWED, words, replace(command, sender=own))
 
 
-def _stop_anyway(command: Command, words: str, request: RawRequest) -> Command:
+def _stop_anyway(command: Command, words: str, request: Request) -> Command:
     """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
     what = Stop() if request.verb == Verb.STOP else _readable_estop(request)
     return replace(command, what=what, note=f"the gateway stops the car in spite of an error: {words}")
 
 
-def _id(request: RawRequest) -> str:
+def _id(request: Request, now_ns: int) -> str:
     """Return an id for a request without one. For an e-stop to all cars every gateway makes the same id."""
     if request.verb != Verb.ESTOP or not request.by_wildcard:
         return uuid.uuid4().hex
-    query = (request.payload or b"") + str(request.now_ns // _SAME_QUERY_NS).encode()
+    query = (request.payload or b"") + str(now_ns // _SAME_QUERY_NS).encode()
     return hashlib.sha256(query).hexdigest()[:32]
 
 
-def _readable_estop(request: RawRequest) -> EmergencyStop:
+def _readable_estop(request: Request) -> EmergencyStop:
     """Return the readable part of an invalid e-stop: its scope and its reason."""
     try:
         fields = json.loads(request.payload or b"{}")
@@ -163,7 +140,7 @@ def _readable_estop(request: RawRequest) -> EmergencyStop:
     return EmergencyStop(_why(why) if isinstance(why, str) else "", fields.get("scope") == Scope.FLEET)
 
 
-def _parse_payload(blank: Command, request: RawRequest) -> Command:
+def _parse_payload(blank: Command, request: Request, car: str, longest_drive_s: float) -> Command:
     verb = blank.verb
     try:
         message: Any = messages.parse(COMMANDS[verb].message, request.payload or b"", _encoding(request))
@@ -176,45 +153,46 @@ def _parse_payload(blank: Command, request: RawRequest) -> Command:
         kind = _word("kind", message.kind or Rank.SCRIPT, _WIRE_KINDS)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
-        what = _action(verb, message, request)
+        what = _action(verb, message, car, longest_drive_s)
     except ValueError as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
     return replace(
         command,
         what=what,
-        age_s=_age_s(message, request),
+        age_s=_age_s(message, request, blank.asked_ns),
         ttl_s=ttl_s if ttl_s is not None else COMMANDS[verb].ttl_s,
     )
 
 
-def _action(verb: str, message: Any, request: RawRequest) -> Action:
+def _action(verb: str, message: Any, car: str, longest_drive_s: float) -> Action:
     """Return the action of a message. Raises ValueError for a wrong field."""
     if verb == Verb.DRIVE:
-        return _drive(message, request.longest_drive_s, request.car)
+        return _drive(message, longest_drive_s, car)
     if verb in _WHAT:
         return _WHAT[verb](message)
+    row = COMMANDS[verb]
+    if row.signal:
+        most_s = row.max_duration_s
+        return Signal(row.verb, _seconds("duration_s", message.duration_s, most_s) if most_s else 0.0)
     plain = PLAIN_ACTIONS[verb]
-    values = {field.name: getattr(message, field.name) for field in fields(plain)}
-    if "duration_s" in values:
-        _seconds("duration_s", values["duration_s"], COMMANDS[verb].max_duration_s)
-    return plain(**values)
+    return plain(**{field.name: getattr(message, field.name) for field in fields(plain)})
 
 
-def _encoding(request: RawRequest) -> str:
+def _encoding(request: Request) -> str:
     if request.payload:
         return request.encoding
     return PROTOBUF  # zero bytes are a message without fields
 
 
-def _age_s(message: Any, request: RawRequest) -> float | None:
+def _age_s(message: Any, request: Request, now_ns: int) -> float | None:
     """Return the age of a request, s; None if unknown, negative if its sender's clock is ahead of ours."""
     if message.HasField("asked"):
-        age_ns: int = request.now_ns - messages.stamp_ns(message.asked)
+        age_ns: int = now_ns - messages.stamp_ns(message.asked)
         return age_ns / 1e9
     if request.sampled_ns is None:
         return None
     # After a wall clock was set back, the timestamps of Zenoh stay ahead of it until it has caught up.
-    return max(0.0, (request.now_ns - request.sampled_ns) / 1e9)
+    return max(0.0, (now_ns - request.sampled_ns) / 1e9)
 
 
 def _text(field: str, value: str, forbidden: str = "") -> str:
@@ -329,7 +307,6 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     Verb.LIGHT: lambda message: SetLight(_word("light", message.light, Light)),
     Verb.SERVO: _servo,
     Verb.ARM: _arm,
-    Verb.WHISTLE: lambda _: Whistle(),
     Verb.SPEED: lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     Verb.FAN: _fan,
     Verb.ESTOP: _estop,

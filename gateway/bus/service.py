@@ -7,6 +7,7 @@ Commands go before queries of values. A command waits for one turn of the loop. 
 queries of the history in another one.
 """
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -36,6 +37,30 @@ RIVAL_TIMEOUT_S: Final = 3.0
 """Timeout for another gateway's answer. A stalled one answers within it or loses its Zenoh lease (2 s)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One command as the bus delivered it: by a query, or as one sample of a stream."""
+
+    verb: str
+    payload: bytes | None
+    encoding: str
+    by_wildcard: bool = False
+    """True if one key expression addressed several cars."""
+    unread: str = ""
+    """Why the payload was not read; empty if it was."""
+    identity: str = ""
+    """Who sent it, proven by a certificate; empty on a bus without certificates."""
+    sampled_ns: int | None = None
+    """Zenoh timestamp of a sample, ns since the epoch; None for a query."""
+    query: zenoh.Query | None = None
+    """The query that waits for an answer; None for a sample."""
+
+    @property
+    def streamed(self) -> bool:
+        """Return True for a sample: nobody waits for an answer."""
+        return self.sampled_ns is not None
+
+
 class AlreadyServed(Exception):
     """Another gateway serves this car. The text names it."""
 
@@ -50,9 +75,9 @@ class CarService:
         health_key = keys.topic_key(fleet, car, "state/health")
         self.singleton = bus.Singleton(opened, health_key, self._already_served, RIVAL_TIMEOUT_S)
         self.singleton.check_alone()
-        self._commands: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_QUERIES)
-        self._large: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
-        self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
+        self._commands: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_QUERIES)
+        self._large: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
+        self._stream: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
         self.values: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_VALUE_QUERIES)
         """Queries of the latest values, each with its family."""
         self.histories: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_HISTORY_QUERIES)
@@ -64,9 +89,9 @@ class CarService:
             # A query on `fleet/**` reaches both: each answers for its own family only.
             opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._on_query, family))
         for expression in keys.command_keys(fleet, car):
-            opened.queryable(expression, self._on_command, too_large=self._on_oversized)
+            opened.queryable(expression, self._on_command, too_large=self._on_command)
         for expression in keys.command_keys(fleet, car, Verb.DRIVE):
-            opened.subscribe(expression, self._stream, largest=bus.LARGEST_PAYLOAD)
+            opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
         opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)
@@ -77,21 +102,19 @@ class CarService:
         *,
         values: "asyncio.Event",
         histories: "asyncio.Event",
-        command: "Callable[[tuple[zenoh.Query, str]], object]",
-        streamed: "Callable[[bus.Sample], object]",
+        command: "Callable[[Request], object]",
         senders: "Callable[[Mapping[str, bool]], object]",
         cars: "Callable[[Mapping[str, bool]], object]",
     ) -> None:
         """Connect the handlers, also for items that wait already.
 
-        `command` takes a query and why its payload is not read. `senders` and `cars` take changes of tokens by name.
-        `values` and `histories` are set when there are queries.
+        `senders` and `cars` take changes of tokens by name. `values` and `histories` are set when there are queries.
         """
         self.values.attach(loop, values)
         self.histories.attach(loop, histories)
         self._commands.attach(loop, command)
         self._large.attach(loop, command)
-        self._stream.attach(loop, streamed)
+        self._stream.attach(loop, command)
         self._senders.attach(loop, senders)
         self._cars.attach(loop, cars)
 
@@ -112,15 +135,39 @@ class CarService:
         is_history = any(each in query.parameters for each in ("_time", "last"))
         return (self.histories if is_history else self.values)((family, query))
 
-    def _on_command(self, query: zenoh.Query) -> bool:
-        """Queue a command. Runs on a Zenoh thread."""
-        return self._commands((query, ""), reserve=MAX_QUEUED_STOPS if _is_stop(query) else 0)
+    def _on_command(self, query: zenoh.Query, unread: str = "") -> bool:
+        """Queue a command, also one that is too large to be read. Runs on a Zenoh thread."""
+        expression = str(query.key_expr)
+        verb = expression.rpartition("/")[2]
+        if "*" in verb:
+            bus.refuse(query, f"{expression}: name the command, there is no command {verb}")
+            return True
+        request = Request(
+            verb,
+            query.payload.to_bytes() if query.payload is not None and not unread else None,
+            str(query.encoding) if query.encoding is not None and not unread else "",
+            by_wildcard="*" in expression,
+            unread=unread,
+            identity=keys.identity_of(expression),
+            query=query,
+        )
+        if verb in STOPS:
+            return self._commands(request, reserve=MAX_QUEUED_STOPS)
+        return (self._large if unread else self._commands)(request)
 
-    def _on_oversized(self, query: zenoh.Query, words: str) -> bool:
-        """Queue a command that is too large to be read. Runs on a Zenoh thread."""
-        if _is_stop(query):
-            return self._commands((query, words), reserve=MAX_QUEUED_STOPS)
-        return self._large((query, words))
+    def _on_sample(self, sample: bus.Sample) -> None:
+        """Queue a drive of a stream. Runs on a Zenoh thread."""
+        if not sample.deleted:
+            request = Request(
+                Verb.DRIVE,
+                sample.payload,
+                sample.encoding,
+                by_wildcard="*" in sample.key,
+                unread=sample.unread,
+                identity=keys.identity_of(sample.key),
+                sampled_ns=sample.time_ns,
+            )
+            self._stream(request)
 
     def _on_sender(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """Queue a change of a sender's token. Runs on a Zenoh thread."""
@@ -129,7 +176,3 @@ class CarService:
     def _on_car(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """Queue a change of a gateway's token. Runs on a Zenoh thread."""
         self._cars(key.rpartition("/")[2], alive)
-
-
-def _is_stop(query: zenoh.Query) -> bool:
-    return str(query.key_expr).rpartition("/")[2] in STOPS

@@ -55,9 +55,11 @@ class SetLight(PartAction):
 
 
 @dataclass(frozen=True, slots=True)
-class Whistle(PartAction):
-    """Beep once."""
+class Signal(PartAction):
+    """Give the signal of a verb, such as a beep, once or for `duration_s` seconds. Its row has `signal` set."""
 
+    verb: Verb
+    duration_s: float = 0.0
     needs_lease: ClassVar[bool] = False
 
 
@@ -164,7 +166,7 @@ PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
     Verb.LEASE: TakeLease,
     Verb.FIND: Find,
 }
-"""Actions by verb whose fields are those of the message, flags or `duration_s`, and need no rule of their own."""
+"""Actions by verb whose fields are flags of the message, and need no rule of their own."""
 
 
 @dataclass(frozen=True, slots=True)

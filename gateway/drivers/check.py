@@ -25,8 +25,8 @@ from gateway.control.commands import (
     MoveServo,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
@@ -35,6 +35,7 @@ from gateway.drivers import Family
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
 from schemas.authority import Sender
+from schemas.commands import COMMANDS
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.topics import TOPICS
 from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
@@ -53,7 +54,7 @@ ACTIONS: Final[tuple[Action, ...]] = (
     *(MoveServo(action) for action in ServoAction),
     AimServo(90),
     MoveArm((90,) * 6),
-    Whistle(),
+    *(Signal(row.verb, row.max_duration_s) for row in COMMANDS.values() if row.signal),
     ChangeSpeed(SpeedStep.UP),
     ChangeSpeed(SpeedStep.DOWN),
     Fan(),

@@ -166,11 +166,11 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert {"@hub", "@recorder", "@simulator", "@console", "red", "green"} == {
         each["name"] for each in told["processes"]
     }
-    assert "is open. The gateway stops the car first." in up.fleet("logs", "red").stdout
+    assert "[link_open]" in up.fleet("logs", "red").stdout
     assert " simulator | {" in up.fleet("logs", "simulator").stdout
     lines = [json.loads(line) for line in up.fleet("logs", "red", "--json").stdout.splitlines()]
     assert {each["name"] for each in lines} == {"red"}
-    assert any("is open. The gateway stops the car first." in each["line"] for each in lines)
+    assert any(each["line"].endswith("[link_open]") for each in lines)
     assert [each["time"] for each in lines] == sorted(each["time"] for each in lines if each["time"].endswith("Z"))
     wrong = up.fleet("logs", "gren")
     assert wrong.returncode == 2

@@ -27,16 +27,17 @@ from gateway.control.commands import (
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
     TakeLease,
     Unpause,
-    Whistle,
 )
 from gateway.control.events import CommandRecord, OutgoingFrame
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.authority import NO_PEOPLE, Estop, FleetPause, People, Sender
+from schemas.commands import Verb
 from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Platform, Rank, Reason, ServoAction, SpeedStep
 from tests.support.controls import Control, control
 
@@ -76,7 +77,7 @@ def anything(moments: random.Random) -> Action:
         case 0:
             return SetMode(moments.choice(list(Mode)))
         case 1:
-            return Whistle()
+            return Signal(Verb.WHISTLE)
         case 2:
             return SetLight(moments.choice(list(Light)))
         case 3:
@@ -214,7 +215,7 @@ class Wild:
 
     def _owe(self, what: Action) -> None:
         match what:
-            case Whistle():
+            case Signal():
                 self.owed["whistle"] += 1
             case MoveServo():
                 self.owed["servo"] += 1

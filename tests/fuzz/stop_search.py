@@ -15,7 +15,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Stop, Whistle
+from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Signal, Stop
 from gateway.control.events import CommandRecord
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.protocol.decoder import Decoder
@@ -26,6 +26,7 @@ from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
 from schemas.authority import Sender
+from schemas.commands import Verb
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
@@ -571,7 +572,7 @@ class Episode:
                     self._run(0.05 + 0.2 * moments.random())
             case "acts":
                 self._ask(Drive(Motion.FORWARD, 10.0))
-                acts: list[Action] = [Whistle()]
+                acts: list[Action] = [Signal(Verb.WHISTLE)]
                 if plan.platform == "arduino" and plan.told != "unknown":
                     acts += [AimServo(moments.randrange(181)), Led(255, 2, 3)]
                 for what in acts:

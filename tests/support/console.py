@@ -47,6 +47,10 @@ def hold_until_driving(page: Page, judge: Judge) -> None:
     raise AssertionError(page.locator(".results").inner_text())
 
 
+LEADS_ONLY = "Only a lead may (teacher)."
+"""The one sample of the words for who is no lead, where teacher is the lead."""
+
+
 class StallProxy:
     """A TCP proxy to a port of loopback. While cut, it passes nothing and closes nothing, as lost Wi-Fi does."""
 

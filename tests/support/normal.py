@@ -14,13 +14,14 @@ from gateway.control.commands import (
     MoveServo,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from gateway.control.driver import Event
 from gateway.control.link_health import LinkHealth
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.sim.model.raspberry_pi import Transport
+from schemas.commands import Verb
 from schemas.words import Light, LinkState, Mode, Motion, Phase, Reason, ServoAction, SpeedStep, Verdict
 from tests.support.truth import WORLDS
 from tests.support.virtual import Pair
@@ -148,7 +149,7 @@ def _joystick(run: NormalRun) -> None:
 def _acts(run: NormalRun) -> None:
     """Send one-shots of each kind, as fast as the queue takes them or slower."""
     one_shots: tuple[Action, ...] = (
-        Whistle(),
+        Signal(Verb.WHISTLE),
         AimServo(run.moments.randint(0, 180)),
         MoveServo(run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET))),
         Led(*(run.moments.randint(0, 255) for _ in range(3))),
@@ -162,9 +163,9 @@ def _acts(run: NormalRun) -> None:
 
 
 def _whistles(run: NormalRun) -> None:
-    """Whistle without a pause for half a minute, so that the car's loop hardly runs."""
+    """Signal without a pause for half a minute, so that the car's loop hardly runs."""
     for _ in range(80):
-        run.ask(Whistle())
+        run.ask(Signal(Verb.WHISTLE))
         run.run(0.36)
 
 

@@ -21,8 +21,8 @@ from gateway.control.commands import (
     PartAction,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from gateway.drivers.yahboom.protocol.frames import ModeOpen, encode
 from gateway.drivers.yahboom.protocol.platforms import StopStyle
@@ -30,6 +30,7 @@ from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
+from schemas.commands import Verb
 from schemas.words import Basis, CarTrust, Light, Mode, Motion, Phase, Platform, ServoAction, SpeedStep, Verdict
 from tests.support.virtual import Pair
 
@@ -45,7 +46,7 @@ RATIO = 1.5
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
 PRINTING = (Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
 READS_PINS = (Mode.REMOTE_CONTROL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
-WHISTLE = Whistle()
+WHISTLE = Signal(Verb.WHISTLE)
 MOTIONS = (Motion.FORWARD, Motion.LEFT, Motion.SPIN_RIGHT, Motion.BACK)
 
 Load = Callable[[Pair, random.Random], None]

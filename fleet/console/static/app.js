@@ -9,7 +9,7 @@ import { PeoplePage } from "./people-page.js";
 import { PlanPage } from "./plan-page.js";
 import { SessionsPage } from "./sessions-page.js";
 import { SetupPage } from "./setup-page.js";
-import { stopStates, t } from "./texts.js";
+import { modes, stopStates, t } from "./texts.js";
 import { Component, html, Icon, Refused, render, useEffect, useRef, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
@@ -43,17 +43,23 @@ function later(title, load) {
   };
 }
 
-// Each page with the drawing of its tab.
+// Each page with the drawing of its tab, 24 by 24: letters that look like symbols differ from phone to phone.
 const PAGES = {
-  "#/": [t.fleet, FleetPage, "fleet"],
-  "#/drive": [t.drive, DrivePage, "drive"],
-  "#/plan": [t.plan, PlanPage, "plan"],
-  "#/plots": [t.plots, later(t.plots, loadPlots), "plots"],
-  "#/time": [t.time, later(t.time, loadTime), "time"],
-  "#/inspect": [t.inspect, InspectPage, "inspect"],
-  "#/people": [t.people, PeoplePage, "people"],
-  "#/sessions": [t.sessions, SessionsPage, "sessions"],
-  "#/setup": [t.setup, SetupPage, "setup"],
+  "#/": [t.fleet, FleetPage, "M4 4h6v6H4zM14 4h6v6h-6zM4 14h6v6H4zM14 14h6v6h-6z"],
+  "#/drive": [t.drive, DrivePage, "M12 3v18M3 12h18M9 6l3-3 3 3M9 18l3 3 3-3M6 9l-3 3 3 3M18 9l3 3-3 3"],
+  "#/plan": [t.plan, PlanPage, "M9 6h11M9 12h11M9 18h11M4 6h1M4 12h1M4 18h1"],
+  "#/plots": [t.plots, later(t.plots, loadPlots), "M4 4v16h16M7 15l4-5 3 3 5-7"],
+  "#/time": [t.time, later(t.time, loadTime), "M3 12h18M7 8v8M12 9.500v5M17 8v8"],
+  "#/inspect": [t.inspect, InspectPage, "M11 4a7 7 0 1 0 0 14 7 7 0 0 0 0-14zM16 16l5 5"],
+  "#/people": [t.people, PeoplePage, "M12 4a4 4 0 1 0 0 8 4 4 0 0 0 0-8zM4 21c0-4 3-6 8-6s8 2 8 6"],
+  "#/sessions": [t.sessions, SessionsPage, "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM12 10a2 2 0 1 0 0 4 2 2 0 0 0 0-4z"],
+  "#/setup": [t.setup, SetupPage, "M4 7h9M17 7h3M4 17h3M11 17h9M15 5a2 2 0 1 0 0 4 2 2 0 0 0 0-4zM9 15a2 2 0 1 0 0 4 2 2 0 0 0 0-4z"],
+};
+const DRAWINGS = {
+  more: "M5 11v2M12 11v2M19 11v2",
+  stop: "M8 3h8l5 5v8l-5 5H8l-5-5V8z",
+  pause: "M8 5v14M16 5v14",
+  estop: "M12 3l9.500 17h-19zM12 10v4M12 17v.500",
 };
 
 // A phone that is held upright has room for five tabs. The last one leads to the other pages.
@@ -65,12 +71,12 @@ const tabs = () => (narrow.matches ? FEW_TABS : ALL_TABS);
 const MorePage = () => html`<h1>${t.more}</h1>
   <ul class="plain more">
     ${Object.entries(PAGES).slice(FIRST_TABS).map(
-      ([to, [name, , drawing]]) => html`<li key=${to}><a class="button" href=${to}><${Icon} name=${drawing} /> ${name}</a></li>`,
+      ([to, [name, , drawing]]) => html`<li key=${to}><a class="button" href=${to}><${Icon} path=${drawing} /> ${name}</a></li>`,
     )}
   </ul>`;
 
 const ALL_TABS = Object.entries(PAGES);
-const FEW_TABS = [...ALL_TABS.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, "more"]]];
+const FEW_TABS = [...ALL_TABS.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, DRAWINGS.more]]];
 
 // ---------------------------------------------------------------- STOP
 
@@ -153,12 +159,12 @@ function StopBar() {
     </div>`}
     <div class="stop-row">
       <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
-        <${Icon} name="stop" /><span>${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}</span>
+        <${Icon} path=${DRAWINGS.stop} /><span>${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}</span>
       </button>
       ${mayPause &&
       html`<button id="pause" class=${store.rights === null ? "later" : ""} aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>
-        <${Icon} name="pause" />${t.pause}</button>`}
-      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} name="estop" />${t.estop}</button>
+        <${Icon} path=${DRAWINGS.pause} />${t.pause}</button>`}
+      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} path=${DRAWINGS.estop} />${t.estop}</button>
     </div>
   </section>`;
 }
@@ -193,7 +199,7 @@ function Tabs({ here, shown }) {
   return html`<nav aria-label="Pages" ref=${bar}>
     ${shown.map(
       ([to, [name, , drawing]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : to === current ? "true" : undefined}
-        ><${Icon} name=${drawing} />${name}</a>`,
+        ><${Icon} path=${drawing} />${name}</a>`,
     )}
   </nav>`;
 }
@@ -269,5 +275,5 @@ class App extends Component {
   }
 }
 
-setTexts(t);
+setTexts({ ...t, modes });
 render(html`<${App} />`, document.getElementById("app"));

@@ -211,7 +211,7 @@ export function carSets(cars) {
 }
 
 // Both are there before anything is drawn: with the rights it is known whose cars come first.
-export const isReady = () => store.state !== null && store.rights !== null;
+export const isReady = () => store.hello !== null && store.state !== null && store.rights !== null;
 
 // The cars in the order of their places.
 export function carsInPlace() {
@@ -337,7 +337,7 @@ export async function ask(path, body) {
 
 // ---------------------------------------------------------------- the socket
 
-export let describe = { done: () => "", refused: () => "" };
+export let describe = { done: () => "", refused: () => "", modes: {} };
 export function setTexts(texts) {
   describe = texts;
 }
@@ -365,6 +365,7 @@ function onMessage(text) {
       break;
     case "hello":
       store.hello = message;
+      Object.assign(describe.modes, message.modes);
       break;
     case "over":
       if (store.press !== null && store.press.id === message.press) {

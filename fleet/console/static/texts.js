@@ -53,16 +53,8 @@ export const arrows = {
   spin_right: ["↻", "spins right"],
 };
 
-export const modes = {
-  manual: ["Manual", "Stops the car. Then you drive it."],
-  remote_control: ["Infrared remote", "Only the infrared remote drives the car. It reports nothing."],
-  tracking: ["Line tracking", "Drives off at once, along a line on the floor."],
-  obstacle_avoidance: ["Obstacle avoidance", "Drives off at once and avoids obstacles. It reports nothing. A stop may take 4 s."],
-  color_led: ["Color LED", "Stands and shows colors. It reports nothing."],
-  light_seeking: ["Light seeking", "Drives toward light, as soon as there is some."],
-  following: ["Following", "Drives after what is in front of it."],
-  unknown: ["Unknown", ""],
-};
+// The console says the names of the other modes, and what a car does in them, when the page connects (schemas/words.py).
+export const modes = { unknown: ["Unknown", ""] };
 
 // What people call a reading. Others are called as their fields.
 export const readings = {

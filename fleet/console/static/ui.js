@@ -4,7 +4,6 @@ import { Component, h, render } from "./vendor/preact.js";
 import { useEffect, useRef, useState } from "./vendor/preact-hooks.js";
 import htm from "./vendor/htm.js";
 import { carSets, store } from "./console.js";
-import { icon } from "./icons.js";
 import { t } from "./texts.js";
 
 export const html = htm.bind(h);
@@ -12,9 +11,9 @@ export { Component, render, useEffect, useRef, useState };
 
 // Made once: Preact passes over what is the same as before, ten times a second.
 const icons = new Map();
-export const Icon = ({ name }) => {
-  if (!icons.has(name)) icons.set(name, icon(html, name));
-  return icons.get(name);
+export const Icon = ({ path }) => {
+  if (!icons.has(path)) icons.set(path, html`<svg class="icon" viewBox="0 0 24 24" aria-hidden="true"><path d=${path} /></svg>`);
+  return icons.get(path);
 };
 
 // Chips for all cars, the person's own ones, and each group. `isOn` tells which of these sets are chosen.

@@ -20,7 +20,7 @@ from gateway.control.commands import (
     PartAction,
     SetLight,
     SetMode,
-    Whistle,
+    Signal,
 )
 from gateway.control.driver import Desk, Event, Fields
 from gateway.drivers.yahboom.car_model import CarModel
@@ -32,6 +32,7 @@ from gateway.drivers.yahboom.protocol.events import Event as WireEvent
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile
+from schemas.commands import Verb
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
@@ -140,7 +141,10 @@ class YahboomDriver(Executor):
             case Find():
                 return None
             case PartAction():
-                words = next((why for frame in self._frames_of(what) if (why := profile.refusal(frame))), None)
+                frames = self._frames_of(what)
+                words = next((why for frame in frames if (why := profile.refusal(frame))), None)
+                if isinstance(what, Signal) and not frames:
+                    return f"{car} ({profile.name}) has no {what.verb}."
                 is_unknown = believed.fan is None and not profile.fan_is_level
                 if words is None and isinstance(what, Fan) and what.on is not None and is_unknown:
                     return f"{car}'s fan state is unknown, so on/off is not possible. Toggle it: `fleet fan {car}`."
@@ -171,7 +175,7 @@ class YahboomDriver(Executor):
                 return (ColorLed(r, g, b),)
             case SetLight(light):
                 return (General(Motion.STOP, light=light),)
-            case Whistle():
+            case Signal(Verb.WHISTLE):
                 return (General(Motion.STOP, whistle=True),)
             case MoveServo(action):
                 return (General(Motion.STOP, servo=action),)

@@ -382,7 +382,8 @@ class Firmware:
             gray = round(min(1023, max(0, raw)) * traits.gray_max / 1023)
             rest = f"GS{gray},LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}"
         volts = body.battery_v(now) * traits.cells / 2
-        return self._frame(f"CSB{0.0 if cm is None else cm:.2f},PV{volts:.2f},{rest}")
+        more = f",{traits.more}" if traits.more else ""
+        return self._frame(f"CSB{0.0 if cm is None else cm:.2f},PV{volts:.2f},{rest}{more}")
 
     def _arm_frame(self, joints: list[int]) -> bytes:
         return self._frame(",".join(f"J{number}{deg}" for number, deg in enumerate(joints, 1)))

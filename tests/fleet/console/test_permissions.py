@@ -27,6 +27,7 @@ from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, Lea
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Light, Mode, Motion, Rank, SpeedStep
 from tests.gateway.control.workbench import Workbench
+from tests.support.console import LEADS_ONLY
 
 NOW = 1000.0
 PERSON, LEAD = Rank.PERSON, Rank.LEAD
@@ -118,7 +119,7 @@ def test_the_words_name_the_person_the_car_and_the_rule() -> None:
     red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
     assert refusals("red", red, EVE)[Right.MOVE] == "eve drives other cars, not red."
     assert refusals("red", red, ZED)[Right.ACT] == "zed watches and stops: the fleet file does not list zed."
-    assert refusals("red", red, ANN)[Right.PAUSE] == "Only a lead may (teacher)."
+    assert refusals("red", red, ANN)[Right.PAUSE] == LEADS_ONLY
     assert refusals("red", red, TEACHER) == {}
 
 
@@ -127,22 +128,20 @@ def test_the_recorder_and_the_plan_are_for_leads_where_the_fleet_has_some() -> N
     blue = Authority(People.parse(["teacher:lead", "eve", "ann:other"]))
     assert [management_refusal({"red": red, "blue": blue}, each) for each in (TEACHER, ANN, EVE, ZED)] == [
         "",
-        *["Only a lead may (teacher)."] * 3,
+        *[LEADS_ONLY] * 3,
     ]
-    assert management_refusal({"green": Authority(), "blue": blue}, ANN) == "Only a lead may (teacher).", (
-        "one car has leads"
-    )
+    assert management_refusal({"green": Authority(), "blue": blue}, ANN) == LEADS_ONLY, "one car has leads"
     no_leads = Authority(People.parse(["ann", "eve:other"]))
     assert [management_refusal({"red": no_leads}, each) for each in (ANN, EVE)] == ["", ""]
     assert management_refusal({"red": no_leads}, ZED) == "zed watches and stops: the fleet file does not list zed."
     assert management_refusal({"red": Authority()}, ZED) == "", "nobody is listed"
-    assert rights_of(ANN, {"red": red})["manage"] == "Only a lead may (teacher)."
+    assert rights_of(ANN, {"red": red})["manage"] == LEADS_ONLY
     assert rights_of(ANN, {})["manage"] == ""
 
 
 def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
     strict = Authority(People.parse(["teacher:lead", "ann"]))
-    assert rights_of(ANN, {"red": strict})["pause"] == "Only a lead may (teacher)."
+    assert rights_of(ANN, {"red": strict})["pause"] == LEADS_ONLY
     assert rights_of(ANN, {"red": strict, "blue": Authority()})["pause"] == ""
     assert rights_of(TEACHER, {"red": strict})["cars"] == {"red": {}}
     assert rights_of(ANN, {})["pause"] == ""

@@ -51,7 +51,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import car_token, command_key, person_of, topic_key
 from schemas.messages import encoding_of
 from schemas.topics import Qos
-from tests.support.console import ConsoleProcess
+from schemas.words import MODE_TEXTS
+from tests.support.console import LEADS_ONLY, ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
 from tests.support.page_flood import HALF_REQUESTS, PLAN, half_request, start_flood
@@ -207,6 +208,7 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
     with teacher.socket() as page:
         hello = json.loads(page.recv())
     assert hello["person"] == {"name": "teacher", "rank": "lead"}
+    assert hello["modes"] == {mode: list(words) for mode, words in MODE_TEXTS.items()}
     stage.drive()
     assert device.ask("POST", "/stop", Origin="https://evil.example")[0] == 403
     assert device.ask("POST", "/stop", Host=f"evil.example:{stage.lan_port}")[0] == 403
@@ -263,7 +265,7 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
     plan = "roles:\n  guide: {mode: trackin}\n"  # a good one would start
     for path in ("/recording/start", "/recording/stop", "/plan/set"):
-        refused = {"ok": False, "words": "Only a lead may (teacher)."}
+        refused = {"ok": False, "words": LEADS_ONLY}
         status, text = driver.ask("POST", path, plan)
         assert (status, json.loads(text)) == (403, refused), path
         assert answer(stage.console.port, "POST", path, plan, **own)[0] == 403, "this computer's person is no lead"
@@ -271,11 +273,11 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
         assert status == 200
         assert "Did you mean tracking?" in text.decode() or "is on the bus" in text.decode(), "passed on"
     with driver.socket() as page:
-        assert next_message(page, "rights")["manage"] == "Only a lead may (teacher)."
+        assert next_message(page, "rights")["manage"] == LEADS_ONLY
         page.send(json.dumps({"t": "plan", "id": 7, "verb": "stop"}))
-        assert next_message(page, "plan_done")["words"] == "Only a lead may (teacher)."
+        assert next_message(page, "plan_done")["words"] == LEADS_ONLY
         page.send(json.dumps({"t": "pause", "id": "p1", "why": "x"}))  # the page may not claim that all stopped
-        assert next_message(page, "bad")["words"] == "Only a lead may (teacher)."
+        assert next_message(page, "bad")["words"] == LEADS_ONLY
     for path in ("/recording/status", "/recording/mark", "/plan/check"):
         assert driver.ask("POST", path, plan)[0] == 200, "for everyone"
     assert driver.ask("GET", "/sessions")[0] == 200

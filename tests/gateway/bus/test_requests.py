@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.bus import requests
-from gateway.bus.requests import BadRequest, RawRequest, parse
+from gateway.bus.requests import BadRequest, parse
+from gateway.bus.service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,
@@ -25,18 +26,16 @@ from gateway.control.commands import (
     Led,
     MoveArm,
     MoveServo,
-    PartAction,
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
     TakeLease,
-    Whistle,
 )
-from gateway.drivers.yahboom.protocol.frames import Frame, General
 from schemas import messages
 from schemas.authority import Sender
-from schemas.commands import COMMANDS
+from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
@@ -44,9 +43,11 @@ from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedS
 NOW = 1_800_000_000_000_000_000
 
 
-def ask(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> Command:
+def ask(
+    verb: str, payload: Any, encoding: str = messages.JSON, *, longest_drive_s: float = 10.0, **more: Any
+) -> Command:
     data = payload if isinstance(payload, bytes | None) else json.dumps(payload).encode()
-    return parse(RawRequest(verb, data, encoding, NOW, **more))
+    return parse(Request(verb, data, encoding, **more), NOW, longest_drive_s=longest_drive_s)
 
 
 def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> BadRequest:
@@ -56,10 +57,10 @@ def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any)
     return caught.value
 
 
-def parsed(request: RawRequest) -> tuple[Command, str]:
+def parsed(request: Request) -> tuple[Command, str]:
     """Return the command. If the request is bad, return the known part of the command, and the reason."""
     try:
-        return parse(request), ""
+        return parse(request, NOW), ""
     except BadRequest as error:
         return error.command, error.words or "no words"
 
@@ -82,7 +83,7 @@ def parsed(request: RawRequest) -> tuple[Command, str]:
         ("servo", {"servo": "vertical", "action": "up"}, MoveServo(ServoAction.VERTICAL_UP)),
         ("servo", {"servo": "horizontal", "action": "right"}, MoveServo(ServoAction.HORIZONTAL_RIGHT)),
         ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, MoveArm((0, 180, 1, 2, 3, 4))),
-        ("whistle", {}, Whistle()),
+        ("whistle", {}, Signal(Verb.WHISTLE)),
         ("speed", {"step": "up"}, ChangeSpeed(SpeedStep.UP)),
         ("speed", {"step": "down"}, ChangeSpeed(SpeedStep.DOWN)),
         ("fan", {}, Fan(None)),
@@ -114,30 +115,29 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
 
 def test_every_verb_of_the_table_is_known_here() -> None:
     for verb in COMMANDS:
-        assert (verb, parsed(RawRequest(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
-    assert sorted([*requests._WHAT, *PLAIN_ACTIONS, "drive"]) == sorted(COMMANDS), "each verb once"
+        assert (verb, parsed(Request(verb, b"{}", messages.JSON))[0].verb) == (verb, verb)
+    signals = [verb for verb, row in COMMANDS.items() if row.signal]
+    assert sorted([*requests._WHAT, *PLAIN_ACTIONS, *signals, "drive"]) == sorted(COMMANDS), "each verb once"
 
 
-def test_the_fields_of_a_plain_action_are_flags_and_durations() -> None:
+def test_the_fields_of_a_plain_action_are_flags() -> None:
     found = {field.name: field.type for action in PLAIN_ACTIONS.values() for field in fields(action)}
-    assert all(each is bool for name, each in found.items() if name != "duration_s")
+    assert all(each is bool for each in found.values())
 
 
-@dataclass(frozen=True)
-class Horn(PartAction):
-    """A verb with a duration, made from `lend`, whose message has one."""
-
-    duration_s: float
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        return (General(Motion.STOP, whistle=True),) * math.ceil(self.duration_s)
+def test_the_message_of_a_signal_has_its_duration_at_most() -> None:
+    common = {field.name for field in pb.StopCommand.DESCRIPTOR.fields}
+    for row in COMMANDS.values():
+        if row.signal:
+            own = {field.name for field in messages.message_class(row.message).DESCRIPTOR.fields} - common
+            assert own == ({"duration_s"} if row.max_duration_s else set())
 
 
-def test_a_plain_action_with_a_duration_has_the_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_with_a_duration_has_the_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made from `lend`, whose message has a duration."""
+    monkeypatch.setattr(requests, "COMMANDS", {**COMMANDS, "lend": replace(COMMANDS["lend"], signal=True)})
     monkeypatch.delitem(requests._WHAT, "lend")
-    monkeypatch.setattr(requests, "PLAIN_ACTIONS", {**PLAIN_ACTIONS, "lend": Horn})
-    assert ask("lend", {"duration_s": 86_400}).what == Horn(86_400.0)
+    assert ask("lend", {"duration_s": 86_400}).what == Signal(Verb.LEND, 86_400.0)
     for wrong in (86_401, 0, -1, "NaN", "Infinity"):
         assert "duration_s" in refused("lend", {"duration_s": wrong}).words
     assert "duration_s 0: allowed are more than 0" in refused("lend", {}).words
@@ -264,7 +264,7 @@ def test_another_verbs_message_is_refused() -> None:
 
 @pytest.mark.parametrize("encoding", ["", messages.JSON, PROTOBUF])
 def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
-    assert ask("whistle", b"", encoding).what == Whistle()
+    assert ask("whistle", b"", encoding).what == Signal(Verb.WHISTLE)
     assert ask("stop", b"", encoding).what == Stop()
     assert "motion is missing" in refused("drive", b"", encoding).words
 
@@ -334,7 +334,7 @@ WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward",
 def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
     verb: str, payload: bytes | None, encoding: str, sampled_ns: int | None, by_wildcard: bool
 ) -> None:
-    request = RawRequest(verb, payload, encoding, NOW, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
+    request = Request(verb, payload, encoding, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
     command, words = parsed(request)
     assert words != "no words"
     assert command.verb == verb

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 
-from gateway.bus.service import MAX_QUEUED_HISTORY_QUERIES, MAX_QUEUED_QUERIES, CarService
+from gateway.bus.service import MAX_QUEUED_HISTORY_QUERIES, MAX_QUEUED_QUERIES, CarService, Request
 from schemas import bus, keys
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
@@ -21,8 +20,7 @@ class Hall:
 
     def __init__(self, doors: CarService) -> None:
         self.doors = doors
-        self.commands: list[tuple[zenoh.Query, str]] = []
-        self.drives: list[bus.Sample] = []
+        self.requests: list[Request] = []
         self.batches: list[Mapping[str, bool]] = []
         self.values, self.histories = asyncio.Event(), asyncio.Event()
 
@@ -31,8 +29,7 @@ class Hall:
             asyncio.get_running_loop(),
             values=self.values,
             histories=self.histories,
-            command=self.commands.append,
-            streamed=self.drives.append,
+            command=self.requests.append,
             senders=self.batches.append,
             cars=lambda _: None,
         )
@@ -48,7 +45,7 @@ async def hall(tmp_path: Path) -> AsyncIterator[tuple[Hall, bus.Bus]]:
         there = Hall(CarService(opened, "fleet", "red"))
         await there.until(lambda: fleet.bus.tokens("fleet/red"), "its doors are open")
         yield there, fleet.bus
-        there.commands.clear()
+        there.requests.clear()
     fleet.close()
 
 
@@ -64,16 +61,17 @@ async def test_what_is_too_large_is_handed_over_with_the_reason_and_not_read(hal
     there.attach()
     for verb in ("drive", "stop"):
         await asyncio.to_thread(ask, asker, f"@cmd/{verb}", LARGE)
-    await there.until(lambda: len(there.commands) == 2, "both commands")
-    assert {words for _, words in there.commands} == {
+    await there.until(lambda: len(there.requests) == 2, "both commands")
+    assert {each.unread for each in there.requests} == {
         "a payload of 5000000 bytes is too large: at most 65536 are read, so nothing of it was"
     }
-    assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.commands[0][1]]
+    assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.requests[0].unread]
     (long,) = await asyncio.to_thread(ask, asker, f"state/link?a={'x' * 5000}")
     assert long.endswith("characters: at most 4096 are read")
     asker.put_command(keys.command_key("fleet", "red", "drive"), LARGE, "application/json")
-    await there.until(lambda: there.drives, "a streamed drive")
-    assert (there.drives[0].payload, there.drives[0].unread) == (b"", there.commands[0][1])
+    await there.until(lambda: len(there.requests) == 3, "a streamed drive")
+    assert (there.requests[2].streamed, there.requests[2].payload) == (True, b"")
+    assert there.requests[2].unread == there.requests[0].unread
 
 
 async def test_questions_of_the_past_wait_by_themselves_and_not_too_many(hall: tuple[Hall, bus.Bus]) -> None:
@@ -104,8 +102,8 @@ async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall
     assert await asyncio.to_thread(fill) == [bus.BUSY] * 2
     assert set(await asyncio.to_thread(ask, asker, "@cmd/stop")) == {"Timeout"}
     there.attach()
-    await there.until(lambda: len(there.commands) == MAX_QUEUED_QUERIES + 1, "all that waited")
-    assert str(there.commands[-1][0].key_expr).endswith("/stop"), "and none after a stop that came before it"
+    await there.until(lambda: len(there.requests) == MAX_QUEUED_QUERIES + 1, "all that waited")
+    assert there.requests[-1].verb == "stop", "and none after a stop that came before it"
 
 
 async def test_changes_of_a_token_are_merged(hall: tuple[Hall, bus.Bus]) -> None:

@@ -27,12 +27,13 @@ from gateway.control.commands import (
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
     TakeLease,
     Unpause,
-    Whistle,
 )
 from schemas.authority import Authority, Estop, Hold, LeaseState, Sender
+from schemas.commands import Verb
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
@@ -52,7 +53,7 @@ WHATS: list[Action] = [
     SetMode(Mode.TRACKING),
     SetMode(Mode.MANUAL),
     SetLight(Light.RED),
-    Whistle(),
+    Signal(Verb.WHISTLE),
     MoveServo(ServoAction.FRONT_LEFT),
     Led(1, 2, 3),
     AimServo(90),
@@ -188,7 +189,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
 def test_who_moves_a_part_needs_the_lease() -> None:
     parts = [what for what in WHATS if isinstance(what, PartAction)]
     without = {type(what) for what in parts if not what.needs_lease}
-    assert without == {Led, SetLight, Whistle}
+    assert without == {Led, SetLight, Signal}
     assert {type(what) for what in parts} - without == {MoveServo, AimServo, MoveArm, ChangeSpeed, Fan}
 
 

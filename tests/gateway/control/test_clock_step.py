@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.bus.requests import RawRequest, parse
+from gateway.bus.requests import parse
+from gateway.bus.service import Request
 from gateway.control.commands import Answer
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from schemas import messages
@@ -41,8 +42,8 @@ class Gateway:
         name = COMMANDS[verb].message
         message: Any = messages.message_class(name)(sender=sender, kind="person", **fields)
         message.asked.seconds = min(max(self.wall_ns // S + ahead_s, -(1 << 63)), (1 << 63) - 1)
-        request = RawRequest(verb, message.SerializeToString(), messages.encoding_of(name), self.wall_ns)
-        answer = self.desk.control.command(parse(request), self.desk.now)
+        request = Request(verb, message.SerializeToString(), messages.encoding_of(name))
+        answer = self.desk.control.command(parse(request, self.wall_ns), self.desk.now)
         self.desk.pump()
         return answer
 

@@ -22,8 +22,8 @@ from gateway.control.commands import (
     Resume,
     SetLight,
     SetMode,
+    Signal,
     Stop,
-    Whistle,
 )
 from gateway.control.safety import PersistedSafety
 from gateway.drivers.yahboom.protocol.frames import ModeOpen, parse_sent
@@ -32,6 +32,7 @@ from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.stopping import RETRY_S
 from gateway.sim.model.traits import CarTraits
 from schemas.authority import Hold, Sender
+from schemas.commands import Verb
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.words import (
     Basis,
@@ -62,7 +63,7 @@ from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 
 ASKED, QUEUED, SENT, COMPLETE = Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE
-WHISTLE = Whistle()
+WHISTLE = Signal(Verb.WHISTLE)
 LIGHT = SetLight(Light.RED)
 FORWARD = Drive(Motion.FORWARD, 5.0)
 

@@ -8,20 +8,27 @@ from typing import Final
 
 from gateway.control.driver import Rejected
 from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
-from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Reject, read_sensors, sensors_matcher
+from gateway.drivers.yahboom.protocol.sensors import (
+    SENSOR_FIELDS,
+    SENSOR_WORDS,
+    FrameWords,
+    Reject,
+    read_sensors,
+    sensors_matcher,
+)
 from schemas.words import Cause
 
 JOINT_MAX: Final = 180.0  # docs/reference/protocol.md#ranges: "ranges a reading must be in"
 
-_SENSORS: Final = tuple(field.word for field in SENSOR_FIELDS)
-_ARM: Final = (b"J1", b"J2", b"J3", b"J4", b"J5", b"J6")
-_IMU: Final = (b"MPUgx", b"MPUgy", b"MPUgz", b"MPUax", b"MPUay", b"MPUaz")
-_WORD: Final = re.compile(rb"(%b|(?:Servo)?J1|J[2-6]|MPU[ga][xyz])(.*)" % b"|".join(_SENSORS), re.DOTALL)
+_ARM: Final = FrameWords((b"J1", b"J2", b"J3", b"J4", b"J5", b"J6"))
+_IMU: Final = FrameWords((b"MPUgx", b"MPUgy", b"MPUgz", b"MPUax", b"MPUay", b"MPUaz"))
+_SENSOR_WORD: Final = b"|".join(field.word for field in SENSOR_FIELDS)
+_WORD: Final = re.compile(rb"(%b|(?:Servo)?J1|J[2-6]|MPU[ga][xyz])(.*)" % _SENSOR_WORD, re.DOTALL)
 _UNSIGNED, _SIGNED = re.compile(rb"[0-9]+(?:\.[0-9]+)?"), re.compile(rb"-?[0-9]+(?:\.[0-9]+)?")
 _NUMBER: Final = {
     **{field.word: re.compile(field.pattern) for field in SENSOR_FIELDS},
-    **dict.fromkeys(_ARM, _UNSIGNED),
-    **dict.fromkeys(_IMU, _SIGNED),
+    **dict.fromkeys(_ARM.words, _UNSIGNED),
+    **dict.fromkeys(_IMU.words, _SIGNED),
 }
 
 
@@ -43,10 +50,10 @@ def parse(raw: bytes, at: float, head: str) -> Event:
             return Rejected(raw, at, Cause.UNKNOWN_WORD, f"{_printable(field)} begins with no word of the table")
         words.append(found[1].removeprefix(b"Servo"))
         texts.append(found[2])
-    table = next((known for known in (_SENSORS, _ARM, _IMU) if words and words[0] in known), _SENSORS)
-    if missing := [word.decode() for word in table if word not in words]:
-        return Rejected(raw, at, Cause.MISSING_WORD, f"no {', '.join(missing)}")
-    if tuple(words) != table:
+    table = next((known for known in (_ARM, _IMU) if words and words[0] in known.words), SENSOR_WORDS)
+    if missing := table.missing(words):
+        return Rejected(raw, at, Cause.MISSING_WORD, f"no {', '.join(word.decode() for word in missing)}")
+    if not table.are_in_order(words):
         return Rejected(raw, at, Cause.UNKNOWN_WORD, "a word twice, out of its order, or of another frame")
     for word, text in zip(words, texts, strict=True):
         if not _NUMBER[word].fullmatch(text):

@@ -5,7 +5,7 @@ an attribute of `Sensors`, and a variable in `read_sensors`.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
@@ -74,6 +74,24 @@ SENSOR_FIELDS: Final = (
     SensorField("obstacle", "obstacle", b"HW", rb"[0-9]{2}", _BITS_2.get, _sides),
     SensorField("light", "light", b"GM", rb"[0-9]{2}", _BITS_2.get, _sides),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameWords:
+    """The words of one kind of frame, in wire order."""
+
+    words: tuple[bytes, ...]
+
+    def missing(self, found: Sequence[bytes]) -> list[bytes]:
+        """Return the words that the frame must have and does not have."""
+        return [word for word in self.words if word not in found]
+
+    def are_in_order(self, found: Sequence[bytes]) -> bool:
+        """Return True if these are the words of such a frame, each once and in its place."""
+        return tuple(found) == self.words
+
+
+SENSOR_WORDS: Final = FrameWords(tuple(field.word for field in SENSOR_FIELDS))
 ATTRIBUTES: Final = {field.measurement: field.attribute for field in SENSOR_FIELDS}
 
 

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from gateway.control.commands import AimServo, Drive, EmergencyStop, Led, SetLight, SetMode, Stop, Whistle
+from gateway.control.commands import AimServo, Drive, EmergencyStop, Led, SetLight, SetMode, Signal, Stop
 from gateway.drivers.waveshare import driver as waveshare
 from gateway.drivers.waveshare.chassis import FULL_SPEED
 from gateway.sim.model.ir_remote import Button
+from schemas.commands import Verb
 from schemas.words import Basis, CarTrust, Light, Mode, Motion, Motors, Phase, Reason, Shows
 from tests.fuzz.ugv_search import SETTLED_S, UgvEpisode
 
@@ -153,7 +154,7 @@ def test_the_stop_of_a_person_waits_for_nothing() -> None:
 
 def test_what_such_a_car_lacks_is_refused_and_its_lights_work() -> None:
     episode = ready("wave_rover")
-    for what in (Led(1, 2, 3), Whistle(), AimServo(1), SetLight(Light.RED), SetMode(Mode.TRACKING)):
+    for what in (Led(1, 2, 3), Signal(Verb.WHISTLE), AimServo(1), SetLight(Light.RED), SetMode(Mode.TRACKING)):
         assert episode.ask(what) is Phase.REJECTED
     episode.ask(SetLight(Light.WHITE))
     episode.run(0.5)

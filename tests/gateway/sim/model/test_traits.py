@@ -5,9 +5,11 @@ from itertools import pairwise
 
 import pytest
 
+from gateway.control.driver import Rejected
+from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.words import Mode
+from schemas.words import Cause, Mode
 from tests.gateway.sim.strangers import FAN, MODE00, PTZ90, RUN, STOP, WHISTLE, VirtualStranger, opening, virtual
 
 COLOR = b"$4WD,CLR255,CLG0,CLB0#"
@@ -224,3 +226,11 @@ async def test_constants_in_place_of_four_readings() -> None:
     car = virtual(traits=CarTraits(constants=True))
     await car.until_received(46)
     assert re.match(rb"\$4WD,CSB[0-9.]+,PV[0-9.]+,GS0,LF0000,HW00,GM00#", car.received)
+
+
+async def test_a_report_with_a_field_of_its_own_is_damage_and_no_reading() -> None:
+    car = virtual(traits=CarTraits(more="TP31.5"))
+    await report_times(car, 3.0)
+    events = Decoder().feed(bytes(car.received), car.now)
+    assert len(events) >= 2
+    assert {(type(each), each.raw[-8:], each.cause) for each in events} == {(Rejected, b",TP31.5#", Cause.UNKNOWN_WORD)}
