@@ -20,6 +20,9 @@ from schemas.words import BatteryAction, BatteryLevel
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
+    from schemas.bus import Bus
+    from schemas.links import LinkUrl
+
 COMMANDS: Final = {
     "sim": ("gateway.sim.cli", "simulated cars that behave like real ones, hazards included"),
     "scan": ("gateway.tools.scan", "the ports and Bluetooth devices there are, and which of them are cars"),
@@ -184,8 +187,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.drivers import check_platform
     from gateway.link import BadUrl, LinkError, parse_url
-    from schemas import identity
-    from schemas.bus import BadEndpoint, Bus, BusError
+    from schemas.bus import BadEndpoint, BusError
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
@@ -211,7 +213,7 @@ def _run(arguments: argparse.Namespace) -> int:
         )
         return _failed(message, 2)
     try:
-        with Bus.open(arguments.connect, start_hub=True, identity=identity.car(car)) as opened:
+        with _opened(arguments, car, url, platform, fleet) as opened:
             service = CarService(opened, fleet, car)
             # The car is on the bus now. The following imports take as long again.
             import asyncio
@@ -256,6 +258,26 @@ def _run(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:  # a second Ctrl-C, after the car was stopped
         return startup.INTERRUPTED
     return 0 if stopped else 1
+
+
+def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: str, fleet: str) -> "Bus":
+    """Return the bus. If it is away, stop the car first, which may still do what it was told. Raises BusError."""
+    from schemas import identity
+    from schemas.bus import BadEndpoint, Bus, BusError, resolve_endpoint
+
+    try:
+        return Bus.open(arguments.connect, start_hub=True, identity=identity.car(car))
+    except BadEndpoint:
+        raise
+    except BusError as error:
+        from pathlib import Path
+
+        from gateway.stop_alone import stop_alone
+        from schemas.state_dir import directory_of
+
+        where = resolve_endpoint(arguments.connect)
+        state_dir = directory_of(where, Path(arguments.state_dir) if arguments.state_dir else None)
+        raise BusError(f"{error} {stop_alone(car, url, platform, fleet, state_dir)}") from error
 
 
 def _failed(message: str, code: int) -> int:

@@ -10,7 +10,8 @@ import pytest
 from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S, cut_links
-from tests.support.processes import FleetProcesses, wait_for
+from tests.support.ports import free_port
+from tests.support.processes import FleetProcesses, driving, wait_for
 
 
 @pytest.mark.soak
@@ -50,3 +51,33 @@ def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fl
     assert (answer["status"], answer["reason"]) == ("rejected", "link_down")
     assert answer["words"].startswith("NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car.")
     assert judge.driving
+
+
+@pytest.mark.parametrize("platform", ["arduino", "ugv_rover"])
+def test_a_gateway_that_finds_no_hub_stops_the_car_all_the_same(
+    platform: str, fleet: FleetProcesses, tmp_path: Path
+) -> None:
+    """The network is away. The watchdog has ended a gateway whose car drives, and its successor starts."""
+    sim, (link,) = fleet.simulate(f"red:{platform}:tcp", truth=True)
+    gateway = fleet.gateway(link, platform=platform)
+    fleet.ready()
+    fleet.ask("drive", motion="forward", duration_s=10)
+    wait_for(lambda: driving(sim), "it drives")
+    gateway.kill()
+    assert driving(sim)
+    successor = fleet.start(
+        "-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", platform, "--retry",
+        "--connect", f"tcp/192.0.2.1:{free_port()}", "--state-dir", str(tmp_path / "state"),
+    )  # fmt: skip
+    assert successor.wait() == 1
+    assert not driving(sim)
+    assert "red was stopped without it" in successor.stderr
+
+
+def test_a_gateway_that_finds_neither_hub_nor_car_says_both(fleet: FleetProcesses) -> None:
+    alone = fleet.start(
+        "-m", "gateway.cli", "run", "--car", "red", "--link", f"tcp://127.0.0.1:{free_port()}", "--platform",
+        "arduino", "--connect", f"tcp/192.0.2.1:{free_port()}",
+    )  # fmt: skip
+    assert alone.wait() == 1
+    assert "red was not stopped either" in alone.stderr

@@ -1,0 +1,78 @@
+"""Stops a car without the bus: the gateway starts, its hub is away, and the car may still do what it was told last.
+
+Without it, a gateway that its watchdog has ended in an outage of the network would leave a moving car alone, since its
+successor waits for the hub first. Nothing is taken from the bus here, and nothing is claimed on it.
+"""
+
+import asyncio
+import contextlib
+import time
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from gateway import drivers
+from gateway.control.controller import Controller
+from gateway.control.driver import Driver
+from gateway.learned_file import LearnedFile
+from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link_loop import at_rate
+from schemas.links import car_link
+
+_STOP_POLL_S: Final = 0.05
+"""Interval at which the stop goes on. Frames are tens of milliseconds apart."""
+
+
+def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
+    """Stop the car without the bus, and return what became of it as a sentence for a person."""
+    try:
+        why_not = asyncio.run(_stop(car, url, platform, fleet, state_dir))
+    except LinkError as error:
+        return f"{car} was not stopped either: {error}"
+    return f"{car} may be moving: {why_not}" if why_not else f"{car} was stopped without it."
+
+
+async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
+    """Open the link, stop the car, close the link. Return what became of it, in words. Raises LinkError."""
+    learned = LearnedFile(state_dir, fleet, car, link=car_link(url), platform=platform)
+    loop = asyncio.get_running_loop()
+    make = learned.load(partial(drivers.driver_of, platform))
+    control = Controller[Driver](car, make, now=loop.time(), now_ns=time.time_ns())
+    driver = control.driver
+    link = await open_link(at_rate(url, driver.model.profile.baud), first=True)
+    control.link_up(loop.time())
+    driver.shut_down(loop.time())
+    reads = asyncio.ensure_future(_read(link, driver))
+    try:
+        while not driver.finished:
+            await _write(link, driver)
+            if reads.done():
+                reads.result()
+            await asyncio.sleep(_STOP_POLL_S)
+            control.tick(loop.time())
+    except LinkLost as error:
+        driver.link_down(str(error), loop.time())
+    finally:
+        reads.cancel()
+        with contextlib.suppress(asyncio.CancelledError, LinkLost):
+            await reads
+        await link.close()
+    return driver.not_stopped
+
+
+async def _read(link: Link, driver: Driver) -> None:
+    loop = asyncio.get_running_loop()
+    while True:
+        data = await link.read()
+        for event in driver.feed(data, loop.time()):
+            driver.on_event(event, loop.time())
+
+
+async def _write(link: Link, driver: Driver) -> None:
+    loop = asyncio.get_running_loop()
+    for event in driver.flush(loop.time()):
+        driver.on_event(event, loop.time())
+    while (write := driver.poll(loop.time())) is not None:
+        driver.sends(write.data, loop.time())
+        await link.write(write.data)
+        driver.on_written(write, loop.time())
