@@ -178,6 +178,7 @@ class CarGateway:
             command=self._commands.on_request,
             senders=self._on_sender_tokens,
             cars=self._estop_sync.on_tokens,
+            poses=self._on_poses,
         )
         work = (
             self._link.keep_open(may_fail=self._settings.retry, is_in_use=self._is_port_in_use),
@@ -276,6 +277,11 @@ class CarGateway:
         for name, alive in changed.items():
             self._control.on_sender_token(name, alive=alive, now=now)
         self._wake.set()
+
+    def _on_poses(self, newest: Mapping[str, bus.Sample]) -> None:
+        """Keep a pose that somebody published, for queries."""
+        for sample in newest.values():
+            self._publisher.keep_pose(sample, self._loop.time())
 
     def _merge(self, other: PersistedSafety, source: str) -> None:
         now = self._loop.time()

@@ -32,6 +32,8 @@ class Service(StrEnum):
     RECORDER = "recorder"
     CONSOLE = "console"
     SIMULATOR = "sim"
+    LOCATOR = "locator"
+    """A program that measures where cars are, such as a camera above the floor."""
 
 
 ANONYMOUS: Final = "anonymous"
@@ -101,6 +103,14 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
             return name == Service.CONSOLE and not is_coordinator
         case IdentityRole.SITE:
             return False  # it passes on what others send under their own identities
+
+
+def may_locate(identity: str, of: str) -> bool:
+    """Return True if an identity may publish the pose of this car: its own gateway, and a locator.
+
+    identity: empty on a hub without certificates; everyone may there.
+    """
+    return identity in ("", car(of), service(Service.LOCATOR))
 
 
 def sender_for(identity: str, sender: str, verb: str) -> str:

@@ -78,6 +78,8 @@ _READING: Final = 3.0
 _STATE: Final = 3.0
 _TRACKING_HZ: Final = 27.0  # docs/reference/protocol.md#rates: the most frames the UART carries, in tracking
 _MODES: Final = (*Mode, UNKNOWN)
+_PLACE_M: Final = (-1000.0, 1000.0)
+"""Range of a place on a floor, in m."""
 
 CAR_TOPICS: Final = (
     Topic(
@@ -166,6 +168,17 @@ CAR_TOPICS: Final = (
         {"roll_rad": "rad", "pitch_rad": "rad", "yaw_rad": "rad"},
         {f"{axis}_rad": (-math.pi, math.pi) for axis in ("roll", "pitch", "yaw")},
         entity="attitude",
+    ),
+    Topic(
+        "sensor/pose",
+        "fleet.v1.Pose",
+        "where the car is, by odometry or a program outside of it",
+        Qos.READING,
+        20.0,
+        _READING,
+        {"x_m": "m", "y_m": "m", "yaw_rad": "rad", "xy_std_m": "m", "yaw_std_rad": "rad"},
+        {"x_m": _PLACE_M, "y_m": _PLACE_M, "yaw_rad": (-math.pi, math.pi)},
+        entity="pose",
     ),
     Topic(
         "sensor/arm",

@@ -9,6 +9,7 @@ import os
 import queue
 import re
 import socket
+import threading
 import time
 import uuid
 import weakref
@@ -44,13 +45,14 @@ from fleet.client.job_threads import JobThreads
 from fleet.client.lease import Lease
 from fleet.client.lost_hub import explained
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
+from fleet.client.pose import pose_message
 from fleet.client.reading import Reading, Watch, reading_of
 from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
-from schemas.bus import Bus, BusError, Failure, NoFleet, Sample, canon
+from schemas.bus import Bus, BusError, Failure, NoFleet, Publisher, Sample, canon
 from schemas.commands import COMMANDS, Verb
-from schemas.identity import IdentityRole
+from schemas.identity import IdentityRole, may_locate
 from schemas.identity import parse as parse_identity
 from schemas.topics import Qos
 from schemas.words import ProcessKind, Rank, RunState, Scope
@@ -135,6 +137,9 @@ class Fleet:
         self._closed = False
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
+        self._poses: dict[str, Publisher] = {}
+        """By car: what publishes its poses."""
+        self._pose_lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         # The query of a gateway that hangs occupies its thread for 10 s. A stop never waits for such a thread.
         self._stop_pool = JobThreads(_MAX_STOP_THREADS, "fleet-stop")
@@ -265,6 +270,41 @@ class Fleet:
                 if coming is not None and waiting.ends(coming, datetime.now(UTC), time.monotonic()):
                     return coming
         raise waiting.timeout_error(written, timeout_s or 0.0, datetime.now(UTC))
+
+    # ------------------------------------------------------------------ poses
+
+    def publish_pose(
+        self,
+        car: str,
+        *,
+        x_m: float,
+        y_m: float,
+        yaw_rad: float,
+        frame: str = "map",
+        at: datetime | None = None,
+        xy_std_m: float | None = None,
+        yaw_std_rad: float | None = None,
+    ) -> None:
+        """Publish where a car is, as this program has measured it from outside: `sensor/pose` (REP-103).
+
+        Cars of one `frame` are on one map. yaw_rad: counter-clockwise from the x axis, any number. at: when it was
+        measured (default: now), with its time zone. xy_std_m, yaw_std_rad: standard deviations, only if they are known.
+        Raises ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with
+        certificates unless this is that of `service.locator`.
+        """
+        self._check_open()
+        message = pose_message(x_m, y_m, yaw_rad, frame, xy_std_m, yaw_std_rad)
+        if not may_locate(self.bus.identity, check_car(car)):
+            raise BusError(
+                f"{self.bus.identity} may not say where {car} is, so the hub would drop it. Open the fleet with "
+                'identity="service.locator"; on another computer, `fleet hub invite --service locator` invites it.'
+            )
+        with self._pose_lock:
+            if car not in self._poses:
+                topic = topics.TOPICS["sensor/pose"]
+                self._poses[car] = self.bus.publisher(keys.topic_key(self.name, car, topic.name), topic, car)
+            when = datetime.now(UTC) if at is None else at
+            self._poses[car].put(message, round(when.timestamp() * 1e6) * 1000)
 
     # ------------------------------------------------------------------ commands
 

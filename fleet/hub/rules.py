@@ -6,6 +6,7 @@ that, an identity speaks only as itself:
 - The gateway of a car publishes and answers under the keys of its car.
 - A service publishes and answers under its own keys, such as `@recorder/**`. The simulator also publishes the true
   state of its cars.
+- A locator publishes where the cars are (`sensor/pose`), and nothing else of them.
 - A command has the identity of its sender in its key: `fleet/red/@cmd/@by/person.mia/drive`. Only `person.mia` may send
   under it. What Mia may do is decided by the gateway, from `people:` of the fleet file, as on a hub without rules. So a
   change of `people:` needs no other rules.
@@ -20,7 +21,7 @@ from typing import Any, Final
 
 from schemas import keys
 from schemas.bus.credentials import HUB
-from schemas.identity import IdentityRole, Service, parse
+from schemas.identity import IdentityRole, Service, parse, service
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 """Messages that ask for something."""
@@ -103,6 +104,10 @@ def _answers(identity: str) -> list[dict[str, Any]]:
     if known is None:
         return []
     role, name = known
+    # Others ask with wildcards: what a rule does not include never arrives.
+    is_asked = _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS))
+    if identity == service(Service.LOCATOR):
+        return [_rule(f"{identity} tells", "ingress", _TELLS, ("*/*/sensor/pose", "*/*/sensor/pose/@adv/**")), is_asked]
     if role is IdentityRole.PERSON or (role is IdentityRole.SERVICE and name not in _OWN_SERVICE):
         return []
     chunk = name if role is IdentityRole.CAR else _OWN_SERVICE[Service(name)]
@@ -113,8 +118,7 @@ def _answers(identity: str) -> list[dict[str, Any]]:
     return [
         _rule(f"{identity} tells", "ingress", _TELLS, own),
         _rule(f"{identity} answers", "ingress", ("reply", "declare_queryable"), commands),
-        # Others ask with wildcards: what a rule does not include never arrives.
-        _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS)),
+        is_asked,
         _rule(f"{identity} is driven", "egress", ("put",), commands),
     ]
 

@@ -94,6 +94,7 @@ def _tracks(topic: str, what: str, *fields: str) -> tuple[StateTrack, ...]:
 
 
 TRUTH: Final = "sim/truth"
+POSE: Final = "sensor/pose"
 WORLD: Final = "@sim/world"
 COMMAND_TOPIC: Final = "event/command"
 ASSIGNMENT: Final = "@coordinator/assignment"
@@ -156,6 +157,8 @@ _SENSOR_PANELS: Final = (
         "Attitude",
         curves=tuple(Curve("sensor/attitude", f"{axis}_rad", f"{axis} (rad)") for axis in ("roll", "pitch", "yaw")),
     ),
+    Panel("Pose", curves=tuple(Curve(POSE, name, f"{name[0]} ({_unit(POSE, name)})") for name in ("x_m", "y_m"))),
+    Panel("Heading", curves=(Curve(POSE, "yaw_rad", f"yaw ({_unit(POSE, 'yaw_rad')})"),)),
     Panel("Arm", curves=tuple(Curve("sensor/arm", f"joint_deg[{n}]", f"J{n + 1} (deg)") for n in range(6))),
 )
 _STATE_PANELS: Final = (

@@ -3,6 +3,7 @@
 The driver decides which measurements are published, and what is claimed of the car. This module fills the messages.
 """
 
+import math
 import socket
 import time
 from collections import deque
@@ -57,6 +58,7 @@ class CarPublisher:
         self._car = car
         self._driver = control.driver
         self._url = url
+        self._boot_id = opened.boot_id
         self._publishers: dict[str, bus.Publisher] = {}
         self._histories: dict[str, HistoryBuffer] = {}
         self._published_states: dict[str, tuple[object, ...]] = {}
@@ -75,7 +77,7 @@ class CarPublisher:
         """When the bus was last unreachable."""
         self._pending: deque[tuple[bus.Publisher, Any, int]] = deque()
         self.dropped = 0
-        """Number of dropped records."""
+        """Number of dropped records, and of poses that are none."""
 
     # ------------------------------------------------------------------ readings
 
@@ -111,6 +113,26 @@ class CarPublisher:
     def _put_kept(self, name: str, message: Any, at: float, stamp_ns: int) -> None:
         payload = self._publishers[name].put(message, stamp_ns)
         self._histories[name].add(Value(at, stamp_ns, payload))
+
+    def keep_pose(self, sample: bus.Sample, now: float) -> None:
+        """Keep a pose that a program outside of the car has published, so that queries are answered with it.
+
+        One that is no pose, or has a number that is none, is dropped: it came from no program of ours.
+        """
+        name = "sensor/pose"
+        try:
+            message: Any = messages.parse(topics.TOPICS[name].message, sample.payload, sample.encoding)
+        except messages.BadPayload:
+            self.dropped += 1
+            return
+        if message.boot_id == self._boot_id:
+            return  # the driver's own
+        if not all(math.isfinite(each) for each in (message.x_m, message.y_m, message.yaw_rad)):
+            self.dropped += 1
+            return
+        if not message.stamp.seconds:
+            message.stamp.FromNanoseconds(self._wall.ns(now))  # when it came
+        self._histories[name].add(Value(now, messages.stamp_ns(message.stamp), message.SerializeToString()))
 
     # ------------------------------------------------------------------ frames out, records
 

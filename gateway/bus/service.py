@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 FAMILIES: Final = ("sensor", "state")
+POSE: Final = "sensor/pose"
+"""The topic that others than the gateway may publish, too (docs/reference/keys.md#poses)."""
 MAX_QUEUED_DRIVES: Final = 32
 """Maximum waiting drives of streams. Older ones are dropped. Few, so that a stop never waits long behind them."""
 MAX_QUEUED_QUERIES: Final = 128
@@ -84,6 +86,7 @@ class CarService:
         """Queries of the history, each with its family."""
         self._senders: bus.Latest[bool] = bus.Latest()
         self._cars: bus.Latest[bool] = bus.Latest()
+        self._poses: bus.Latest[bus.Sample] = bus.Latest(limit=1)
         # Queryables first, then the token: clients that see the token must get an answer.
         for family in FAMILIES:
             # A query on `fleet/**` reaches both: each answers for its own family only.
@@ -92,6 +95,9 @@ class CarService:
             opened.queryable(expression, self._on_command, too_large=self._on_command)
         for expression in keys.command_keys(fleet, car, Verb.DRIVE):
             opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD)
+        # A program outside of the car may publish its pose. The gateway answers queries with it.
+        pose = keys.topic_key(fleet, car, POSE)
+        opened.subscribe(pose, lambda sample: self._poses(POSE, sample), largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
         opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)
@@ -105,10 +111,12 @@ class CarService:
         command: "Callable[[Request], object]",
         senders: "Callable[[Mapping[str, bool]], object]",
         cars: "Callable[[Mapping[str, bool]], object]",
+        poses: "Callable[[Mapping[str, bus.Sample]], object]",
     ) -> None:
         """Connect the handlers, also for items that wait already.
 
         `senders` and `cars` take changes of tokens by name. `values` and `histories` are set when there are queries.
+        `poses` takes the newest pose that somebody published, the gateway itself, too.
         """
         self.values.attach(loop, values)
         self.histories.attach(loop, histories)
@@ -117,6 +125,7 @@ class CarService:
         self._stream.attach(loop, command)
         self._senders.attach(loop, senders)
         self._cars.attach(loop, cars)
+        self._poses.attach(loop, poses)
 
     @property
     def dropped(self) -> int:

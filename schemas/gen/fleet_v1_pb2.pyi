@@ -199,6 +199,30 @@ class Attitude(_message.Message):
     yaw_rad: float
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roll_rad: _Optional[float] = ..., pitch_rad: _Optional[float] = ..., yaw_rad: _Optional[float] = ...) -> None: ...
 
+class Pose(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "frame", "x_m", "y_m", "yaw_rad", "xy_std_m", "yaw_std_rad")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    YAW_RAD_FIELD_NUMBER: _ClassVar[int]
+    XY_STD_M_FIELD_NUMBER: _ClassVar[int]
+    YAW_STD_RAD_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    frame: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    xy_std_m: float
+    yaw_std_rad: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., frame: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., yaw_rad: _Optional[float] = ..., xy_std_m: _Optional[float] = ..., yaw_std_rad: _Optional[float] = ...) -> None: ...
+
 class Link(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "state", "reason", "url", "rx_bytes", "tx_bytes", "rx_frames", "tx_frames", "rejects", "reconnects", "tx_airtime", "since_s", "last_rx_s")
     class RejectsEntry(_message.Message):

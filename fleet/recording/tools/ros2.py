@@ -162,6 +162,20 @@ def _arm(message: Any, header: Any) -> Any:
     return _joints(header, names, position=map(math.radians, message.joint_deg))
 
 
+def _pose(message: Any, header: Any) -> Any:
+    """Return a measured pose on the floor. What was not measured has a covariance of 0: unknown."""
+    header.frame_id = message.frame or header.frame_id
+    covariance = np.zeros(36)
+    covariance[[0, 7]], covariance[35] = message.xy_std_m**2, message.yaw_std_rad**2
+    pose = _ros(
+        "geometry_msgs/msg/Pose",
+        position=_vector(message.x_m, message.y_m, of="Point"),
+        orientation=_quaternion(0.0, 0.0, message.yaw_rad),
+    )
+    measured = _ros("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
+    return _ros("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=measured)
+
+
 def _truth(message: Any, header: Any) -> Any:
     """Return the true pose of a simulated car in its world."""
     header.frame_id = "world"
@@ -193,6 +207,7 @@ _CONVERTERS: Final[Mapping[str, tuple[str, Callable[[Any, Any], Any]]]] = {
     "fleet.v1.Wheels": ("sensor_msgs/msg/JointState", _wheels),
     "fleet.v1.Odometer": ("sensor_msgs/msg/JointState", _odometer),
     "fleet.v1.Arm": ("sensor_msgs/msg/JointState", _arm),
+    "fleet.v1.Pose": ("geometry_msgs/msg/PoseWithCovarianceStamped", _pose),
     "fleet.v1.Truth": ("geometry_msgs/msg/PoseStamped", _truth),
     "foxglove.Log": ("rcl_interfaces/msg/Log", _log),
 }

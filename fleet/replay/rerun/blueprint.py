@@ -26,6 +26,13 @@ _MIN_WORLD_ASPECT: Final = 1.5
 """Minimum ratio of width to height of the view of the world if text views are below it."""
 _LEDS: Final = frozenset({panels.LED_REQUESTED.name, panels.LED_TRUE.name})
 
+_FLOORS: Final[Mapping[str, str]] = {
+    panels.TRUTH: "World, from above (simulated cars)",
+    panels.POSE: "Map, from above (measured poses)",
+}
+"""The views of the floor, by the topic that says where cars are."""
+
+_Ground = tuple[tuple[float, float], tuple[float, float]]
 _View = rrb.View | rrb.Container
 _Overrides = dict[Any, list[Any]]
 """Visualizers by entity. Any, because Rerun's own mapping type is invariant."""
@@ -38,7 +45,10 @@ def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.
     """
     session = drawing.contents()
     builder = _RerunLayout(drawing, _axis(drawing.span_ns, last_s))
-    tabs = [builder.fleet_tab(drawing.ground()), *(builder.car_tab(car) for car in session.cars)]
+    tabs = [
+        builder.fleet_tab({topic: drawing.ground(topic) for topic in _FLOORS}),
+        *(builder.car_tab(car) for car in session.cars),
+    ]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
         rrb.BlueprintPanel(state="collapsed"),
@@ -59,15 +69,16 @@ class _RerunLayout:
         self._color = drawing.color
         self._axis = axis
 
-    def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
-        """Return the tab of the fleet: a page of its cars and a page of its services."""
+    def fleet_tab(self, grounds: Mapping[str, _Ground | None]) -> _View:
+        """Return the tab of the fleet: a page of its cars and a page of its services. grounds: by topic of a place."""
         session = self._session
         texts = [view for name, ours, theirs in panels.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
         if panels.PLAN_TOPIC in session.services:
             plan = panels.entity(f"{session.fleet}/{panels.PLAN_TOPIC}")
             texts.append(rrb.TextDocumentView(origin=plan, contents=[plan], name="Plan"))
         wide = _MIN_WORLD_ASPECT if texts else 1.0
-        left: list[_View] = [self._world(*ground, wide)] if ground is not None else []
+        floors = [self._floor(topic, *ground, wide) for topic, ground in grounds.items() if ground is not None]
+        left: list[_View] = [rrb.Tabs(*floors, active_tab=0)] if len(floors) > 1 else [*floors]
         if texts:
             left.append(rrb.Tabs(*texts, active_tab=0))
         right: list[_View] = []
@@ -185,12 +196,10 @@ class _RerunLayout:
             origin="/", contents=list(overrides), name=name, overrides=overrides, time_view=self._axis
         )
 
-    def _world(self, low: tuple[float, float], high: tuple[float, float], wide: float) -> rrb.Spatial3DView:
+    def _floor(self, topic: str, low: tuple[float, float], high: tuple[float, float], wide: float) -> rrb.Spatial3DView:
         session = self._session
-        contents = [
-            f"{self._entity(car, panels.TRUTH)}/**" for car, topics in session.cars.items() if panels.TRUTH in topics
-        ]
-        if panels.WORLD in session.services:
+        contents = [f"{self._entity(car, topic)}/**" for car, topics in session.cars.items() if topic in topics]
+        if topic == panels.TRUTH and panels.WORLD in session.services:
             contents.append(f"{self._entity('', panels.WORLD)}/**")
         x, y = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
         size = max(high[1] - low[1], (high[0] - low[0]) / wide)
@@ -198,8 +207,7 @@ class _RerunLayout:
         eye = rrb.EyeControls3D(
             position=(x, y - 0.01, max(_MIN_EYE_HEIGHT_M, 1.2 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
         )
-        name = "World, from above (simulated cars)"
-        return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
+        return rrb.Spatial3DView(origin="/", contents=contents, name=_FLOORS[topic], eye_controls=eye)
 
 
 def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis:

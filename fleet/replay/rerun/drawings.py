@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
+from itertools import product
 from math import cos, sin
 from typing import Any, Final
 
@@ -62,6 +63,7 @@ class Drawing:
         """Colors of LED commands by command id, until their outcome."""
         self._drawers: dict[str, Callable[[str, Any, _Times], Iterator[Any]]] = {
             panels.TRUTH: self._truth,
+            panels.POSE: self._pose,
             panels.WORLD: self._world,
             panels.COMMAND_TOPIC: self._commands,
             panels.ASSIGNMENT: self._roles,
@@ -118,10 +120,10 @@ class Drawing:
             yield from self._ends.chunks(self.span_ns[1])
 
     def static(self) -> Iterator[Any]:
-        """Yield the path, color and name of each simulated car as static data, visible at any time."""
+        """Yield the path, color and name of each car that has a place as static data, visible at any time."""
         contents = self.contents()
-        for index, car in enumerate(contents.cars):
-            key = keys.topic_key(contents.fleet, car, panels.TRUTH)
+        for (index, car), topic in product(enumerate(contents.cars), (panels.TRUTH, panels.POSE)):
+            key = keys.topic_key(contents.fleet, car, topic)
             points = self._car_path(key)
             if points is None:
                 continue
@@ -155,12 +157,17 @@ class Drawing:
             indexes = _indexes(dict.fromkeys(TIMELINES, at))
             yield rrc.Chunk.from_columns(panels.entity(key), indexes=indexes, columns=columns)
 
-    def ground(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Return the lowest and highest x and y of walls and paths in meters; None without a simulated car."""
-        paths = [points for key in list(self._parts) if (points := self._car_path(key)) is not None]
+    def ground(self, topic: str) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Return the lowest and highest x and y of the paths of a topic in meters; None if it has none.
+
+        Those of the truth include the walls: a measured pose counts from an origin of its own.
+        """
+        of_topic = [key for key in self._parts if panels.topic_of(key) == topic]
+        paths = [points for key in of_topic if (points := self._car_path(key)) is not None]
         if not paths:
             return None
-        every = np.concatenate([*paths, *([np.array(self.corners)] if self.corners else [])])
+        corners = self.corners if topic == panels.TRUTH else []
+        every = np.concatenate([*paths, *([np.array(corners)] if corners else [])])
         low, high = every.min(axis=0), every.max(axis=0)
         return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
@@ -172,6 +179,11 @@ class Drawing:
             whole = np.concatenate(parts)
             self._parts[key] = parts = [whole if self._limit is None else whole[-self._limit :]]
         return parts[0]
+
+    def _pose(self, path: str, poses: Any, times: _Times) -> Iterator[Any]:  # noqa: ARG002 - a lens draws the arrow
+        points = np.stack([numbers(poses, "x_m"), numbers(poses, "y_m")], axis=1)
+        self._parts.setdefault(panels.key_of(path), []).append(points)
+        return iter(())
 
     def _truth(self, path: str, truths: Any, times: _Times) -> Iterator[Any]:
         x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).dictionary_encode()

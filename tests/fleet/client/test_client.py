@@ -1,6 +1,7 @@
 """Fleet, sync and async, against real gateways of simulated cars, and against gateways that do not answer."""
 
 import asyncio
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +30,46 @@ def client(cars: Cars) -> Iterator[Fleet]:
 
 def test_the_cars_are_those_with_a_token(client: Fleet) -> None:
     assert client.cars() == ["blue", "green", "red"]
+
+
+def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Cars) -> None:
+    assert client.get("red/sensor/pose") == [], "nobody has measured one"
+    client.publish_pose("red", x_m=1.5, y_m=-0.5, yaw_rad=7.0, frame="map", xy_std_m=0.02)
+
+    def poses() -> list[Any]:
+        return client.get("red/sensor/pose")
+
+    wait_for(poses, "the gateway has it")
+    (reading,) = poses()
+    assert (reading["frame"], reading["x_m"], reading["y_m"]) == ("map", 1.5, -0.5)
+    assert reading["yaw_rad"] == pytest.approx(7.0 - math.tau)
+    assert (reading["xy_std_m"], reading["yaw_std_rad"]) == (0.02, None)
+    key = "fleet/red/sensor/pose"
+    cars.bus.put_command(key, b"no pose", "application/json")
+    cars.bus.put_command(key, b'{"x_m": "NaN"}', "application/json")
+    cars.bus.put_command(key, b'{"frame": "map", "x_m": 2.5}', "application/json")
+    wait_for(lambda: poses()[0]["x_m"] == 2.5, "any client may publish one, as JSON, too")
+    assert [each["x_m"] for each in client.history("red/sensor/pose", last=10)] == [1.5, 2.5]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"x_m": math.inf},
+        {"y_m": 2000.0},
+        {"x_m": math.nan},
+        {"yaw_rad": math.nan},
+        {"frame": ""},
+        {"frame": "a\u202e"},
+        {"xy_std_m": -1.0},
+        {"yaw_std_rad": math.inf},
+        {"car": "Red"},
+    ],
+)
+def test_a_pose_that_is_none_is_refused(wrong: dict[str, Any], client: Fleet) -> None:
+    fields: dict[str, Any] = {"car": "red", "x_m": 0.0, "y_m": 0.0, "yaw_rad": 0.0, **wrong}
+    with pytest.raises(ValueError, match=r"is not allowed|is no car"):
+        client.publish_pose(**fields)
 
 
 def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars) -> None:

@@ -10,7 +10,7 @@ import zenoh
 from fleet.hub.rules import access_control
 from schemas import keys
 from schemas.commands import COMMANDS
-from schemas.identity import Service, car, person, service
+from schemas.identity import Service, car, may_locate, person, service
 
 EVERYONE = [person("mia"), person("eve"), car("red"), car("blue"), *map(service, Service)]
 RULES = access_control([(each, each) for each in EVERYONE])
@@ -74,6 +74,18 @@ def test_everyone_speaks_for_itself_only(identity: str) -> None:
     assert allows(identity, "ingress", "put", "fleet/red/sim/truth") == (
         identity in (car("red"), service(Service.SIMULATOR))
     )
+    for of in ("red", "blue"):
+        assert allows(identity, "ingress", "put", f"fleet/{of}/sensor/pose") == may_locate(identity, of)
+        caches = f"fleet/{of}/sensor/pose/@adv/pub/1/2/_"
+        assert allows(identity, "ingress", "declare_queryable", caches) == may_locate(identity, of)
+
+
+def test_a_pose_is_said_by_the_cars_own_gateway_and_by_a_locator() -> None:
+    assert {each for each in EVERYONE if may_locate(each, "red")} == {car("red"), service(Service.LOCATOR)}
+    assert may_locate("", "red"), "on a hub without certificates everyone may"
+    locator = service(Service.LOCATOR)
+    for other in ("fleet/red/sensor/range", "fleet/red/state/mode", "fleet/red/sim/truth", "fleet/*/sensor/*"):
+        assert not allows(locator, "ingress", "put", other)
 
 
 @pytest.mark.parametrize("identity", EVERYONE)

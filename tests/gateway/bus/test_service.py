@@ -32,6 +32,7 @@ class Hall:
             command=self.requests.append,
             senders=self.batches.append,
             cars=lambda _: None,
+            poses=lambda _: None,
         )
 
     async def until(self, so: Any, what: str) -> None:

@@ -15,7 +15,7 @@ from tests.support.sorted_writer import SortedWriter
 
 SECONDS = 120
 MOMENTS = 100
-TABLES = [topic for topic in CAR_TOPICS if topic.family in ("sensor", "state")]
+TABLES = [topic for topic in CAR_TOPICS if topic.family in ("sensor", "state", "sim")]
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,7 @@ def test_each_type_is_a_standard_message_with_stamp_and_frame(tmp_path: Path) ->
         "sensor_msgs/msg/Imu",
         "sensor_msgs/msg/JointState",
         "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
         "rcl_interfaces/msg/Log",
     }
 
@@ -84,6 +85,20 @@ def test_an_attitude_is_a_rotation_and_says_what_was_not_measured(tmp_path: Path
     turned = message.orientation
     assert (turned.x, turned.y, turned.z, turned.w) == pytest.approx((0, 0, math.sqrt(0.5), math.sqrt(0.5)))
     assert message.angular_velocity_covariance[0] == message.linear_acceleration_covariance[0] == -1
+
+
+def test_a_pose_keeps_its_frame_and_what_is_known_of_its_error(tmp_path: Path) -> None:
+    fields = {"frame": "map", "x_m": 1.5, "y_m": -2.0, "yaw_rad": math.pi / 2, "xy_std_m": 0.1}
+    write_bag(
+        Session(write(tmp_path / "one.mcap", ("fleet/red/sensor/pose", "fleet.v1.Pose", fields))).rows(),
+        tmp_path / "bag",
+    )
+    ((topic, _, _, message),) = read(tmp_path / "bag")
+    assert (topic, message.header.frame_id) == ("/red/pose", "map")
+    place, turned = message.pose.pose.position, message.pose.pose.orientation
+    assert (place.x, place.y, turned.z, turned.w) == pytest.approx((1.5, -2.0, math.sqrt(0.5), math.sqrt(0.5)))
+    known = {at: each for at, each in enumerate(message.pose.covariance) if each}
+    assert known == pytest.approx({0: 0.01, 7: 0.01})
 
 
 def test_what_ros_has_no_message_for_keeps_all_its_fields(tmp_path: Path) -> None:
