@@ -23,13 +23,14 @@ from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
 from fleet.console.inspections import Inspections
 from fleet.console.lane_feed import LaneFeed
+from fleet.console.map_feed import MapFeed
 from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
-from fleet.console.pairing import PagePerson
+from fleet.console.pairing import MAX_GUESTS, PagePerson
 from fleet.console.past_api import PastApi
-from fleet.console.permissions import management_refusal, rights_of
+from fleet.console.permissions import GUEST_REFUSAL, guest_rights, management_refusal, rights_of
 from fleet.console.plan_feed import PlanFeed
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
@@ -42,7 +43,7 @@ from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
-from schemas.keys import person_of, topic_key
+from schemas.keys import SIMULATOR, person_of, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.topics import TOPICS
@@ -52,6 +53,8 @@ MAX_PAGES: Final = 96
 """Maximum number of connected pages."""
 MAX_PAGES_OF_DEVICE: Final = 8
 """Maximum number of connected pages of one device on the network."""
+MAX_PAGES_OF_GUEST: Final = 2
+"""The same of one guest. All guests together have one for each of them, so that some places are left for persons."""
 KEPT_FOR_LEADS: Final = 8
 KEPT_FOR_THIS_COMPUTER: Final = 8
 """Pages that are kept for leads, and for this computer."""
@@ -62,6 +65,11 @@ _MAX_MERGES: Final = 256
 """Number of remembered merges of stops, by person and cars."""
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
+
+GUEST_MESSAGES: Final = frozenset(
+    {"echo", "ping", Verb.STOP, "plot", "lanes", "lanes_end", "map", "map_end", "inspect", "inspect_end"}
+)
+"""What a page of a guest may send, beside stops of some cars: it watches."""
 
 OnOutcomes = Callable[[list[dict[str, Any]]], object]
 _BUS_LOST: Final = "The console has lost the bus. Press again when it is back."
@@ -108,7 +116,9 @@ class Console:
         self.plan = PlanFeed(fleet, file, self.operator, self.sender_of, self.management_refusal, self._newest_samples)
         self._plots = PlotFeed(fleet, self.operator.spawn)
         self._lanes = LaneFeed()
-        self._feeds: Sequence[PageFeed] = (self._plots, self._lanes, Inspections(fleet, self._view.look_up), self.plan)
+        self._map = MapFeed(self._view.has_place)
+        inspections = Inspections(fleet, self._view.look_up)
+        self._feeds: Sequence[PageFeed] = (self._plots, self._lanes, self._map, inspections, self.plan)
         self._statuses: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_status, limit=_MAX_EVENTS, newest=True
         )
@@ -143,6 +153,8 @@ class Console:
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
+        for place in ("*/sim/truth", f"{SIMULATOR}/world"):
+            bus.subscribe(f"{name}/{place}", self._map.on_sample)
         bus.subscribe(f"{name}/{SUPERVISOR_STATUS.name}", self._statuses)
         await self.plan.begin()
         async with asyncio.TaskGroup() as tasks:
@@ -224,8 +236,9 @@ class Console:
         rights = {
             sender: rights_of(sender, authority) for sender in {page.operator.sender for page in self._pages.values()}
         }
+        of_guests = guest_rights(authority)
         for page in self._pages.values():
-            page.show_new("rights", rights[page.operator.sender])
+            page.show_new("rights", of_guests if page.person.is_guest else rights[page.operator.sender])
             page.show_new("groups", {"groups": self.groups})
         for press in self._presses.alive:
             page = self._pages[press.client]
@@ -245,11 +258,14 @@ class Console:
                 self._view.on_message(key.car, key.topic, message, now)
                 if self._view.has_place(key.car):
                     self._lanes.on_message(key, message)
+                    self._map.on_message(key, message)
                 if key.topic == "state/safety" and self._report is not None:
                     self._report.on_safety(key.car, message, now)
         present = self._present
         self._view.on_presence(present, now)
-        self._lanes.keep(frozenset(self._view.names))
+        names = frozenset(self._view.names)
+        self._lanes.keep(names)
+        self._map.keep(names)
         if self._view.left_out and not self._said_left_out:
             self._said_left_out = True
             log.warning(
@@ -335,8 +351,12 @@ class Console:
             most -= KEPT_FOR_THIS_COMPUTER + (0 if person.rank == Rank.LEAD else KEPT_FOR_LEADS)
         if len(self._pages) >= most:
             raise TooManyPages("too many pages are open")
-        if device and sum(page.device == device for page in self._pages.values()) >= MAX_PAGES_OF_DEVICE:
-            raise TooManyPages(f"this device has {MAX_PAGES_OF_DEVICE} pages open: close one")
+        is_guest = person is not None and person.is_guest
+        most_of_device = MAX_PAGES_OF_GUEST if is_guest else MAX_PAGES_OF_DEVICE
+        if device and sum(page.device == device for page in self._pages.values()) >= most_of_device:
+            raise TooManyPages(f"this device has {most_of_device} pages open: close one")
+        if is_guest and sum(page.person.is_guest for page in self._pages.values()) >= MAX_GUESTS:
+            raise TooManyPages("too many pages of guests are open")
 
     async def add_page(
         self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None, device: str = ""
@@ -347,15 +367,16 @@ class Console:
         """
         self._check_room(person, device)
         whose = person or self.person
-        operator = await self._operators.join(whose.name)
+        operator = await self._operators.join(whose.acts_as)
         try:
             self._check_room(person, device)  # others may have come meanwhile
         except TooManyPages:
-            self._operators.leave(whose.name)
+            self._operators.leave(whose.acts_as)
             raise
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
-        names = {"sender": operator.sender, "fleet": self._fleet.sync.name}
+        # What another guest has stopped, this one has not.
+        names = {"sender": "" if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
         for feed in self._feeds:
@@ -372,7 +393,7 @@ class Console:
             self._end(press, "The page has gone.")
         self._count(page, page.operator.release_leases(page.number))
         del self._pages[page.number]
-        self._operators.leave(page.person.name)
+        self._operators.leave(page.person.acts_as)
 
     def on_text(self, page: PageLink, text: str) -> None:
         """Handle one message of a page. A bad one is answered, and changes nothing."""
@@ -454,6 +475,9 @@ class Console:
             cars = () if message.kind == Verb.UNPAUSE else message.cars()
             if words := self._command_refusal(page, cars, now):
                 raise BadPageMessage(words)
+        stops_some = message.kind == "do" and message.fields.get("verb") == Verb.STOP
+        if page.person.is_guest and not stops_some and message.kind not in GUEST_MESSAGES:
+            raise BadPageMessage(GUEST_REFUSAL)
         handle = self._handlers.get(message.kind)
         if handle is None:
             raise BadPageMessage(f"unknown message {message.kind!r}")

@@ -148,6 +148,8 @@ class NetworkGuard(Guard):
         if device is None or (state != "valid" and not stops):
             expired = "'s pairing has expired; only STOP works (open /pair)"  # the page looks for "expired"
             return f"this device{' is not paired (open /pair)' if device is None else expired}"
+        if device.person.is_guest and not stops and not _may_guest_ask(scope, method):
+            return "a guest watches and stops (a lead assigns this device on the page Board)"
         scope[PERSON], scope[DEVICE] = device.person, device.id
         self._on_device(tuple(scope["client"]), device)
         return ""
@@ -162,6 +164,14 @@ class NetworkGuard(Guard):
 
     def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:  # noqa: ARG002 - Guard's
         return []  # only a pairing code earns one
+
+
+def _may_guest_ask(scope: Scope, method: str) -> bool:
+    """Return True for what a device that nobody has assigned yet may read: the live page, and no recording."""
+    if scope["type"] == "websocket":
+        return True
+    path = scope["path"]
+    return method in ("GET", "HEAD") and (path in (*COOKIE_PATHS, "/people") or path.startswith("/static/"))
 
 
 def cookie_value(headers: dict[str, str], name: str) -> str | None:

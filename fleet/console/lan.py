@@ -19,6 +19,7 @@ from fleet.console.certificate import Certificate, ensure_certificate
 from fleet.console.connection_limit import ConnectionLimit, LogLimit
 from fleet.console.guard import DEVICE, PAIR_PATH, Scope
 from fleet.console.pairing import (
+    CLASS_LIFETIME_S,
     CODE_LIFETIME_S,
     COOKIE_LIFETIME_S,
     COOKIE_MEMORY_S,
@@ -125,8 +126,8 @@ class Lan:
         self._refusals = LogLimit()
         self._failures = LogLimit()
         self._shared_cookies = LogLimit()
-        self._connected: dict[int, tuple[str, str, Callable[[], object]]] = {}
-        """Device, address and the function that closes it, by number of the socket."""
+        self._connected: dict[int, tuple[str, str, Callable[[], object], Callable[[], object]]] = {}
+        """Device, address, and the functions that close it for good and for a moment, by number of the socket."""
         self._last_socket = 0
         self.people.serve()
         self._write(listed)
@@ -148,16 +149,44 @@ class Lan:
         qr = segno.make(pairing_link(self.address, code)).svg_data_uri(scale=5, border=4, light="#fff", dark="#000")
         return {"code": code_words(code), "qr": qr, "address": self.address, "lifetime_s": CODE_LIFETIME_S}
 
+    async def open_class(self) -> dict[str, Any]:
+        """Open the console for a class. Return its code as JSON values. Raises ValueError or OSError."""
+        code = new_code(secrets.choice)
+        await asyncio.to_thread(self.people.change, lambda book: (book.open_class(code, time.time()), None))
+        qr = segno.make(pairing_link(self.address, code)).svg_data_uri(scale=10, border=4, light="#fff", dark="#000")
+        log.warning("a class may join for %.0f minutes: its devices watch and stop", CLASS_LIFETIME_S / 60)
+        shown = {"code": code_words(code), "qr": qr, "address": self.address, "lifetime_s": CLASS_LIFETIME_S}
+        return shown | {"fingerprint": self.certificate.fingerprint}
+
+    async def close_class(self) -> None:
+        """Let no more devices of a class join. Raises OSError."""
+        await asyncio.to_thread(self.people.change, lambda book: (book.close_class(), None))
+
+    async def assign(self, device_id: str, person: PagePerson) -> None:
+        """Make a guest a person. Its pages connect again as that person. Raises ValueError or OSError."""
+        await asyncio.to_thread(self.people.change, lambda book: (book.assign(device_id, person, time.time()), None))
+        log.warning("%s was assigned to %s", device_id, person.name)
+        for device, _, _, renew in list(self._connected.values()):
+            if device == device_id:
+                renew()
+
     async def pair(
-        self, code: str, client: tuple[str, int], device: str
+        self, code: str, client: tuple[str, int], device: str, cookie_before: str = ""
     ) -> tuple[str | None, float, PagePerson | None]:
-        """Pair a device. Return its cookie, else None and the time to wait before the next try, s."""
+        """Pair a device. Return its cookie, else None and the time to wait before the next try, s. Raises ClassFull.
+
+        cookie_before: of a device that is paired already. It stays who it is, if this is the code of a class.
+        """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
             self.guesses.wrong += 1
             return None, wait_s, None
+        book = self.people.read()
+        known, state = book.device_of(cookie_before, time.time())
+        if known is not None and state == "valid" and book.is_class_code(code, time.time()):
+            return cookie_before, 0.0, known.person
         cookie = secrets.token_urlsafe(32)
-        found = self.people.read().redeem(code, cookie, "", device, time.time())
+        found = book.redeem(code, cookie, "", device, time.time())
         if found is not None:
             found = await asyncio.to_thread(self.people.change, lambda book: self._redeemed(book, code, cookie, device))
         if found is None:
@@ -193,7 +222,7 @@ class Lan:
     def on_device(self, client: tuple[str, int], device: PairedDevice) -> None:
         """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
         self.listener.on_paired(client, device.id)
-        others = {address for id_, address, _ in self._connected.values() if id_ == device.id} - {client[0]}
+        others = {address for id_, address, *_ in self._connected.values() if id_ == device.id} - {client[0]}
         if others and (words := self._shared_cookies.words("", time.monotonic())) is not None:
             places = ", ".join([client[0], *sorted(others)])
             log.warning(
@@ -211,11 +240,11 @@ class Lan:
         return any(each.id == scope[DEVICE] for each in self._open_devices(time.time()))
 
     @contextmanager
-    def connected(self, scope: Scope, close: Callable[[], object]) -> Iterator[None]:
-        """Keep a socket in the list of those that revocation closes."""
+    def connected(self, scope: Scope, close: Callable[[], object], renew: Callable[[], object]) -> Iterator[None]:
+        """Keep a socket in the list of those that revocation closes. renew: lets the page connect again."""
         self._last_socket += 1
         number = self._last_socket
-        self._connected[number] = scope[DEVICE], scope["client"][0], close
+        self._connected[number] = scope[DEVICE], scope["client"][0], close, renew
         try:
             yield
         finally:
@@ -224,7 +253,7 @@ class Lan:
     def close_revoked(self) -> None:
         """Close the sockets of devices that were revoked or whose cookie has expired."""
         current = {each.id for each in self._open_devices(time.time())}
-        for device, address, close in list(self._connected.values()):
+        for device, address, close, _ in list(self._connected.values()):
             if device not in current:
                 log.warning("closed the page of %s at %s: revoked or expired", device, address)
                 close()
@@ -290,7 +319,7 @@ class Lan:
                 "device": each.device,
                 "paired_s": int(each.paired_s),
                 "days_left": int((each.expires_s - now) // 86_400),
-                "addresses": sorted({address for id_, address, _ in self._connected.values() if id_ == each.id}),
+                "addresses": sorted({address for id_, address, *_ in self._connected.values() if id_ == each.id}),
             }
             for each in self._open_devices(now)
         ]

@@ -1,5 +1,7 @@
 """Pairing codes, paired devices and their people: they open the console from the network. Pure.
 
+The code of a class is one of them, which pairs any number of devices for ten minutes, as guests.
+
 Times are seconds since the epoch, since the book outlives the process. A code or a cookie is stored as its hash.
 """
 
@@ -8,6 +10,7 @@ import hmac
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
+from itertools import count
 from typing import Any, Final, Literal, Self
 
 from fleet.hub.join_code import CODE_ALPHABET
@@ -35,6 +38,14 @@ GUESS_MEMORY_S: Final = 3600.0
 MAX_GUESSERS: Final = 1024
 """Maximum number of remembered addresses. More are forgotten, the oldest first."""
 MAX_DEVICE_NAME_LENGTH: Final = 60
+CLASS_LIFETIME_S: Final = 600.0
+"""Time for which the code of a class pairs devices. A guess at 1,000 a second finds it once in 1.8 million times."""
+GUEST: Final = "guest"
+"""The rank of a device that came by the code of a class, until a lead assigns it to a person. It watches and stops."""
+MAX_GUESTS: Final = 48
+"""Maximum number of guests: a class. The code pairs no more, whoever has photographed it."""
+GUEST_LIFETIME_S: Final = 12 * 3600.0
+"""Time after which a guest is forgotten."""
 RANKS: Final = (str(Rank.PERSON), str(Rank.LEAD))  # text: click takes an enum by the names of its members
 
 CookieState = Literal["unknown", "expired", "valid"]
@@ -42,6 +53,14 @@ CookieState = Literal["unknown", "expired", "valid"]
 
 class UnknownPerson(ValueError):
     """The fleet lists its people, and this is none of them. The text says who they are."""
+
+
+class ClassFull(Exception):
+    """There is no place for another guest. The text says what to do."""
+
+
+class NoGuest(ValueError):
+    """There is no guest with this id. The text says so."""
 
 
 class BadBook(ValueError):
@@ -54,20 +73,34 @@ class PagePerson:
 
     name: str
     rank: str = Rank.PERSON
-    """`person` or `lead`."""
+    """`person`, `lead`, or `guest`."""
+
+    @property
+    def is_guest(self) -> bool:
+        """True for whoever came with a class and is not assigned yet."""
+        return self.rank == GUEST
+
+    @property
+    def acts_as(self) -> str:
+        """The person of its client on the bus. All guests share one: they only stop."""
+        return GUEST if self.is_guest else self.name
+
+
+_ANY: Final = PagePerson(GUEST, GUEST)
+"""The person of the code of a class."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairingCode:
-    """A code that pairs one device, once."""
+    """A code that pairs one device, once. That of a class (its person is a guest) pairs one after the other."""
 
     digest: str
     person: PagePerson
     issued_s: float
 
     def is_open(self, now: float) -> bool:
-        """Return True in the two minutes after it was made. A clock that was set back ends it."""
-        return 0 <= now - self.issued_s < CODE_LIFETIME_S
+        """Return True in the minutes after it was made. A clock that was set back ends it."""
+        return 0 <= now - self.issued_s < (CLASS_LIFETIME_S if self.person.is_guest else CODE_LIFETIME_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +117,14 @@ class PairedDevice:
     @property
     def expires_s(self) -> float:
         """When its cookie expires."""
-        return self.paired_s + COOKIE_LIFETIME_S
+        return self.paired_s + (GUEST_LIFETIME_S if self.person.is_guest else COOKIE_LIFETIME_S)
 
     def state(self, now: float) -> CookieState:
         """Return whether its cookie opens the console, only stops the cars, or neither."""
         if now < self.expires_s:
             return "valid"
+        if self.person.is_guest:
+            return "unknown"
         return "expired" if now < self.expires_s + COOKIE_MEMORY_S else "unknown"
 
 
@@ -108,6 +143,42 @@ class PeopleBook:
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
         """Add a code for a person. Raises UnknownPerson, and ValueError for what is no name or no rank."""
+        self._check(person)
+        open_codes = [each for each in self.codes if each.is_open(now)]
+        codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
+        return replace(self, codes=codes[-MAX_CODES:])
+
+    def open_class(self, code: str, now: float) -> Self:
+        """Add the code of a class, instead of an earlier one. Raises ValueError if somebody has the name of guests."""
+        if GUEST in (self.people or ()):
+            raise ValueError(f"`people:` in the fleet file has a {GUEST}. Give that person another name first.")
+        book = self.close_class()
+        codes = (*(each for each in book.codes if each.is_open(now)), PairingCode(digest(normal_code(code)), _ANY, now))
+        return replace(book, codes=codes[-MAX_CODES:])
+
+    def close_class(self) -> Self:
+        """End the code of the class. Its guests stay."""
+        return replace(self, codes=tuple(each for each in self.codes if not each.person.is_guest))
+
+    def is_class_code(self, code: str, now: float) -> bool:
+        """Return True for the open code of a class."""
+        return any(each.person.is_guest for each in self._matching(code, now))
+
+    def assign(self, device_id: str, person: PagePerson, now: float) -> Self:
+        """Make a guest a person: its device is paired from now on. Raises NoGuest, and ValueError as `issue`."""
+        self._check(person)
+        guest = next((each for each in self.guests(now) if each.id == device_id), None)
+        if guest is None:
+            raise NoGuest("This guest is not there any more.")
+        assigned = replace(guest, person=person, paired_s=now)
+        return replace(self, devices=tuple(assigned if each is guest else each for each in self.devices))
+
+    def guests(self, now: float) -> list[PairedDevice]:
+        """Return the devices that nobody has assigned yet."""
+        return [each for each in self.devices if each.person.is_guest and each.state(now) == "valid"]
+
+    def _check(self, person: PagePerson) -> None:
+        """Raise UnknownPerson, or ValueError for what is no name or no rank."""
         keys.check_name(person.name, "a person's name")
         if self.people is not None and person.name not in self.people:
             hint = did_you_mean(person.name, self.people) or f"There are: {', '.join(self.people)}."
@@ -118,22 +189,37 @@ class PeopleBook:
         if self._ranked(person) != person:
             leads = f"Leads are: {', '.join(self.leads)}." if self.leads else "It has no lead."
             raise ValueError(f"`people:` in the fleet file makes {person.name} no lead. {leads}")
-        open_codes = [each for each in self.codes if each.is_open(now)]
-        codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
-        return replace(self, codes=codes[-MAX_CODES:])
 
-    def redeem(self, code: str, cookie: str, device_id: str, device: str, now: float) -> Self | None:
-        """Pair a device: end the code and add the device. None if the code is wrong, used or too old."""
+    def _matching(self, code: str, now: float) -> list[PairingCode]:
         wanted = digest(normal_code(code))
         # Each is compared, in constant time.
-        matching = [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
+        return [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
+
+    def redeem(self, code: str, cookie: str, device_id: str, device: str, now: float) -> Self | None:
+        """Pair a device: end the code, unless it is that of a class, and add the device.
+
+        None if the code is wrong, used or too old. Raises ClassFull.
+        """
+        matching = self._matching(code, now)
         if not matching:
             return None
-        words = printable(device)[:MAX_DEVICE_NAME_LENGTH].strip()
-        added = PairedDevice(device_id, matching[0].person, words, digest(cookie), now)
-        codes = tuple(each for each in self.codes if each is not matching[0])
+        used = matching[0]
         devices = [each for each in self.devices if each.state(now) != "unknown"]
+        person = used.person
+        if person.is_guest:
+            # A guest takes the place of nobody: the code is on a wall, and anyone may have come.
+            if len(self.guests(now)) >= MAX_GUESTS or len(devices) >= MAX_DEVICES:
+                raise ClassFull("The class is full. A lead assigns some devices, or revokes them.")
+            person = PagePerson(self._guest_name(), GUEST)
+        words = printable(device)[:MAX_DEVICE_NAME_LENGTH].strip()
+        added = PairedDevice(device_id, person, words, digest(cookie), now)
+        codes = self.codes if person.is_guest else tuple(each for each in self.codes if each is not used)
         return replace(self, codes=codes, devices=(*devices, added)[-MAX_DEVICES:])
+
+    def _guest_name(self) -> str:
+        """Return a name that is easy to find on a beamer, and that nobody has."""
+        taken = {each.person.name for each in self.devices} | set(self.people or ())
+        return next(name for number in count(1) if (name := f"{GUEST}-{number}") not in taken)
 
     def revoke(self, names: Iterable[str]) -> tuple[Self, list[PairedDevice]]:
         """Remove the devices with these ids or of these people. Return the removed ones, too."""

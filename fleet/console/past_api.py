@@ -103,6 +103,8 @@ def moment_question(text: str) -> dict[str, Any]:
         "at_ms": int(at_ms),
         "car": car,
         "span_s": span_s,
+        "map": fields.get("map") is True,
+        "plan": fields.get("plan") is True,
         "series": [(each.car, each.topic, each.field) for each in series],
     }
 

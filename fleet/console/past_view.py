@@ -9,15 +9,20 @@ from typing import Any, Final
 from fleet.console.bus_message import is_finite, is_shown
 from fleet.console.car_view import CarView, FleetView
 from fleet.console.frame_log import FrameLog
+from fleet.console.map_view import PLACE_TOPICS, WORLD, MapView
+from fleet.console.plan_view import PlanView
 from fleet.console.plot_buffer import PlotBuffer, Series
 from fleet.recording.tools.lanes import HELD_NS, Lanes
 from fleet.recording.tools.moment import Known
 from schemas.colors import car_color, hex_color
+from schemas.keys import COORDINATOR
 from schemas.topics import CAR_TOPICS
 
 DETAIL_BEFORE_NS: Final = 60_000_000_000
 """Time before the moment whose commands and frames are shown of one car: a command ends within seconds, and a page
 shows 60 frames, which a car that reports once a second sends in a minute."""
+DECISIONS_BEFORE_NS: Final = 600_000_000_000
+"""Time before the moment whose decisions are shown, the newest about each car. They are published on change only."""
 PLOT_SLOTS: Final = 600
 """Values of one series: a page draws no more (static/plots-page.js)."""
 _TOPICS: Final = frozenset(topic.name for topic in CAR_TOPICS)
@@ -48,6 +53,33 @@ def is_told(each: Known) -> bool:
         and is_shown(each.key.car)
         and is_finite(each.message)
     )
+
+
+def map_at(known: Iterable[Known], trail: Iterable[Known], at_ns: int) -> dict[str, Any]:
+    """Return what a map shows of a moment. trail: messages of PLACE_TOPICS before it."""
+    view, now = MapView(), at_ns / _S
+    placed = [each for each in known if each.key.topic in PLACE_TOPICS]
+    # The newest by the time of publishing comes last, as in the tables: a backfilled one was recorded late.
+    for each in (*sorted(trail, key=lambda each: each.publish_ns), *placed):
+        if is_told(each):
+            view.on_message(each.key.car, each.key.topic, each.message, each.log_ns / _S)
+    for each in known:
+        if f"{each.key.car}/{each.key.topic}" == WORLD.name and is_finite(each.message):
+            view.on_message("", WORLD.name, each.message, each.log_ns / _S)
+    return {"cars": view.places(now), "trails": view.trails(now), "world": view.world(now)}
+
+
+def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, Any]:
+    """Return what the plan page shows of a moment: the last plan by then, who had which role, and late decisions.
+
+    Nothing records whether the coordinator still ran.
+    """
+    view = PlanView()
+    newest = sorted(in_force, key=lambda each: each.key.topic != "plan")  # another plan would forget decisions
+    for each in (*newest, *sorted(decisions, key=lambda each: each.publish_ns)):
+        if each.key.car == COORDINATOR and is_finite(each.message):
+            view.on_message(f"{each.key.car}/{each.key.topic}", each.message)
+    return view.as_dict()
 
 
 def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns: int) -> dict[str, Any]:

@@ -7,13 +7,27 @@ session is, and one that grows or that the quota takes is read as it is.
 from pathlib import Path
 from typing import Any, Final
 
-from fleet.console.past_view import DETAIL_BEFORE_NS, cars_at, detail_of, lanes_as_dict, samples_of
+from fleet.console.map_view import PLACE_TOPICS, TRAIL_S, TRAIL_STEP_S
+from fleet.console.past_view import (
+    DECISIONS_BEFORE_NS,
+    DETAIL_BEFORE_NS,
+    cars_at,
+    detail_of,
+    lanes_as_dict,
+    map_at,
+    plan_at,
+    samples_of,
+)
 from fleet.console.plot_buffer import Series
 from fleet.console.worker import serve_lines
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.tools.moment import known_at, lanes_of, read_between
+from fleet.recording.tools.car_timeline import DECISION_TOPIC
+from fleet.recording.tools.moment import known_at, lanes_of, newest_of, read_between, thinned
 from fleet.recording.tools.summary import of_session
+from schemas.topics import TOPICS
 
+PLAN: Final = TOPICS["@coordinator/plan"]
+ASSIGNMENT: Final = TOPICS["@coordinator/assignment"]
 _MS: Final = 1_000_000
 
 
@@ -48,6 +62,14 @@ def _moment(session: Session, at_ns: int, question: dict[str, Any]) -> dict[str,
         from_ns = at_ns - round(question["span_s"] * 1e9)
         topics = tuple(dict.fromkeys(f"*/{each.car}/{each.topic}" for each in series))
         found["samples"] = samples_of(series, read_between(session, topics, from_ns, at_ns), from_ns, at_ns)
+    if question.get("map"):
+        topics = tuple(f"*/*/{topic}" for topic in PLACE_TOPICS)
+        trail = thinned(session, topics, at_ns - round(TRAIL_S * 1e9), at_ns, round(TRAIL_STEP_S * 1e9))
+        found["map"] = map_at(known, trail, at_ns)
+    if question.get("plan"):
+        in_force = newest_of(session, (f"*/{PLAN.name}", f"*/{ASSIGNMENT.name}"), at_ns)
+        decisions = read_between(session, (f"*/{DECISION_TOPIC}",), at_ns - DECISIONS_BEFORE_NS, at_ns)
+        found["plan"] = plan_at(in_force, decisions)
     return found
 
 

@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from fleet.console.guard import PAIR_PATH, PERSON, Scope
-from fleet.console.pairing import PagePerson
+from fleet.console.pairing import ClassFull, PagePerson
 from fleet.console.request_body import read_text
 from fleet.console.requests import BadPageMessage, PageMessage
 from schemas.words import Rank
@@ -33,9 +33,13 @@ def pair_routes(lan: "Lan") -> list[Route]:
         if request.client is None or code is None:
             return _failure("This is no pairing code.", 400)
         device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
-        cookie, wait_s, person = await lan.pair(code, (request.client.host, request.client.port), device)
+        before = request.cookies.get(lan.cookie, "")
+        try:
+            cookie, wait_s, person = await lan.pair(code, (request.client.host, request.client.port), device, before)
+        except ClassFull as error:
+            return _failure(str(error), 409)
         if cookie is None or person is None:
-            words = "This code is wrong, used or older than two minutes."
+            words = "This code is wrong, used or too old."
             if wait_s == 0:
                 return _failure(words, 403)
             wait = str(math.ceil(wait_s))
@@ -63,6 +67,14 @@ def people_routes(lan: "Lan | None") -> list[Route]:
             if message.kind == "revoke":
                 gone = await lan.revoke([message.text("id")])
                 return JSONResponse({"ok": bool(gone)})
+            if message.kind == "open_class":
+                return JSONResponse({"ok": True, **await lan.open_class()})
+            if message.kind == "close_class":
+                await lan.close_class()
+                return JSONResponse({"ok": True})
+            if message.kind == "assign":
+                await lan.assign(message.text("id"), PagePerson(message.text("name")))
+                return JSONResponse({"ok": True})
             person = PagePerson(message.text("name"), message.text("rank"))
             return JSONResponse({"ok": True, **await lan.offer(person)})
         except (BadPageMessage, ValueError) as error:

@@ -1,13 +1,15 @@
 """The rights of a person on a car, in words, so that a page shows beforehand what a gateway would refuse. Pure."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final
 
 from fleet.policy.denials import describe, fleet_refusal
 from schemas.authority import Authority, People, Right, Sender
 from schemas.keys import person_of
 from schemas.words import Rank
+
+GUEST_REFUSAL: Final = "You watch, and you can STOP. A lead assigns this device on the page Board."
 
 
 def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
@@ -38,6 +40,13 @@ def rights_of(sender: str, cars: Mapping[str, Authority]) -> dict[str, Any]:
     leads = any(person_of(sender) in each.people.leads for each in cars.values())
     mine = [car for car, authority in cars.items() if _is_mine(authority, sender)]
     return {"cars": by_car, **fleet, "lead": leads, "mine": mine}
+
+
+def guest_rights(cars: Iterable[str]) -> dict[str, Any]:
+    """Return the rights of a device of a class that nobody has assigned yet: as `rights_of`, and it may only stop."""
+    refused = dict.fromkeys(map(str, Right), GUEST_REFUSAL)
+    fleet = dict.fromkeys((str(Right.PAUSE), str(Right.UNPAUSE), "manage"), GUEST_REFUSAL)
+    return {"cars": dict.fromkeys(cars, refused), **fleet, "lead": False, "mine": []}
 
 
 def _is_mine(authority: Authority, sender: str) -> bool:

@@ -355,7 +355,11 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
     sending.add_done_callback(on_sent)
     from_network = lan if PERSON in socket_.scope else None
     try:
-        with nullcontext() if from_network is None else from_network.connected(socket_.scope, partial(end, NOT_PAIRED)):
+        with (
+            nullcontext()
+            if from_network is None
+            else from_network.connected(socket_.scope, partial(end, NOT_PAIRED), end)
+        ):
             yield on_text
     finally:
         console.remove_page(page)

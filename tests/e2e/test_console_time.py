@@ -221,9 +221,12 @@ def test_a_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, s
     expect(page.locator("[data-past-at]")).to_have_count(0)
 
 
-def test_a_jump_in_a_session_of_an_hour_is_fast(stage: ConsoleStage) -> None:
-    page = stage.page(link("", START_MS + 1000))
+@pytest.mark.parametrize("view", ["", "map"])
+def test_a_jump_in_a_session_of_an_hour_is_fast(view: str, stage: ConsoleStage) -> None:
+    page = stage.page(link(view, START_MS + 1000))
     shown_at(page, START_MS + 1000)
+    if view == "map":
+        expect(page.locator("[data-mark]")).to_have_count(3)
     took: list[float] = []
     for number in range(JUMPS):
         at_ms = START_MS + (number * 7919 % HOUR_S) * 1000 + 500
@@ -241,7 +244,7 @@ def test_a_jump_in_a_session_of_an_hour_is_fast(stage: ConsoleStage) -> None:
         )
         took.append(ms / 1000)
     took.sort()
-    print(f"\njump: p50 {took[len(took) // 2] * 1000:.0f} ms, longest {took[-1] * 1000:.0f} ms")
+    print(f"\njump with {view or 'fleet'}: p50 {took[len(took) // 2] * 1000:.0f} ms, longest {took[-1] * 1000:.0f} ms")
     assert took[-1] < MAX_JUMP_S
 
 

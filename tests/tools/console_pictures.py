@@ -22,7 +22,7 @@ from tests.support.processes import FleetProcesses, wait_for
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
 FLEET_FILE = "cars:\n  red: {platform: arduino}\n  blue: {platform: stm32+arm}\n  green: {}\n"
-ON_PHONES = ("fleet", "drive", "plan", "plots", "time", "inspect", "sessions", "pair")
+ON_PHONES = ("fleet", "drive", "plan", "map", "plots", "time", "inspect", "sessions", "pair")
 COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""
@@ -72,7 +72,7 @@ def take_pictures(stage: ConsoleStage, scratch: Path, directory: Path) -> None:
             if suffix and name not in ON_PHONES:
                 continue
             page = pair_page(stage, port, options) if name == "pair" else stage.page(path, **options)
-            prepare(page, name, link)
+            prepare(page, name, link, port)
             time.sleep(1.0)
             page.evaluate(REPLACE, texts)
             file = directory / f"console-{name}{suffix}.png"
@@ -88,13 +88,21 @@ def pair_page(stage: ConsoleStage, port: int, options: dict[str, Any]) -> Page:
     return page
 
 
-def prepare(page: Page, name: str, link: str) -> None:
-    """Do the first steps of a person on a page."""
+def prepare(page: Page, name: str, link: str, port: int) -> None:
+    """Do the first steps of a person on a page. link: of a new car. port: that of the network."""
     match name:
         case "drive":
             page.locator("input[name=select-red]").check()
+        case "map":
+            page.locator("[data-mark]").nth(2).wait_for()
+        case "board":
+            page.locator("[data-class=open]").click()
+            code = page.locator(".class .code").inner_text()
+            for _ in range(2):
+                assert NetworkDevice(port).pair(code)["ok"]
+            page.locator("[data-guest-name]").nth(1).wait_for()
         case "people":
-            page.locator("[data-device]").wait_for()
+            page.locator("[data-device]").first.wait_for()
         case "sessions":
             row = page.locator("[data-session]")
             row.first.wait_for()

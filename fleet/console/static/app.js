@@ -22,6 +22,8 @@ const loadPlots = async () => {
   document.head.append(looks);
   return (await import("./plots-page.js")).PlotsPage;
 };
+const loadMap = async () => (await import("./map-page.js")).MapPage;
+const loadBoard = async () => (await import("./board-page.js")).BoardPage;
 const loadTime = async () => (await import("./time-page.js")).TimePage;
 function later(title, load) {
   let Page = null;
@@ -48,10 +50,12 @@ const PAGES = {
   "#/": [t.fleet, FleetPage, "M4 4h6v6H4zM14 4h6v6h-6zM4 14h6v6H4zM14 14h6v6h-6z"],
   "#/drive": [t.drive, DrivePage, "M12 3v18M3 12h18M9 6l3-3 3 3M9 18l3 3 3-3M6 9l-3 3 3 3M18 9l3 3-3 3"],
   "#/plan": [t.plan, PlanPage, "M9 6h11M9 12h11M9 18h11M4 6h1M4 12h1M4 18h1"],
+  "#/map": [t.map, later(t.map, loadMap), "M3 6l6-2 6 2 6-2v14l-6 2-6-2-6 2zM9 4v14M15 6v14"],
   "#/plots": [t.plots, later(t.plots, loadPlots), "M4 4v16h16M7 15l4-5 3 3 5-7"],
   "#/time": [t.time, later(t.time, loadTime), "M3 12h18M7 8v8M12 9.500v5M17 8v8"],
   "#/inspect": [t.inspect, InspectPage, "M11 4a7 7 0 1 0 0 14 7 7 0 0 0 0-14zM16 16l5 5"],
   "#/people": [t.people, PeoplePage, "M12 4a4 4 0 1 0 0 8 4 4 0 0 0 0-8zM4 21c0-4 3-6 8-6s8 2 8 6"],
+  "#/board": [t.board, later(t.board, loadBoard), "M3 4h18v12H3zM12 16v5M8 21h8"],
   "#/sessions": [t.sessions, SessionsPage, "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM12 10a2 2 0 1 0 0 4 2 2 0 0 0 0-4z"],
   "#/setup": [t.setup, SetupPage, "M4 7h9M17 7h3M4 17h3M11 17h9M15 5a2 2 0 1 0 0 4 2 2 0 0 0 0-4zM9 15a2 2 0 1 0 0 4 2 2 0 0 0 0-4z"],
 };
@@ -136,6 +140,9 @@ function Report({ report }) {
   </div>`;
 }
 
+// A device of a class that nobody has assigned yet.
+const isGuest = () => store.hello?.person.rank === "guest";
+
 function StopBar() {
   const [asking, setAsking] = useState(null); // estop, pause
   const [why, setWhy] = useState("");
@@ -164,7 +171,7 @@ function StopBar() {
       ${mayPause &&
       html`<button id="pause" class=${store.rights === null ? "later" : ""} aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>
         <${Icon} path=${DRAWINGS.pause} />${t.pause}</button>`}
-      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} path=${DRAWINGS.estop} />${t.estop}</button>
+      ${!isGuest() && html`<button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} path=${DRAWINGS.estop} />${t.estop}</button>`}
     </div>
   </section>`;
 }
@@ -266,6 +273,7 @@ class App extends Component {
         ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
         ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
+        ${isReady() && isGuest() && html`<p class="note guest" role="status" data-guest>${t.guest(store.hello.person.name)}</p>`}
         ${state?.unrecorded && html`<${Banner} words=${t.unrecorded(state.unrecorded)} />`}
         ${isReady() && html`<${Paused} cars=${state.cars} />`}
       </div>

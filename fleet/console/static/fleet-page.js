@@ -91,7 +91,7 @@ function markOf(car) {
 }
 
 // What is wrong with a car, the worst first, each with its class and short words.
-function troublesOf(car) {
+export function troublesOf(car) {
   const silent_s = silence(car);
   return [
     car.estops.length > 0 && ["bad", "estopped"],

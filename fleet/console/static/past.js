@@ -33,7 +33,8 @@ async function read(name, mine) {
 
 // ---------------------------------------------------------------- a moment
 
-let extras = { car: "", series: [], span_s: 0 }; // what the page shows beside the cars
+let extras = { car: "", series: [], span_s: 0, map: false, plan: false }; // what the page shows beside the cars
+const NOTHING = { cars: [], detail: null, samples: null, map: null, plan: null, shown: null, words: "" }; // not known yet
 let isDirty = false;
 let isLoading = false;
 
@@ -50,7 +51,8 @@ async function load() {
       isDirty = store.past !== null;
       continue;
     }
-    const known = found.ok ? { cars: found.cars, detail: found.detail ?? null, samples: found.samples ?? null } : { cars: [], detail: null, samples: null };
+    const { cars = [], detail = null, samples = null, map = null, plan = null } = found.ok ? found : {};
+    const known = { cars, detail, samples, map, plan };
     showPast({ ...store.past, ...known, shown: asked, words: found.words ?? "" });
   }
   isLoading = false;
@@ -59,7 +61,7 @@ async function load() {
 // Show the moment of a recording. Whatever is held is let go first.
 export function jump(session, at_ms) {
   release();
-  const before = store.past?.session === session ? store.past : { session, cars: [], detail: null, samples: null, shown: null, words: "" };
+  const before = store.past?.session === session ? store.past : { ...NOTHING, session };
   showPast({ ...before, at_ms: Math.round(at_ms) });
   writeAddress();
   load();
@@ -103,7 +105,7 @@ async function readAddress() {
   }
   const { begin, words } = await openSession(session); // which another one may have replaced meanwhile
   if (begin !== undefined) jump(session, begin);
-  else showPast({ session, at_ms: 0, cars: [], detail: null, samples: null, shown: null, words: words || describe.unreachable });
+  else showPast({ ...NOTHING, session, at_ms: 0, words: words || describe.unreachable });
 }
 window.addEventListener("hashchange", readAddress);
 readAddress();

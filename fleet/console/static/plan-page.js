@@ -2,6 +2,7 @@
 
 import { ask, askBySocket, changed, clock, on, store, who } from "./console.js";
 import { seen } from "./foreign.js";
+import { need } from "./past.js";
 import { countsWith, withRoles } from "./plan-text.js";
 import { modes, t } from "./texts.js";
 import { html, Refused, useEffect, useRef, useState } from "./ui.js";
@@ -34,7 +35,18 @@ async function sendPlan(what, text) {
 
 const FAULT = /^\u2068?plan:(\d+):\d+: (error|warning): (.*)$/;
 
+// A recording does not say whether the coordinator still ran.
+const StatusThen = ({ shown }) =>
+  shown.plan === null
+    ? html`<p>${t.noPlanThen}</p>`
+    : html`<p role="status" data-plan-then><strong>${shown.stopped_by
+          ? t.planStopped(seen(shown.plan.name), who(shown.stopped_by))
+          : t.planThen(seen(shown.plan.name), shown.plan.set_by && who(shown.plan.set_by))}</strong></p>
+        ${shown.phase && html`<p>${t.phase(shown.phase)}</p>`}
+        ${shown.rules?.length > 0 && html`<p>${t.rules(shown.rules)}</p>`}`;
+
 function Status({ shown }) {
+  if (store.past !== null) return html`<${StatusThen} shown=${shown} />`;
   if (shown.plan === null) return html`<p>${t.noPlan}</p>`;
   const { name, set_by } = shown.plan;
   const refused = store.rights.manage;
@@ -210,8 +222,15 @@ function Editor({ current }) {
   </section>`;
 }
 
+const NO_PLAN = { plan: null, log: [] };
+
 export function PlanPage() {
-  const shown = inForce;
+  const isPast = store.past !== null;
+  const shown = isPast ? (store.past.plan ?? NO_PLAN) : inForce;
+  useEffect(() => {
+    need({ plan: true });
+    return () => need({ plan: false });
+  }, []);
   return html`
     <h1>${t.plan}</h1>
     <div class="columns">
@@ -219,6 +238,7 @@ export function PlanPage() {
         <${Status} shown=${shown} />
         ${shown.roles && html`<${Roles} roles=${shown.roles} />`}
         ${shown.decisions && html`<${Decisions} decisions=${shown.decisions} />`}
+        ${isPast && shown.decisions && html`<p class="hint">${t.planThenWhy}</p>`}
         ${shown.log.length > 0 &&
         html`<section>
           <h2>${t.coordinator}</h2>
@@ -227,7 +247,7 @@ export function PlanPage() {
           </ul>
         </section>`}
       </div>
-      <${Editor} current=${shown.plan?.text} />
+      ${isPast ? shown.plan && html`<section><h2>${t.planText}</h2><pre class="scroll" tabindex="0">${seen(shown.plan.text)}</pre></section>` : html`<${Editor} current=${shown.plan?.text} />`}
     </div>
   `;
 }

@@ -1,23 +1,19 @@
 // The time line: a lane for each car, live and of a recording. Who scrubs looks back: all pages show that moment then.
 
-import { ask, carsInPlace, changed, clock, consoleNow, store, when, who } from "./console.js";
+import { carsInPlace, changed, clock, store, when, who } from "./console.js";
 import { seen } from "./foreign.js";
-import { liveSpans, showLanes } from "./lanes.js";
-import { goLive, jump, lanesOf, openSession } from "./past.js";
+import { useMoments } from "./moments.js";
+import { goLive, jump, openSession } from "./past.js";
 import { around, eventTimes, LANES, nextTime, placed, previousTime, saidAt } from "./spans.js";
 import { modes, t } from "./texts.js";
-import { Component, html, useEffect, useState } from "./ui.js";
+import { Component, html, useState } from "./ui.js";
 import { lengthWords } from "./when.js";
 
-const LIVE_MS = 900_000;
-const SHORTEST_MS = 60_000; // of a console that has just begun
 const LATE_MS = 2000; // the newest span of now ends with the last state, which is up to two seconds old
-const REFRESH_MS = 10_000; // the lanes of a recording that grows
 const NEAR_MS = 30_000;
 const MAX_NEAR = 40;
 const MAX_SESSIONS = 50;
 const WINDOWS = [0, 600_000, 60_000]; // the whole, ten minutes, one
-const LIVE_GAP_MS = 1500; // nearer to the end than this is now
 
 const modeWords = (word) => modes[word]?.[0] ?? word;
 const wordsOf = ({ lane, words }) => (lane === "mode" ? modeWords(words) : lane === "driver" ? t.drivenMark(who(words)) : words);
@@ -40,50 +36,11 @@ class CarLanes extends Component {
   }
 }
 
-function useSessions() {
-  const [found, setFound] = useState({ sessions: [], running: null });
-  useEffect(() => {
-    let over = false;
-    Promise.all([ask("/sessions"), ask("/recording/status", "")]).then(([listed, recorder]) => {
-      const running = recorder.ok && recorder.state === "recording" ? recorder.session : "";
-      if (!over) setFound({ sessions: listed.sessions ?? [], running });
-    });
-    return () => (over = true);
-  }, []);
-  return found;
-}
-
-// The live spans change with each message: one array for each second is enough to look at.
-let liveMade = { at: 0, begin: 0, spans: [] };
-const liveNow = () => {
-  const at = Math.floor(consoleNow() / 1000);
-  if (liveMade.at !== at) {
-    const spans = liveSpans();
-    const first = spans.reduce((least, each) => Math.min(least, each.begin), at * 1000 - SHORTEST_MS);
-    liveMade = { at, begin: Math.max(first, at * 1000 - LIVE_MS), spans };
-  }
-  return liveMade;
-};
-
 export function TimePage() {
-  const { sessions, running } = useSessions();
+  const { sessions, running, name, shown, at, whole, canScrub, go } = useMoments();
+  const { past } = store;
   const [length, setLength] = useState(0);
   const [copied, setCopied] = useState("");
-  useEffect(showLanes, []);
-  const { past } = store;
-  const name = past?.session ?? "";
-  const isRunning = name !== "" && name === running;
-  useEffect(() => {
-    if (name) openSession(name);
-    if (!isRunning) return;
-    const timer = setInterval(() => openSession(name, { again: true }), REFRESH_MS);
-    return () => clearInterval(timer);
-  }, [name, isRunning]);
-
-  const live = liveNow();
-  const shown = past === null ? { spans: live.spans, marks: [], begin: live.begin, end: live.at * 1000 } : lanesOf(name);
-  const at = past?.at_ms ?? shown.end;
-  const whole = shown?.begin === undefined ? { from: at - LIVE_MS, to: at } : { from: Math.min(shown.begin, at), to: Math.max(isRunning ? live.at * 1000 : shown.end, at, shown.begin + 1000) };
   // A window around the moment, within the whole. It moves by halves, so that the lanes stand still under the finger.
   const step = length / 2;
   const from = length === 0 ? whole.from : Math.max(whole.from, Math.floor(at / step) * step - step / 2);
@@ -91,12 +48,6 @@ export function TimePage() {
   const { spans = [], marks = [] } = shown ?? {};
   const cars = past === null ? carsInPlace().map((car) => car.name) : [...new Set([...(shown?.cars ?? []), ...past.cars.map((car) => car.name)])];
 
-  const canScrub = name !== "" || Boolean(running);
-  const go = (to_ms) => {
-    const asked = Math.min(whole.to, Math.max(whole.from, to_ms));
-    if (past === null && asked > whole.to - LIVE_GAP_MS) return;
-    if (canScrub) jump(name || running, asked);
-  };
   const choose = async (event) => {
     const chosen = event.target.value;
     if (chosen === "") return goLive();

@@ -58,6 +58,26 @@ def read_between(session: Session, expressions: tuple[str, ...], from_ns: int, t
     yield from _decoded(session.rows(Selection(expressions, from_ns, to_ns + 1)))
 
 
+def thinned(session: Session, expressions: tuple[str, ...], from_ns: int, to_ns: int, step_ns: int) -> Iterator[Known]:
+    """Yield messages as `read_between`, of each key at most one in each step of time."""
+    yield from _decoded(one_a_step(session.rows(Selection(expressions, from_ns, to_ns + 1)), step_ns))
+
+
+def one_a_step(rows: Iterable[Row], step_ns: int) -> Iterator[Row]:
+    """Yield the first row of each key in each step of time. Pure."""
+    taken: dict[str, int] = {}
+    for row in rows:
+        topic, step = row[0].channel.topic, row[2] // step_ns
+        if taken.get(topic) != step:
+            taken[topic] = step
+            yield row
+
+
+def newest_of(session: Session, expressions: tuple[str, ...], at_ns: int) -> list[Known]:
+    """Return the newest message of some keys up to a moment, however old. For what is published on change only."""
+    return list(_decoded(newest_rows(session.rows(Selection(expressions, 0, at_ns + 1))).values()))
+
+
 def lanes_of(session: Session) -> Lanes:
     """Return the lanes and marks of a whole session. `session.damage` then has what could not be read."""
     expressions = (*(f"*/*/{topic}" for topic in LANE_TOPICS), f"*/{MARK_TOPIC}")

@@ -1,5 +1,6 @@
 """Pairing codes, cookies and the slow-down, on virtual time."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,17 @@ from fleet.console.connection_limit import (
     ConnectionLimit,
     LogLimit,
 )
-from fleet.console.pairing import BadBook, GuessLimit, PagePerson, PeopleBook, UnknownPerson, code_words, new_code
+from fleet.console.pairing import (
+    BadBook,
+    ClassFull,
+    GuessLimit,
+    NoGuest,
+    PagePerson,
+    PeopleBook,
+    UnknownPerson,
+    code_words,
+    new_code,
+)
 from fleet.hub.join_code import CODE_ALPHABET
 
 MIA = PagePerson("mia")
@@ -119,6 +130,92 @@ def test_a_damaged_book_is_refused(text: str) -> None:
         PeopleBook.of_text(text)
     with pytest.raises(BadBook):
         PeopleBook.of_text(paired().as_text().replace('"digest": "', '"digest": 1, "x": "'))
+
+
+CLASS = "CLASS234"
+
+
+def join(book: PeopleBook, number: int, now: float = NOW, code: str = CLASS) -> PeopleBook | None:
+    return book.redeem(code, f"cookie{number}", f"id{number}", "Phone", now)
+
+
+def test_the_code_of_a_class_pairs_guests_for_ten_minutes_until_it_is_closed() -> None:
+    book = paired().open_class(CLASS, NOW)
+    for number in range(3):
+        found = join(book, number, NOW + number)
+        assert found is not None
+        book = found
+    assert [each.person.name for each in book.guests(NOW + 5)] == ["guest-1", "guest-2", "guest-3"]
+    assert PeopleBook.of_text(book.as_text()) == book
+    assert CLASS not in book.as_text()
+    assert join(book, 9, NOW + pairing.CLASS_LIFETIME_S - 1) is not None
+    assert join(book, 9, NOW + pairing.CLASS_LIFETIME_S) is None
+    assert join(book, 9, NOW - 1) is None, "a clock that was set back ends it"
+    assert join(book.close_class(), 9) is None
+    assert join(book.open_class("OTHER234", NOW), 9) is None, "a new one ends the one before"
+    states = [book.device_of("cookie0", NOW + hours * 3600)[1] for hours in (11.9, 12.1)]
+    assert states == ["valid", "unknown"], "a guest is forgotten after a day of school"
+
+
+def test_a_thousand_that_come_are_one_class_and_take_nobodys_place() -> None:
+    book = PeopleBook()
+    for number in range(pairing.MAX_DEVICES - 10):
+        book = book.issue(f"CODE{number:04}", MIA, NOW)
+        book = book.redeem(f"CODE{number:04}", f"own{number}", f"own{number}", "", NOW) or book
+    persons = book.devices
+    book = book.open_class(CLASS, NOW)
+    full = 0
+    for number in range(1000):
+        try:
+            book = join(book, number) or book
+        except ClassFull:
+            full += 1
+    assert (len(book.guests(NOW)), full) == (10, 990), "there are that many places"
+    assert book.devices[: len(persons)] == persons
+    book = replace(book, devices=())
+    for number in range(1000):
+        with suppress(ClassFull):
+            book = join(book, number) or book
+    assert len(book.guests(NOW)) == pairing.MAX_GUESTS
+    names = [each.person.name for each in book.guests(NOW)]
+    assert len(set(names)) == len(names)
+
+
+@given(st.lists(CODES, min_size=1, max_size=200))
+def test_guesses_join_no_class(guesses: list[str]) -> None:
+    book = PeopleBook().open_class(CLASS, NOW)
+    for guess in guesses:
+        assert (join(book, 1, code=guess) is not None) is (guess == CLASS)
+        assert book.is_class_code(guess, NOW) is (guess == CLASS)
+
+
+def test_a_guest_becomes_a_person_once_and_is_listed_as_the_fleet_lists_people() -> None:
+    listed = replace(PeopleBook(), people=("mia", "teacher"), leads=("teacher",))
+    book = join(listed.open_class(CLASS, NOW), 1)
+    assert book is not None
+    later = NOW + 3600
+    done = book.assign("id1", MIA, later)
+    device, state = done.device_of("cookie1", later + 29 * 86_400)
+    assert device is not None
+    assert (device.person, state) == (MIA, "valid"), "it is paired from then on"
+    assert done.guests(later) == []
+    for wrong, error in ((PagePerson("nobody"), UnknownPerson), (PagePerson("mia", "lead"), ValueError)):
+        with pytest.raises(error):
+            book.assign("id1", wrong, later)
+    for gone in (done, replace(book, devices=())):
+        with pytest.raises(NoGuest):
+            gone.assign("id1", MIA, later)
+    with pytest.raises(NoGuest):
+        book.assign("id1", MIA, NOW + pairing.GUEST_LIFETIME_S)
+    with pytest.raises(NoGuest):
+        replace(paired(), people=("mia",)).assign("d1", MIA, NOW)  # a person stays who they are
+    with pytest.raises(ValueError, match="guest"):
+        replace(listed, people=("guest",)).open_class(CLASS, NOW)
+    for rank in ("guest", "king"):
+        with pytest.raises(ValueError):
+            PeopleBook().issue("K7QF3MXP", PagePerson("mia", rank), NOW)
+    named = replace(listed, people=("guest-1",)).open_class(CLASS, NOW)
+    assert [each.person.name for each in (join(named, 1) or named).guests(NOW)] == ["guest-2"]
 
 
 @pytest.mark.parametrize("name", ["d1", "mia"])

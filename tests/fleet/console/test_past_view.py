@@ -100,6 +100,29 @@ def test_values_of_a_plot_are_those_of_its_time_and_at_most_one_a_slot(session: 
     assert values[-1] == (9999, 999.9)
 
 
+def test_the_map_of_a_moment_has_places_trails_and_the_floor(session: Path) -> None:
+    found = answer(question(session, 10.5, map=True))["map"]
+    assert sorted(found["cars"]) == ["blue", "green", "red"]
+    assert {place[3] for place in found["cars"].values()} == {""}, "the truth goes before what is measured"
+    assert found["world"]["walls"][0] == [-2, 2, -2, -2]
+    assert found["world"]["lamps"] == [["beacon", 1.5, 1.5, False]]
+    assert all(len(points) > 5 for points in found["trails"].values())
+    ages = [found["cars"]["red"][5], *(answer(question(session, at, map=True))["map"] for at in (25, 60))]
+    assert ages[0] is None
+    assert ages[1]["cars"]["red"][5] in (5, 6), "it is told how old the last place is"
+    assert ages[1]["world"] is None
+    assert ages[2] == {"cars": {}, "trails": {}, "world": None}
+    assert "map" not in answer(question(session, 10.5))
+
+
+def test_the_plan_of_a_moment_is_the_last_one_that_was_put_in_force(session: Path) -> None:
+    found = {at: answer(question(session, at, plan=True))["plan"] for at in (-1, 15)}
+    assert found[-1]["plan"] is None
+    assert found[15]["plan"]["text"]
+    assert {car for role in found[15]["roles"] for car in role["cars"]} <= {"red", "green", "blue"}
+    assert [each["decided"] for each in found[15]["decisions"]]
+
+
 def test_names_and_numbers_that_are_none_reach_no_page() -> None:
     odd = [
         known("state/motion", pb.Motion(motion="stop", speed=math.nan), 1),
@@ -140,8 +163,15 @@ def test_a_damaged_session_says_what_is_lost(session: Path, tmp_path: Path) -> N
 
 def test_the_questions_of_a_page() -> None:
     asked = {"at_ms": 1000.7, "car": "red", "span_s": 60, "series": [list(RANGE)], "more": 1}
-    assert moment_question(json.dumps(asked)) == {"at_ms": 1000, "car": "red", "span_s": 60.0, "series": [RANGE]}
-    assert moment_question('{"at_ms": 5}') == {"at_ms": 5, "car": "", "span_s": 0.0, "series": []}
+    plain = {"at_ms": 5, "car": "", "span_s": 0.0, "map": False, "plan": False, "series": []}
+    assert moment_question(json.dumps(asked)) == plain | {
+        "at_ms": 1000,
+        "car": "red",
+        "span_s": 60.0,
+        "series": [RANGE],
+    }
+    assert moment_question('{"at_ms": 5}') == plain
+    assert moment_question('{"at_ms": 5, "map": true, "plan": true}') == plain | {"map": True, "plan": True}
 
 
 @pytest.mark.parametrize(

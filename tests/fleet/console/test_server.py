@@ -38,7 +38,7 @@ from fleet.console.budgets import (
 )
 from fleet.console.car_view import MAX_OTHER_CARS
 from fleet.console.connection_limit import MAX_PER_DEVICE
-from fleet.console.console import MAX_PAGES_OF_DEVICE
+from fleet.console.console import MAX_PAGES_OF_DEVICE, MAX_PAGES_OF_GUEST
 from fleet.console.log_rate import LOG_BURST
 from fleet.console.page_link import SEND_TIMEOUT_S
 from fleet.console.people_file import PeopleFile, people_path
@@ -251,6 +251,90 @@ def test_a_code_is_for_a_person_of_the_fleet_and_for_a_console_that_runs(stage: 
         assert (code, "`fleet console --lan`" in words) == (2, True)
     finally:
         hub.close()
+
+
+def told(page: ClientConnection, kind: str) -> dict[str, Any]:
+    """Return the next message of a kind to a page."""
+    while (found := json.loads(page.recv(timeout=30)))["t"] != kind:
+        pass
+    return dict(found)
+
+
+def test_a_class_joins_with_one_code_watches_stops_and_is_assigned(stage: ServerStage) -> None:
+    teacher, pupil = stage.device("teacher", "--rank", "lead"), stage.device("mia")
+
+    def people(who: NetworkDevice, **message: str) -> tuple[int, Any]:
+        status, text = who.ask("POST", "/people", json.dumps(message))
+        return status, json.loads(text)
+
+    for kind in ("open_class", "close_class", "assign"):
+        assert people(pupil, t=kind)[0] == 403
+    status, opened = people(teacher, t="open_class")
+    assert (status, opened["lifetime_s"], opened["qr"][:14]) == (200, 600, "data:image/svg")
+    guests = [NetworkDevice(stage.lan_port) for _ in range(3)]
+    names = [guest.pair(opened["code"])["name"] for guest in guests]
+    assert names == ["guest-1", "guest-2", "guest-3"]
+    assert guests[0].pair(opened["code"])["name"] == "guest-1", "who scans again stays"
+    assert pupil.pair(opened["code"])["name"] == "mia"
+    refused_paths = {"GET": ("/sessions", "/past/x"), "POST": ("/people", "/plan/check", "/recording/status")}
+    for verb, path in ((verb, path) for verb, paths in refused_paths.items() for path in paths):
+        status, words = guests[0].ask(verb, path, None if verb == "GET" else "{}")
+        assert (status, b"watches and stops" in words) == (403, True), path
+    for path in ("/", "/hello", "/static/app.js"):
+        assert guests[0].ask("GET", path)[0] == 200
+
+    stage.drive()
+    with guests[0].socket() as page:
+        assert told(page, "hello")["person"] == {"name": "guest-1", "rank": "guest"}
+        rights = told(page, "rights")
+        assert set(rights["cars"]["red"]) >= {"move", "act", "take", "lend", "resume"}
+        assert rights["manage"] == rights["pause"] != ""
+        refused: list[dict[str, Any]] = [
+            {"t": "press", "press": 1, "cars": ["red"], "motion": "forward", "n": told(page, "tick")["n"]},
+            {"t": "take", "id": 1, "cars": ["red"]},
+            {"t": "do", "id": 2, "verb": "led", "cars": ["red"], "rgb": [1, 2, 3]},
+            {"t": "do", "id": 3, "verb": "estop", "cars": ["red"], "why": ""},
+            {"t": "estop", "id": "e", "why": ""},
+            {"t": "pause", "id": "p", "why": ""},
+            {"t": "unpause", "id": 4},
+            {"t": "plan", "id": 5, "verb": "stop"},
+        ]
+        for message in refused:
+            page.send(json.dumps(message))
+            assert "Board" in told(page, "bad")["words"], message
+        page.send('{"t": "map"}')
+        assert "red" in told(page, "map")["cars"]
+        assert stage.judge.driving, "nothing of that was carried out"
+        page.send('{"t": "stop", "id": "guest"}')
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        assert person_of(stage.fleet.state("safety").hold.by) == "guest", "and no lead is said to have stopped it"
+        stage.drive()
+        assert guests[1].ask("POST", "/stop?id=other")[0] == 204
+        wait_for(lambda: not stage.judge.driving, "red stands again")
+
+        listed = {each["name"]: each for each in json.loads(teacher.ask("GET", "/people")[1])["lan"]["devices"]}
+        assert listed["guest-1"]["rank"] == "guest"
+        device = listed["guest-1"]["id"]
+        for wrong in ({"id": device, "name": "nobody"}, {"id": "none", "name": "eva"}, {"id": device, "name": "E <b>"}):
+            assert people(teacher, t="assign", **wrong)[0] == 400
+        assert people(teacher, t="assign", id=device, name="eva")[0] == 200
+        with pytest.raises(ConnectionClosed):
+            told(page, "none")
+        assert page.close_code == 1000, "it connects again, and is told nothing of a revocation"
+    with guests[0].socket() as page:
+        assert told(page, "hello")["person"] == {"name": "eva", "rank": "person"}
+    assert people(teacher, t="assign", id=device, name="mia")[0] == 400, "a person stays who they are"
+    assert people(teacher, t="close_class")[0] == 200
+    late = NetworkDevice(stage.lan_port)
+    assert not late.pair(opened["code"])["ok"]
+    assert late.ask("GET", "/hello")[0] == 403
+    with contextlib.ExitStack() as pages:
+        for _ in range(MAX_PAGES_OF_GUEST):
+            told(pages.enter_context(guests[1].socket()), "hello")
+        with guests[1].socket() as one_more, pytest.raises(ConnectionClosed):
+            told(one_more, "hello")
+    for name in ("guest-2", "guest-3", "eva"):
+        stage.run("people", "--revoke", name)
 
 
 def book_file(stage: ServerStage) -> PeopleFile:

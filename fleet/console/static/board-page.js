@@ -1,0 +1,138 @@
+// The board: what a whole room reads from the wall. Who leads lets a class join here, and gives each device a person and a car.
+
+import { ask, command, isRefused, store, who } from "./console.js";
+import { troublesOf } from "./fleet-page.js";
+import { arrows, modes, t } from "./texts.js";
+import { html, Results, useEffect, useState } from "./ui.js";
+
+const READ_MS = 2000;
+const LESSON_MINUTES = [10, 45, 90];
+
+const post = (message) => ask("/people", JSON.stringify(message));
+
+// Who has a car, and how: a drive that runs, a loan, a lease.
+function holderOf(car) {
+  const { owner, motion } = car.motion;
+  if (motion in arrows && owner) return t.boardDrives(who(owner));
+  if (car.loan) return t.lentMark(car.loan.to);
+  if (car.lease) return t.boardHolds(who(car.lease.holder));
+  return t.boardFree;
+}
+
+function Tile({ car }) {
+  const [arrow, words] = arrows[car.motion.motion] ?? ["", ""];
+  const troubles = troublesOf(car);
+  return html`<li class=${`car board-tile ${words ? "moving" : ""} ${troubles.length > 0 ? "bad-tile" : ""}`} style=${{ "--car": car.color }} data-board=${car.name}>
+    <h2>${car.name}${arrow && html` <span aria-hidden="true">${arrow}</span>`}</h2>
+    <p><strong>${holderOf(car)}</strong></p>
+    <p class="dim">${[words, modes[car.mode.asked]?.[0] ?? car.mode.asked, car.hold && t.boardHeld(who(car.hold))].filter(Boolean).join(" · ")}</p>
+    ${troubles.length > 0 && html`<p class="bad">⚠ ${troubles.map((each) => each.words).join(", ")}</p>`}
+  </li>`;
+}
+
+function useLan() {
+  const [found, setFound] = useState(null);
+  const read = async () => {
+    const answer = await ask("/people");
+    setFound("may_pair" in answer ? answer : null);
+  };
+  useEffect(() => {
+    read();
+    const timer = setInterval(read, READ_MS);
+    return () => clearInterval(timer);
+  }, []);
+  return [found, read];
+}
+
+function ClassCode() {
+  const [answer, setAnswer] = useState(null);
+  const [endsAt, setEndsAt] = useState(0);
+  const [now, setNow] = useState(performance.now());
+  useEffect(() => {
+    const timer = setInterval(() => setNow(performance.now()), 1000);
+    return () => clearInterval(timer);
+  }, []);
+  const open = async () => {
+    const found = await post({ t: "open_class" });
+    setAnswer(found);
+    setNow(performance.now());
+    setEndsAt(performance.now() + 1000 * (found.lifetime_s ?? 0));
+  };
+  const close = async () => {
+    const found = await post({ t: "close_class" });
+    if (found.ok) setEndsAt(0);
+    else setAnswer(found);
+  };
+  const left_s = Math.ceil((endsAt - now) / 1000);
+  if (answer === null || !answer.ok || left_s <= 0) {
+    return html`<div><button class="main" data-class="open" onClick=${open}>${t.classOpen}</button>
+      <p role="status">${answer === null ? "" : answer.ok ? t.classOver : answer.words}</p></div>`;
+  }
+  return html`<div class="class-code">
+    <div class="controls"><h2>${t.classTitle}</h2><span>${t.classLeft(left_s)}</span><button data-class="close" onClick=${close}>${t.classClose}</button></div>
+    <img class="qr" src=${answer.qr} alt=${t.pairPicture(answer.address)} />
+    <p role="status">${t.classHow(answer.address)}</p>
+    <p class="code">${answer.code}</p>
+    <p>${t.classThen}</p>
+    <p class="hint">${t.classWarning} <code class="fingerprint">${answer.fingerprint}</code></p>
+  </div>`;
+}
+
+function Guest({ guest, cars, onDone }) {
+  const [name, setName] = useState("");
+  const [car, setCar] = useState("");
+  const [minutes, setMinutes] = useState(LESSON_MINUTES[1]);
+  const [words, setWords] = useState("");
+  const assign = async (event) => {
+    event.preventDefault();
+    const found = await post({ t: "assign", id: guest.id, name });
+    if (!found.ok) return setWords(found.words);
+    if (car !== "") command("lend", [car], { to: name, duration_s: minutes * 60 });
+    onDone(t.classAssigned(guest.name, name));
+  };
+  const lendable = cars.filter((each) => !isRefused("lend", [each.name]));
+  return html`<li class="guest-row" data-guest-name=${guest.name}><form class="controls" onSubmit=${assign}>
+    <strong>${guest.name}</strong> <span class="hint">${guest.device || t.deviceUnknown}</span>
+    <label>${t.className} <input name="person" list="board-people" maxlength="32" required value=${name} onInput=${(event) => setName(event.target.value)} /></label>
+    <label>${t.classCar} <select name="car" value=${car} onChange=${(event) => setCar(event.target.value)}>
+      <option value="">${t.classNoCar}</option>
+      ${lendable.map((each) => html`<option key=${each.name}>${each.name}</option>`)}</select></label>
+    ${car !== "" && html`<label>${t.classFor} <select name="minutes" value=${minutes} onChange=${(event) => setMinutes(Number(event.target.value))}>
+      ${LESSON_MINUTES.map((count) => html`<option key=${count} value=${count}>${t.minutes(count)}</option>`)}</select></label>`}
+    <button aria-label=${t.classAssignOf(guest.name)} disabled=${store.past !== null}>${t.classAssign}</button>
+    ${words && html`<p class="bad" role="alert">${words}</p>`}
+  </form></li>`;
+}
+
+function Guests({ lan, cars, read }) {
+  const [done, setDone] = useState("");
+  const guests = lan.devices.filter((each) => each.rank === "guest");
+  const onDone = (words) => {
+    setDone(words);
+    read();
+  };
+  return html`<section class="guests">
+    <datalist id="board-people">${lan.people.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
+    <h2>${t.classGuests(guests.length)}</h2>
+    <p role="status">${done}</p>
+    <ul class="plain">${guests.map((guest) => html`<${Guest} key=${guest.id} guest=${guest} cars=${cars} onDone=${onDone} />`)}</ul>
+    <${Results} />
+  </section>`;
+}
+
+const fill = () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
+
+export function BoardPage({ cars }) {
+  const [found, read] = useLan();
+  const lan = found?.may_pair ? found.lan : undefined; // undefined: it is none of this page's business
+  return html`<div class="board">
+    <div class="controls board-head"><h1>${t.board}</h1>
+      ${document.fullscreenEnabled && html`<button data-fill onClick=${fill}>${t.boardFull}</button>`}</div>
+    <ul class="plain board-cars">
+      ${cars.length === 0 && html`<li>${store.past === null ? t.noCars : t.noCarsThen}</li>`}
+      ${cars.map((car) => html`<${Tile} key=${car.name} car=${car} />`)}
+    </ul>
+    ${lan !== undefined && html`<section class="class" aria-label=${t.classTitle}>${lan === null ? html`<p class="hint">${t.notOnNetwork}</p>` : html`<${ClassCode} />`}</section>`}
+    ${lan && html`<${Guests} lan=${lan} cars=${cars} read=${read} />`}
+  </div>`;
+}
