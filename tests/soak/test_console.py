@@ -25,7 +25,8 @@ from tests.support.processes import GatewayProcess, wait_for
 from tests.support.up import Up
 from tests.support.wire_record import WireRecord
 
-pytestmark = pytest.mark.soak
+# Before each press all cars are brought into a mode, and a stop in doubt takes its time: some seconds for each press.
+pytestmark = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
 # The other programs send nothing while they track.
 KINDS = ("arduino", "arduino+arm")
@@ -254,18 +255,21 @@ def test_twenty_moving_cars_scroll_smoothly_on_a_slow_phone(twenty: TwentyCars) 
         devtools.send("Emulation.setCPUThrottlingRate", {"rate": THROTTLE})
         tiles, way = page.locator(".tiles"), {"x": 195, "y": 500, "speed": 600, "gestureSourceType": "mouse"}
 
-        def scroll(distance: int) -> bool:
+        def scroll() -> bool:
+            """Scroll away from the nearer end. Return whether the tiles have moved."""
             before = tiles.evaluate("(tiles) => tiles.scrollTop")
+            distance = SCROLL_PX if before < SCROLL_PX / 2 else -SCROLL_PX
             devtools.send("Input.synthesizeScrollGesture", way | {"yDistance": -distance})
             return bool(abs(tiles.evaluate("(tiles) => tiles.scrollTop") - before) > SCROLL_PX / 2)
 
-        wait_for(lambda: scroll(SCROLL_PX), "the new page scrolls")
-        for number in range(SCROLLS):
+        wait_for(scroll, "the new page scrolls")
+        for _ in range(SCROLLS):
             browser.start_tracing(page=page, categories=FRAMES)
-            assert scroll(SCROLL_PX if number % 2 else -SCROLL_PX)
+            assert scroll()
             frames = frames_of(browser.stop_tracing())
             rates.append((len(frames) - 1) / (frames[-1] - frames[0]))
-    print(f"\nscrolling twenty cars at throttle {THROTTLE}: {', '.join(f'{each:.0f}' for each in rates)} frames/s")
+    shown = ", ".join(f"{each:.0f}" for each in rates)
+    print(f"\nscrolling twenty cars at throttle {THROTTLE}: {shown} frames/s; load {os.getloadavg()[0]:.1f}")
     assert sorted(rates)[len(rates) // 2] >= MIN_FRAMES_HZ
 
 
