@@ -139,15 +139,15 @@ class Fleet:
         *,
         x_m: float,
         y_m: float,
-        yaw_rad: float,
+        heading_rad: float,
         frame: str = "map",
         at: datetime | None = None,
         xy_std_m: float | None = None,
-        yaw_std_rad: float | None = None,
+        heading_std_rad: float | None = None,
     ) -> None:
         """Publish where a car is, as this program has measured it from outside: `sensor/pose`."""
-        publish, stds = self.sync.publish_pose, {"xy_std_m": xy_std_m, "yaw_std_rad": yaw_std_rad}
-        await self.call(partial(publish, car, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, frame=frame, at=at, **stds))
+        publish, stds = self.sync.publish_pose, {"xy_std_m": xy_std_m, "heading_std_rad": heading_std_rad}
+        await self.call(partial(publish, car, x_m=x_m, y_m=y_m, heading_rad=heading_rad, frame=frame, at=at, **stds))
 
     async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Stop these cars, or every car."""

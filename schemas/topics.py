@@ -176,8 +176,8 @@ CAR_TOPICS: Final = (
         Qos.READING,
         20.0,
         _READING,
-        {"x_m": "m", "y_m": "m", "yaw_rad": "rad", "xy_std_m": "m", "yaw_std_rad": "rad"},
-        {"x_m": _PLACE_M, "y_m": _PLACE_M, "yaw_rad": (-math.pi, math.pi)},
+        {"x_m": "m", "y_m": "m", "heading_rad": "rad", "xy_std_m": "m", "heading_std_rad": "rad"},
+        {"x_m": _PLACE_M, "y_m": _PLACE_M, "heading_rad": (-math.pi, math.pi)},
         entity="pose",
     ),
     Topic(
@@ -320,6 +320,8 @@ SERVICE_TOPICS: Final = (
 
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
 
+FROM_OUTSIDE: Final = frozenset({"sensor/pose"})
+"""Readings that a program outside of the car may publish, of any car and in any mode. They are no sign of life."""
 RESULT: Final = "fleet.v1.Result"
 _FAMILIES: Final = tuple(dict.fromkeys(topic.family for topic in CAR_TOPICS))
 _MIN_WORD_LENGTH: Final = 4

@@ -279,21 +279,21 @@ class Fleet:
         *,
         x_m: float,
         y_m: float,
-        yaw_rad: float,
+        heading_rad: float,
         frame: str = "map",
         at: datetime | None = None,
         xy_std_m: float | None = None,
-        yaw_std_rad: float | None = None,
+        heading_std_rad: float | None = None,
     ) -> None:
         """Publish where a car is, as this program has measured it from outside: `sensor/pose` (REP-103).
 
-        Cars of one `frame` are on one map. yaw_rad: counter-clockwise from the x axis, any number. at: when it was
-        measured (default: now), with its time zone. xy_std_m, yaw_std_rad: standard deviations, only if they are known.
+        Cars of one `frame` are on one map. heading_rad: counter-clockwise from the x axis, any number. at: when it was
+        measured (default: now), with its time zone. xy_std_m, heading_std_rad: standard deviations, if they are known.
         Raises ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with
         certificates unless this is that of `service.locator`.
         """
         self._check_open()
-        message = pose_message(x_m, y_m, yaw_rad, frame, xy_std_m, yaw_std_rad)
+        message = pose_message(x_m, y_m, heading_rad, frame, xy_std_m, heading_std_rad)
         if not may_locate(self.bus.identity, check_car(car)):
             raise BusError(
                 f"{self.bus.identity} may not say where {car} is, so the hub would drop it. Open the fleet with "

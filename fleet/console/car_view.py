@@ -96,7 +96,8 @@ class CarView:
 
     def on_message(self, topic: str, value: Any, now: float) -> None:
         """Handle a message of this car. topic: such as `sensor/range`."""
-        self._heard_at = now
+        if topic not in topics.FROM_OUTSIDE:
+            self._heard_at = now
         match topic:
             case "event/command":
                 self._on_command(value)

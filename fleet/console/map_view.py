@@ -37,7 +37,7 @@ class Place:
 
     x_m: float
     y_m: float
-    yaw_rad: float
+    heading_rad: float
     frame: str
     at: float
     xy_std_m: float | None = None
@@ -72,7 +72,7 @@ class MapView:
                     return  # what a simulator knows is no measurement, and better than any
                 std = message.xy_std_m if message.HasField("xy_std_m") else None
                 frame = message.frame[:_MAX_MAP_NAME_LENGTH] or "map"
-                self._put(car, Place(message.x_m, message.y_m, message.yaw_rad, frame, at, std))
+                self._put(car, Place(message.x_m, message.y_m, message.heading_rad, frame, at, std))
             case WORLD.name:
                 self._world, self._world_at = message, at
             case _:
@@ -84,7 +84,7 @@ class MapView:
         if before is not None and before.frame != place.frame:
             self._trails.pop(car, None)  # it counts from another origin
         trail = self._trails.setdefault(car, deque())
-        while trail and trail[0][0] < place.at - TRAIL_S:
+        while trail and abs(place.at - trail[0][0]) > TRAIL_S:  # or the clock was set back
             trail.popleft()
         if trail:
             at, x_m, y_m = trail[-1]
@@ -104,7 +104,7 @@ class MapView:
             car: [
                 round(place.x_m, 3),
                 round(place.y_m, 3),
-                round(place.yaw_rad, 3),
+                round(place.heading_rad, 3),
                 place.frame,
                 None if place.xy_std_m is None else round(place.xy_std_m, 3),
                 int(now - place.at) if place.is_stale(now) else None,

@@ -158,7 +158,7 @@ _SENSOR_PANELS: Final = (
         curves=tuple(Curve("sensor/attitude", f"{axis}_rad", f"{axis} (rad)") for axis in ("roll", "pitch", "yaw")),
     ),
     Panel("Pose", curves=tuple(Curve(POSE, name, f"{name[0]} ({_unit(POSE, name)})") for name in ("x_m", "y_m"))),
-    Panel("Heading", curves=(Curve(POSE, "yaw_rad", f"yaw ({_unit(POSE, 'yaw_rad')})"),)),
+    Panel("Heading", curves=(Curve(POSE, "heading_rad", f"heading ({_unit(POSE, 'heading_rad')})"),)),
     Panel("Arm", curves=tuple(Curve("sensor/arm", f"joint_deg[{n}]", f"J{n + 1} (deg)") for n in range(6))),
 )
 _STATE_PANELS: Final = (

@@ -127,7 +127,7 @@ class CarPublisher:
             return
         if message.boot_id == self._boot_id:
             return  # the driver's own
-        if not all(math.isfinite(each) for each in (message.x_m, message.y_m, message.yaw_rad)):
+        if not all(math.isfinite(each) for each in (message.x_m, message.y_m, message.heading_rad)):
             self.dropped += 1
             return
         if not message.stamp.seconds:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 FAMILIES: Final = ("sensor", "state")
-POSE: Final = "sensor/pose"
-"""The topic that others than the gateway may publish, too (docs/reference/keys.md#poses)."""
 MAX_QUEUED_DRIVES: Final = 32
 """Maximum waiting drives of streams. Older ones are dropped. Few, so that a stop never waits long behind them."""
 MAX_QUEUED_QUERIES: Final = 128
@@ -96,8 +94,8 @@ class CarService:
         for expression in keys.command_keys(fleet, car, Verb.DRIVE):
             opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD)
         # A program outside of the car may publish its pose. The gateway answers queries with it.
-        pose = keys.topic_key(fleet, car, POSE)
-        opened.subscribe(pose, lambda sample: self._poses(POSE, sample), largest=bus.LARGEST_PAYLOAD)
+        pose = keys.topic_key(fleet, car, "sensor/pose")
+        opened.subscribe(pose, lambda sample: self._poses(pose, sample), largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
         opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)

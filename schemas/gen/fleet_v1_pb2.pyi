@@ -200,7 +200,7 @@ class Attitude(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roll_rad: _Optional[float] = ..., pitch_rad: _Optional[float] = ..., yaw_rad: _Optional[float] = ...) -> None: ...
 
 class Pose(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "frame", "x_m", "y_m", "yaw_rad", "xy_std_m", "yaw_std_rad")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "frame", "x_m", "y_m", "heading_rad", "xy_std_m", "heading_std_rad")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -208,9 +208,9 @@ class Pose(_message.Message):
     FRAME_FIELD_NUMBER: _ClassVar[int]
     X_M_FIELD_NUMBER: _ClassVar[int]
     Y_M_FIELD_NUMBER: _ClassVar[int]
-    YAW_RAD_FIELD_NUMBER: _ClassVar[int]
+    HEADING_RAD_FIELD_NUMBER: _ClassVar[int]
     XY_STD_M_FIELD_NUMBER: _ClassVar[int]
-    YAW_STD_RAD_FIELD_NUMBER: _ClassVar[int]
+    HEADING_STD_RAD_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -218,10 +218,10 @@ class Pose(_message.Message):
     frame: str
     x_m: float
     y_m: float
-    yaw_rad: float
+    heading_rad: float
     xy_std_m: float
-    yaw_std_rad: float
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., frame: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., yaw_rad: _Optional[float] = ..., xy_std_m: _Optional[float] = ..., yaw_std_rad: _Optional[float] = ...) -> None: ...
+    heading_std_rad: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., frame: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., heading_rad: _Optional[float] = ..., xy_std_m: _Optional[float] = ..., heading_std_rad: _Optional[float] = ...) -> None: ...
 
 class Link(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "state", "reason", "url", "rx_bytes", "tx_bytes", "rx_frames", "tx_frames", "rejects", "reconnects", "tx_airtime", "since_s", "last_rx_s")

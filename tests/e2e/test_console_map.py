@@ -89,7 +89,7 @@ def test_a_simulated_car_is_drawn_where_it_truly_is(stage: ConsoleStage) -> None
 def test_measured_poses_have_a_floor_of_their_own_and_names_are_no_markup(stage: ConsoleStage) -> None:
     page = stage.page("#/map")
     frame = "<b onclick=alert(1)>\u202egro\u200bund"
-    pose = json.dumps({"frame": frame, "x_m": 900, "y_m": 2, "yaw_rad": 1, "xy_std_m": 0.05}).encode()
+    pose = json.dumps({"frame": frame, "x_m": 900, "y_m": 2, "heading_rad": 1, "xy_std_m": 0.05}).encode()
 
     def floors() -> list[str]:
         stage.fleet.bus.put_command("fleet/phantom/sensor/pose", pose, "application/json")

@@ -162,12 +162,12 @@ def test_a_locator_says_where_cars_are_and_a_person_does_not(stage: SecureStage)
     with Client(stage.fleet.endpoint, identity=locator) as outside, Client(stage.fleet.endpoint, identity=MIA) as mia:
 
         def place(x_m: float) -> None:
-            outside.publish_pose("red", x_m=x_m, y_m=0.0, yaw_rad=0.0)
+            outside.publish_pose("red", x_m=x_m, y_m=0.0, heading_rad=0.0)
             wait_for(lambda: [each["x_m"] for each in mia.get("red/sensor/pose")] == [x_m], "red's gateway has it")
 
         place(1.0)
         with pytest.raises(BusError, match="hub invite --service locator"):
-            mia.publish_pose("red", x_m=5.0, y_m=0.0, yaw_rad=0.0)
+            mia.publish_pose("red", x_m=5.0, y_m=0.0, heading_rad=0.0)
         mia.bus.put_command("fleet/red/sensor/pose", b'{"x_m": 7}', "application/json")
         place(2.0)
         assert [each["x_m"] for each in mia.history("red/sensor/pose", last=9)] == [1.0, 2.0]

@@ -17,6 +17,7 @@ from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan,
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway import drivers
 from schemas.car_profile import CarProfile
+from schemas.topics import FROM_OUTSIDE
 from schemas.words import Mode
 
 ANY_CAR: Final = "a car"
@@ -24,9 +25,9 @@ ANY_CAR: Final = "a car"
 
 
 def list_unmeasured(expression: Expression, profile: CarProfile, mode: Mode) -> tuple[str, ...]:
-    """List the names in the expression that such a car does not measure in this mode."""
+    """List the names in the expression that such a car does not measure in this mode, and nobody outside of it."""
     measured = profile.measurable(mode)
-    topics = {name: topic_of(name).partition("/") for name in expression.names}
+    topics = {name: topic_of(name).partition("/") for name in expression.names if topic_of(name) not in FROM_OUTSIDE}
     return tuple(name for name, (family, _, topic) in topics.items() if family == "sensor" and topic not in measured)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from gateway import drivers
-from schemas.topics import TOPICS
+from schemas.topics import FROM_OUTSIDE, TOPICS
 from schemas.words import UNKNOWN, Mode, Platform, Verdict
 
 MODE: Final = TOPICS["state/mode"]
@@ -41,7 +41,7 @@ def sensor_of(name: str) -> str:
 
 def does_exist(sensor: str, mode: Mode) -> bool:
     """Return True if cars send readings of this sensor in this mode. In manual mode that depends on the car: True."""
-    return mode is Mode.MANUAL or sensor in _PROFILE.measurable(mode)
+    return mode is Mode.MANUAL or f"sensor/{sensor}" in FROM_OUTSIDE or sensor in _PROFILE.measurable(mode)
 
 
 def mode_spans(states: Iterable[Mapping[str, Any]]) -> Iterator[ModeSpan]:

@@ -166,11 +166,11 @@ def _pose(message: Any, header: Any) -> Any:
     """Return a measured pose on the floor. What was not measured has a covariance of 0: unknown."""
     header.frame_id = message.frame or header.frame_id
     covariance = np.zeros(36)
-    covariance[[0, 7]], covariance[35] = message.xy_std_m**2, message.yaw_std_rad**2
+    covariance[[0, 7]], covariance[35] = message.xy_std_m**2, message.heading_std_rad**2
     pose = _ros(
         "geometry_msgs/msg/Pose",
         position=_vector(message.x_m, message.y_m, of="Point"),
-        orientation=_quaternion(0.0, 0.0, message.yaw_rad),
+        orientation=_quaternion(0.0, 0.0, message.heading_rad),
     )
     measured = _ros("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
     return _ros("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=measured)

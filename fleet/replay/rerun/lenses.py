@@ -68,11 +68,11 @@ def lenses() -> list[Any]:
     derived[panels.PLAN_TOPIC] = lens(panels.PLAN_TOPIC).to_component(
         rr.TextDocument.descriptor_text(), ".text", cast_to="auto"
     )
-    for topic, heading in ((panels.TRUTH, "heading_rad"), (panels.POSE, "yaw_rad")):
+    for topic in (panels.TRUTH, panels.POSE):
         derived[topic] = (
             lens(topic)
             .to_component(rr.Arrows3D.descriptor_origins(), rrc.Selector(".").pipe(_origins), cast_to="auto")
-            .to_component(rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_vectors(heading)), cast_to="auto")
+            .to_component(rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_vectors), cast_to="auto")
         )
     return list(derived.values())
 
@@ -163,9 +163,6 @@ def _origins(poses: Any) -> Any:
     return _fixed(triples(numbers(poses, "x_m"), numbers(poses, "y_m")))
 
 
-def _vectors(heading: str) -> _Pipe:
-    def vectors(poses: Any) -> Any:
-        angle = numbers(poses, heading)
-        return _fixed(triples(_ARROW_M * np.cos(angle), _ARROW_M * np.sin(angle)))
-
-    return vectors
+def _vectors(poses: Any) -> Any:
+    heading = numbers(poses, "heading_rad")
+    return _fixed(triples(_ARROW_M * np.cos(heading), _ARROW_M * np.sin(heading)))

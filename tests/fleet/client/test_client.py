@@ -34,7 +34,7 @@ def test_the_cars_are_those_with_a_token(client: Fleet) -> None:
 
 def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Cars) -> None:
     assert client.get("red/sensor/pose") == [], "nobody has measured one"
-    client.publish_pose("red", x_m=1.5, y_m=-0.5, yaw_rad=7.0, frame="map", xy_std_m=0.02)
+    client.publish_pose("red", x_m=1.5, y_m=-0.5, heading_rad=7.0, frame="map", xy_std_m=0.02)
 
     def poses() -> list[Any]:
         return client.get("red/sensor/pose")
@@ -42,8 +42,8 @@ def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Car
     wait_for(poses, "the gateway has it")
     (reading,) = poses()
     assert (reading["frame"], reading["x_m"], reading["y_m"]) == ("map", 1.5, -0.5)
-    assert reading["yaw_rad"] == pytest.approx(7.0 - math.tau)
-    assert (reading["xy_std_m"], reading["yaw_std_rad"]) == (0.02, None)
+    assert reading["heading_rad"] == pytest.approx(7.0 - math.tau)
+    assert (reading["xy_std_m"], reading["heading_std_rad"]) == (0.02, None)
     key = "fleet/red/sensor/pose"
     cars.bus.put_command(key, b"no pose", "application/json")
     cars.bus.put_command(key, b'{"x_m": "NaN"}', "application/json")
@@ -58,16 +58,16 @@ def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Car
         {"x_m": math.inf},
         {"y_m": 2000.0},
         {"x_m": math.nan},
-        {"yaw_rad": math.nan},
+        {"heading_rad": math.nan},
         {"frame": ""},
         {"frame": "a\u202e"},
         {"xy_std_m": -1.0},
-        {"yaw_std_rad": math.inf},
+        {"heading_std_rad": math.inf},
         {"car": "Red"},
     ],
 )
 def test_a_pose_that_is_none_is_refused(wrong: dict[str, Any], client: Fleet) -> None:
-    fields: dict[str, Any] = {"car": "red", "x_m": 0.0, "y_m": 0.0, "yaw_rad": 0.0, **wrong}
+    fields: dict[str, Any] = {"car": "red", "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0, **wrong}
     with pytest.raises(ValueError, match=r"is not allowed|is no car"):
         client.publish_pose(**fields)
 

@@ -88,6 +88,9 @@ def test_a_function_has_a_range_and_is_measured_where_its_field_is() -> None:
     arduino = drivers.profile_of("arduino")
     assert list_unmeasured(expression, arduino, Mode.MANUAL) == ()
     assert list_unmeasured(expression, arduino, Mode.TRACKING) == ("size(range.range_m)",)
+    placed = parse(needs("pose.x_m > 1")).roles["scout"].needs
+    assert placed is not None
+    assert list_unmeasured(placed, arduino, Mode.TRACKING) == (), "a program outside of the car may measure it"
 
 
 def test_one_message_has_no_past_so_a_watch_knows_no_function() -> None:

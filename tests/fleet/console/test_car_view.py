@@ -123,6 +123,7 @@ def test_a_card_without_news_says_its_age_and_claims_no_link(after_s: float, sil
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/link", pb.Link(state="online"), 9.0)
     view.on_message("red", "sensor/range", pb.Range(range_m=0.5), 10.0)
+    view.on_message("red", "sensor/pose", pb.Pose(x_m=1), 10.0 + after_s)  # a camera sees it: that is no news of it
     (car,) = view.as_list(10.0 + after_s)
     assert car.get("silent_s") == silent_s
     assert car["link"]["state"] == "unknown"

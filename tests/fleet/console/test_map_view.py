@@ -31,13 +31,13 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def told_by_tables(tables: dict[str, Any], at_ns: int) -> dict[str, list[Any]]:
     """Return what the tables of a session say about the places of the cars at a moment, as a page gets it."""
     told: dict[str, list[Any]] = {}
-    for topic, heading, frame in ((POSE, "yaw_rad", None), (TRUTH, "heading_rad", "")):
+    for topic, frame in ((POSE, None), (TRUTH, "")):
         table, stale_s = tables[topic], TOPICS[topic].stale_after_s or 0.0
         logged = table["log_time"].astype("int64")
         for car, rows in table[(logged <= at_ns) & (logged > at_ns - SHOWN_S * S)].groupby("car"):
             row = rows.loc[rows["publish_time"].astype("int64").idxmax()]
             age_s = (at_ns - int(logged.loc[row.name])) / 1e9
-            place = [round(row[name], 3) for name in ("x_m", "y_m", heading)]
+            place = [round(row[name], 3) for name in ("x_m", "y_m", "heading_rad")]
             where = row["frame"] if frame is None else frame
             std = round(row["xy_std_m"], 3) if topic == POSE else None
             told[str(car)] = [*place, where, std, int(age_s) if age_s > stale_s else None]
@@ -63,7 +63,7 @@ def truth(x_m: float) -> pb.Truth:
 
 def test_a_measured_pose_is_shown_with_its_frame_and_error_and_truth_goes_first() -> None:
     view = MapView()
-    view.on_message("red", POSE, pb.Pose(frame="map", x_m=1.23456, y_m=2, yaw_rad=-1, xy_std_m=0.05), 10.0)
+    view.on_message("red", POSE, pb.Pose(frame="map", x_m=1.23456, y_m=2, heading_rad=-1, xy_std_m=0.05), 10.0)
     view.on_message("blue", POSE, pb.Pose(x_m=1), 10.0)
     assert view.places(10.5) == {
         "blue": [1.0, 0.0, 0.0, "map", None, None],

@@ -107,7 +107,7 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
             made.put(f"{base}/sensor/wheels", pb.Wheels(left_m_s=0.25, right_m_s=-0.25), at)
             made.put(f"{base}/sensor/odometer", pb.Odometer(left_m=second, right_m=-second), at)
             made.put(f"{base}/sensor/attitude", pb.Attitude(yaw_rad=0.1), at)
-            pose = pb.Pose(frame="map", x_m=second / 10, y_m=float(index), yaw_rad=0.5, xy_std_m=0.02)
+            pose = pb.Pose(frame="map", x_m=second / 10, y_m=float(index), heading_rad=0.5, xy_std_m=0.02)
             made.put(f"{base}/sensor/pose", pose, at)
             made.put(f"{base}/sensor/arm", pb.Arm(joint_deg=[90, 45, 30, 20, 10, second]), at)
         inferred = "tracking" if now == "tracking" else "manual" if now == "manual" else "unknown"

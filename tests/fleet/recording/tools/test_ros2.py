@@ -88,7 +88,7 @@ def test_an_attitude_is_a_rotation_and_says_what_was_not_measured(tmp_path: Path
 
 
 def test_a_pose_keeps_its_frame_and_what_is_known_of_its_error(tmp_path: Path) -> None:
-    fields = {"frame": "map", "x_m": 1.5, "y_m": -2.0, "yaw_rad": math.pi / 2, "xy_std_m": 0.1}
+    fields = {"frame": "map", "x_m": 1.5, "y_m": -2.0, "heading_rad": math.pi / 2, "xy_std_m": 0.1}
     write_bag(
         Session(write(tmp_path / "one.mcap", ("fleet/red/sensor/pose", "fleet.v1.Pose", fields))).rows(),
         tmp_path / "bag",
