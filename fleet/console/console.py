@@ -376,7 +376,7 @@ class Console:
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
         # What another guest has stopped, this one has not.
-        names = {"sender": "" if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
+        names = {"sender": None if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
         for feed in self._feeds:

@@ -51,6 +51,7 @@ def test_a_class_joins_from_the_board_and_a_pupil_gets_a_car(stage: ConsoleStage
 
     # A guest watches: nothing drives, and STOP stops.
     expect(first.locator("#pause, #estop")).to_have_count(0)
+    expect(first.locator("nav a")).to_have_text(["Fleet", "Map", "Plots", "Time line", "Board"])
     first.goto(f"{first.url.partition('#')[0]}#/drive")
     first.locator("input[name=select-red]").check()
     expect(first.locator("[data-motion=forward]")).to_have_attribute("aria-disabled", "true")

@@ -66,12 +66,15 @@ const DRAWINGS = {
   estop: "M12 3l9.500 17h-19zM12 10v4M12 17v.500",
 };
 
+// A device of a class that nobody has assigned yet.
+const isGuest = () => store.hello?.person.rank === "guest";
+
 // A phone that is held upright has room for five tabs. The last one leads to the other pages.
 const narrow = matchMedia("(max-width: 34rem) and (orientation: portrait)");
 narrow.addEventListener("change", changed);
 const MORE = "#/more";
 const FIRST_TABS = 4;
-const tabs = () => (narrow.matches ? FEW_TABS : ALL_TABS);
+const tabs = () => (isGuest() ? GUEST_TABS : narrow.matches ? FEW_TABS : ALL_TABS);
 const MorePage = () => html`<h1>${t.more}</h1>
   <ul class="plain more">
     ${Object.entries(PAGES).slice(FIRST_TABS).map(
@@ -80,6 +83,7 @@ const MorePage = () => html`<h1>${t.more}</h1>
   </ul>`;
 
 const ALL_TABS = Object.entries(PAGES);
+const GUEST_TABS = ["#/", "#/map", "#/plots", "#/time", "#/board"].map((to) => [to, PAGES[to]]); // to watch
 const FEW_TABS = [...ALL_TABS.slice(0, FIRST_TABS), [MORE, [t.more, MorePage, DRAWINGS.more]]];
 
 // ---------------------------------------------------------------- STOP
@@ -139,9 +143,6 @@ function Report({ report }) {
     <ul class="plain chips">${[...failed, ...others].map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
   </div>`;
 }
-
-// A device of a class that nobody has assigned yet.
-const isGuest = () => store.hello?.person.rank === "guest";
 
 function StopBar() {
   const [asking, setAsking] = useState(null); // estop, pause

@@ -99,7 +99,7 @@ function Guest({ guest, cars, onDone }) {
       ${lendable.map((each) => html`<option key=${each.name}>${each.name}</option>`)}</select></label>
     ${car !== "" && html`<label>${t.classFor} <select name="minutes" value=${minutes} onChange=${(event) => setMinutes(Number(event.target.value))}>
       ${LESSON_MINUTES.map((count) => html`<option key=${count} value=${count}>${t.minutes(count)}</option>`)}</select></label>`}
-    <button aria-label=${t.classAssignOf(guest.name)} disabled=${store.past !== null}>${t.classAssign}</button>
+    <button aria-label=${t.classAssignOf(guest.name)}>${t.classAssign}</button>
     ${words && html`<p class="bad" role="alert">${words}</p>`}
   </form></li>`;
 }
@@ -124,7 +124,8 @@ const fill = () => (document.fullscreenElement ? document.exitFullscreen() : doc
 
 export function BoardPage({ cars }) {
   const [found, read] = useLan();
-  const lan = found?.may_pair ? found.lan : undefined; // undefined: it is none of this page's business
+  // undefined: a class is none of this page's business. In the past nothing is changed.
+  const lan = found?.may_pair && store.past === null ? found.lan : undefined;
   return html`<div class="board">
     <div class="controls board-head"><h1>${t.board}</h1>
       ${document.fullscreenEnabled && html`<button data-fill onClick=${fill}>${t.boardFull}</button>`}</div>

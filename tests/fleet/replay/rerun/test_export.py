@@ -1,5 +1,6 @@
 """Exports a session to an .rrd with its layout. Rerun's own reader counts the rows."""
 
+import math
 import os
 import shutil
 import signal
@@ -7,7 +8,9 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import rerun.chunk as rrc
 from click.testing import CliRunner
@@ -17,6 +20,7 @@ from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import FLEET_FILE
 from fleet.replay import panels
 from fleet.replay.rerun import export, lenses
+from schemas.messages import message_class
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import CARS, START_NS, make
 
@@ -75,6 +79,28 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
     messages = [m for m in Session(made[0]).messages() if m.key == "fleet/red/state/mode"]
     assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
     assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
+
+
+@pytest.mark.parametrize("topic", ["sim/truth", "sensor/pose"])
+def test_a_place_is_an_arrow_with_a_path(topic: str, made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    export.export(Session(made[0]), out)
+    key = f"fleet/red/{topic}"
+    places, vectors, ways = [], [], []
+    for chunk in rrc.RrdReader(out).store().stream():
+        batch, entity = chunk.to_record_batch(), panels.key_of(chunk.entity_path)
+        if entity == key and "Arrows3D:origins" in batch.schema.names:
+            places += [tuple(row[0]) for row in batch.column("Arrows3D:origins").to_pylist()]
+            vectors += [tuple(row[0]) for row in batch.column("Arrows3D:vectors").to_pylist()]
+        if entity == f"{key}/way" and "LineStrips3D:strips" in batch.schema.names:
+            ways += [[tuple(point) for point in row[0]] for row in batch.column("LineStrips3D:strips").to_pylist()]
+    kind = message_class(TOPICS[topic].message)
+    told: list[Any] = [kind.FromString(m.payload) for m in Session(made[0]).messages() if m.key == key]
+    np.testing.assert_allclose(places, [(each.x_m, each.y_m, 0.0) for each in told], atol=1e-6)
+    headings = [math.atan2(y, x) - each.heading_rad for (x, y, _), each in zip(vectors, told, strict=True)]
+    np.testing.assert_allclose([math.remainder(each, math.tau) for each in headings], 0.0, atol=1e-5)
+    (way,) = ways
+    np.testing.assert_allclose(way, places)
 
 
 def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
