@@ -120,6 +120,9 @@ class CarPublisher:
         One that is no pose, or has a number that is none, is dropped: it came from no program of ours.
         """
         name = "sensor/pose"
+        if sample.deleted or sample.unread:
+            self.dropped += 1
+            return
         try:
             message: Any = messages.parse(topics.TOPICS[name].message, sample.payload, sample.encoding)
         except messages.BadPayload:
