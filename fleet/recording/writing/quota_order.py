@@ -6,7 +6,8 @@ touches its time, because the time before a pin may be in another session.
 Unpinned segments go first, the oldest of all sessions. Pinned ones may have half of the quota: if they have more, the
 oldest of them go before anything else. So a condition that is always true leaves room for what comes. Tables for
 questions go with the first segment of their session, as they are of no use then. If no other segment is left, all
-tables go before the pinned ones: they can be made again.
+tables go, which can be made again. What is pinned stays within its half, also where marked sessions, which stay whole,
+leave less than that: all together are more than the quota then, and the recorder says so.
 """
 
 from bisect import bisect_right
@@ -77,7 +78,7 @@ class Taking:
 
 
 def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:
-    """Return what to take so that `over` bytes are free. It is less if all of it is not enough."""
+    """Return what to take so that `over` bytes are free. It is less if that is not enough."""
     taking = Taking()
     stored = {session.name: session for session in sessions}
     left = {session.name: len(session.segments) for session in sessions}
@@ -116,10 +117,6 @@ def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:
         if taking.freed >= over:
             return taking
         free_tables(session.name)
-    for segment in rest:
-        if taking.freed >= over:
-            return taking
-        take(segment)
     return taking
 
 

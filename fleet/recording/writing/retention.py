@@ -92,7 +92,7 @@ class Quota:
             freed = _take(root / name, infos[root / name], taking, done)
             over -= freed
         if over > 0:
-            why = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
+            why = f"by {over / MB:.1f} MB that are marked, pinned, in use or not to be removed"
             done.warning = f"{root} has more than its quota, {why}"
         return done
 

@@ -28,8 +28,7 @@ B = stored("b", (3, 10, False), (4, 10, True), tables=5, other=1)
         (20, 100, "a1 a3", ""),
         (21, 100, "a1 a3 b1", ""),
         (35, 100, "a1 a3 b1", ""),
-        (36, 100, "a1 a3 b1 a2", "a"),
-        (99, 100, "a1 a3 b1 a2 b2", "a b"),
+        (99, 100, "a1 a3 b1", ""),
         (1, 39, "a2", ""),
         (11, 39, "a2 a1", ""),
     ],
@@ -53,17 +52,16 @@ SESSIONS = st.lists(
 
 
 @given(sessions=SESSIONS, over=st.integers(0, 200), quota=st.integers(1, 200))
-def test_no_pin_goes_while_pins_have_no_more_than_half_and_others_are_left(
-    sessions: list[StoredSession], over: int, quota: int
-) -> None:
+def test_no_pin_goes_while_pins_have_no_more_than_half(sessions: list[StoredSession], over: int, quota: int) -> None:
     found = choose(sessions, over, quota)
     every = [each for session in sessions for each in session.segments]
-    assert found.freed >= over or len(found.segments) == len(every)
+    assert found.freed >= over or all(each.pinned for each in every if each not in found.segments)
     assert len({(each.session, each.file) for each in found.segments}) == len(found.segments)
     left = [each for each in every if each not in found.segments]
     pinned_before = sum(each.bytes for each in every if each.pinned)
-    if any(each.pinned for each in found.segments) and any(not each.pinned for each in left):
-        assert pinned_before > quota * PINNED_SHARE
+    pinned_left = sum(each.bytes for each in left if each.pinned)
+    largest = max((each.bytes for each in found.segments if each.pinned), default=0)
+    assert pinned_left == pinned_before or pinned_left + largest > int(quota * PINNED_SHARE), "pins keep their half"
     for pinned in (True, False):
         ages = [each.begin_ns for each in found.segments if each.pinned is pinned]
         kept = [each.begin_ns for each in left if each.pinned is pinned]
