@@ -22,6 +22,7 @@ from fleet.recording.session_dir import MAX_MARK_CHARACTERS, NoMark, add_mark
 from fleet.recording.session_lookup import sessions_in
 from schemas import keys
 from schemas.local_time import date_and_clock, with_offset
+from schemas.printable import printable
 
 if TYPE_CHECKING:
     from fleet.conditions import Expression
@@ -31,6 +32,8 @@ MAX_FOR_S: Final = 86_400.0
 """Maximum of --for: recordings of lessons and demos are no longer than a day."""
 FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open", "link")
 """Fields of a hit as JSON and CSV."""
+MAX_CELL: Final = 60
+"""Maximum length of a cell. Names of a recording are anybody's."""
 _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
 
 
@@ -78,7 +81,8 @@ def find(
     except ValueError as error:
         raise click.UsageError(f"--since: {error}") from None
     place = existing_sessions_place(directory)
-    found = list(_hits(place, expression, cars, for_s or 0.0, since_ns))
+    longest_s: list[float] = []
+    found = list(_hits(place, expression, cars, for_s or 0.0, since_ns, longest_s))
     if as_json:
         for path, hit in found:
             click.echo(json.dumps(_to_dict(path, hit)))
@@ -92,13 +96,23 @@ def find(
     if mark and not _marked(found, expression):
         raise click.exceptions.Exit(1)
     if not found:
-        raise click.ClickException(f"{expression} was never true in the sessions of {place}.")
+        most_s = max(longest_s, default=-1.0)
+        how_long = "" if most_s < 0 else f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)}"
+        raise click.ClickException(f"{expression} was never true{how_long} in the sessions of {place}.")
 
 
 def _hits(
-    place: Path, expression: "Expression", cars: tuple[str, ...], for_s: float, since_ns: int
+    place: Path,
+    expression: "Expression",
+    cars: tuple[str, ...],
+    for_s: float,
+    since_ns: int,
+    longest_s: list[float],
 ) -> Iterator[tuple[Path, "Hit"]]:
-    """Yield the hits of all sessions. Sessions that are not whole are named on stderr."""
+    """Yield the hits of all sessions. What could not be searched is named on stderr.
+
+    longest_s: is filled with the longest time for which it held in each session.
+    """
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.find import find_in
     from fleet.recording.tools.summary import of_session
@@ -117,8 +131,13 @@ def _hits(
         about = of_session(session)
         there |= {*about.cars}
         if is_searched := about.end_ns >= since_ns:
-            for hit in find_in(session, expression, [*({*about.cars} & {*(cars or about.cars)})], for_s, since_ns):
+            searched = [*({*about.cars} & {*(cars or about.cars)})]
+            found = find_in(session, expression, searched, for_s, since_ns)
+            longest_s.append(found.longest_s)
+            for hit in found.hits:
                 yield path, hit
+            for words in found.left_out.words():
+                echo_safely(f"{path.name}: not searched: {words}", err=True)
         # A file that cannot be read may be younger than the rest.
         if words := session.damage_words or (about.words if is_searched else ""):
             echo_safely(f"{path.name}: only what is intact was searched: {words}", err=True)
@@ -147,7 +166,13 @@ def _marked(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
 
 def _row(path: Path, hit: "Hit") -> tuple[str, ...]:
     times = (date_and_clock(hit.begin_ns / 1e9), date_and_clock(hit.end_ns / 1e9))
-    return path.name, hit.car, *times, time_spec.words(hit.length_s), hit.mode or "-", hit.command or "-"
+    return (
+        printable(path.name, MAX_CELL),
+        printable(hit.car, MAX_CELL),
+        *times,
+        time_spec.words(hit.length_s),
+        *(printable(each, MAX_CELL) or "-" for each in (hit.mode, hit.command)),
+    )
 
 
 def _to_dict(path: Path, hit: "Hit") -> dict[str, object]:
@@ -164,4 +189,7 @@ def _link(path: Path, hit: "Hit") -> str:
 
 
 def _open_command(path: Path, hit: "Hit") -> str:
-    return f"fleet replay {shlex.quote(str(path))} --car {hit.car} --from {with_offset(hit.begin_ns)}"
+    """Return a command that a person may paste. A name that no car can have is none of it, whoever recorded it."""
+    place = str(path) if not str(path).startswith("-") else f"./{path}"
+    car = f" --car {hit.car}" if keys.is_name(hit.car) else ""
+    return f"fleet replay {shlex.quote(place)}{car} --from {with_offset(hit.begin_ns)}"

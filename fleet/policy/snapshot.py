@@ -20,6 +20,11 @@ from schemas import messages, topics
 from schemas.car_profile import CarProfile
 from schemas.messages import Observation
 
+_KIND_OF_CPPTYPE: Final[Mapping[int, type]] = {
+    FieldDescriptor.CPPTYPE_BOOL: bool,
+    FieldDescriptor.CPPTYPE_STRING: str,
+}
+"""All others are numbers."""
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 
@@ -61,7 +66,6 @@ class _Fields(dict[str, _Field]):
 
 def _fields() -> _Fields:
     result = _Fields()
-    kinds = {FieldDescriptor.CPPTYPE_BOOL: bool, FieldDescriptor.CPPTYPE_STRING: str}
     for name, topic in topics.TOPICS.items():
         if topic.family not in ("sensor", "state"):
             continue
@@ -69,7 +73,7 @@ def _fields() -> _Fields:
         descriptors: Any = messages.message_class(topic.message).DESCRIPTOR.fields
         for each in descriptors:
             if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
-                kind = kinds.get(each.cpp_type, float)
+                kind = _KIND_OF_CPPTYPE.get(each.cpp_type, float)
                 result[f"{name.partition('/')[2]}.{each.name}"] = _Field(name, each.name, kind)
     return result
 
@@ -93,6 +97,15 @@ def topic_of(name: str) -> str:
 def value_of(name: str, seen: Observation) -> Any:
     """Return the value of a name, or of a function of one, in a message of its topic. None if it was not measured."""
     return _FIELDS[name].value(seen)
+
+
+def is_in(name: str, message: Any) -> bool:
+    """Return True if the schema of a message has the field of a name, with the type that it has in a condition."""
+    wanted = _FIELDS[name]
+    described = message.DESCRIPTOR.fields_by_name.get(wanted.member)
+    if described is None or described.is_repeated or described.message_type is not None:
+        return False
+    return _KIND_OF_CPPTYPE.get(described.cpp_type, float) is wanted.kind and described.enum_type is None
 
 
 @dataclass(frozen=True, slots=True)

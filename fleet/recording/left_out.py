@@ -22,6 +22,7 @@ class LeftOutCause(StrEnum):
     NOT_PROTOBUF = "not protobuf"
     UNREADABLE = "does not match its schema"
     BAD_SCHEMA = "its schema is unreadable"
+    OTHER_FIELD = "its schema lacks a field of the condition, or has another type for it"
     UNKNOWN_ENUM = "has a number that its schema has no name for"
     VIEWER = "not read by Rerun"
     NO_FLEET = "not a key of a car or service that is replayed"

@@ -12,7 +12,9 @@ from typing import Any, Final
 from fleet.conditions import Expression
 from fleet.conditions.holding import HeldSpan
 from fleet.policy.car_condition import CarCondition
-from fleet.policy.snapshot import topic_of
+from fleet.policy.snapshot import is_in, topic_of
+from fleet.recording.left_out import LeftOut, LeftOutCause
+from fleet.recording.reading.mcap_reader import ChannelInfo
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
@@ -29,7 +31,10 @@ COMMANDS: Final = TOPICS["event/command"]
 
 @dataclass(frozen=True, slots=True)
 class Hit:
-    """A time during which a condition held for one car. Times: ns since the epoch, of the first and last reading."""
+    """A time during which a condition held for one car.
+
+    Times: of the first and last reading, by the recorder's clock, ns since the epoch.
+    """
 
     car: str
     begin_ns: int
@@ -57,10 +62,13 @@ class ConditionRun:
         self._command = ""
         self._at_begin = "", ""
         """Mode and command when the current hit began."""
+        self._ahead_ns = 0
         self.hits: list[Hit] = []
+        self.longest_s = -1.0
+        """The longest time for which the condition held, s; negative if it never did."""
 
-    def add(self, topic: str, message: Any, at_ns: int) -> None:
-        """Take in a message."""
+    def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
+        """Take in a message. at_ns: its stamp; ahead_ns: what the recorder's clock showed more."""
         # The schema is that of the recording, and may lack a field.
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
             self._command = asked_by(message)
@@ -69,6 +77,7 @@ class ConditionRun:
         if topic not in self._condition.topics or (step := self._condition.add(topic, message, at_ns)) is None:
             return
         self._keep(step.ended)
+        self._ahead_ns = ahead_ns
         if step.has_begun:
             self._at_begin = self._mode, self._command
 
@@ -78,30 +87,82 @@ class ConditionRun:
         return self.hits
 
     def _keep(self, span: HeldSpan | None) -> None:
-        if span is not None and span.length_s >= self._for_s:
-            self.hits.append(Hit(self._car, *span, *self._at_begin))
+        if span is None:
+            return
+        self.longest_s = max(self.longest_s, span.length_s)
+        if span.length_s >= self._for_s:
+            begin_ns, end_ns = span.begin_ns + self._ahead_ns, span.end_ns + self._ahead_ns
+            self.hits.append(Hit(self._car, begin_ns, end_ns, *self._at_begin))
+
+
+@dataclass(slots=True)
+class Found:
+    """What a question found in one session."""
+
+    hits: list[Hit]
+    """Sorted by time."""
+    longest_s: float
+    """The longest time for which the condition held, whatever was asked for, s; negative if it never did."""
+    left_out: LeftOut
+    """Messages under the keys of the condition that have none of its values."""
 
 
 def find_in(
     session: Session, expression: Expression, cars: Collection[str], for_s: float = 0.0, since_ns: int = 0
-) -> list[Hit]:
-    """Return the hits of these cars in a session, sorted by time. `session.damage` then has what could not be read."""
+) -> Found:
+    """Return the hits of these cars in a session. `session.damage` then has what could not be read.
+
+    Times are those of the recorder's clock, as in all that opens a session. since_ns: ns since the epoch.
+    """
     topics = sorted({MODE.name, COMMANDS.name, *map(topic_of, expression.names)})
     selection = Selection(tuple(f"*/{car}/{topic}" for car in cars for topic in topics))
-    runs = {car: ConditionRun(expression, car, for_s) for car in cars}
-    for each in as_published(_messages(session, selection)):
-        car, topic, message = each.item
-        if each.at_ns >= since_ns or topic in (MODE.name, COMMANDS.name):
-            runs[car].add(topic, message, each.at_ns)
-    return sorted((hit for run in runs.values() for hit in run.close()), key=lambda hit: (hit.begin_ns, hit.car))
+    messages: dict[str, list[RecordedMessage[tuple[str, Any]]]] = {car: [] for car in cars}
+    left_out = LeftOut()
+    for car, message in _messages(session, selection, expression, left_out):
+        messages[car].append(message)
+    hits: list[Hit] = []
+    longest_s = -1.0
+    for car, every in messages.items():
+        run = ConditionRun(expression, car, for_s)
+        for ahead_ns, each in as_published(every):
+            topic, message = each.item
+            if each.at_ns + ahead_ns >= since_ns or topic in (MODE.name, COMMANDS.name):
+                run.add(topic, message, each.at_ns, ahead_ns)
+        hits += run.close()
+        longest_s = max(longest_s, run.longest_s)
+    return Found(sorted(hits, key=lambda hit: (hit.begin_ns, hit.car)), longest_s, left_out)
 
 
-def _messages(session: Session, selection: Selection) -> Iterator[RecordedMessage[tuple[str, str, Any]]]:
+def _messages(
+    session: Session, selection: Selection, expression: Expression, left_out: LeftOut
+) -> Iterator[tuple[str, RecordedMessage[tuple[str, Any]]]]:
+    """Yield each message with its car. Those of the condition's topics that have none of its values are left out."""
+    names: dict[str, list[str]] = {}
+    for name in expression.names:
+        names.setdefault(topic_of(name), []).append(name)
     decoder = MessageDecoder()
     for info, _, log_ns, publish_ns, data in session.rows(selection):
         key, message = keys.parse(info.channel.topic), decoder.message(info, data)
-        if key is None or message is None or message.DESCRIPTOR.full_name != TOPICS[key.topic].message:
-            continue  # a message of another type has no fields of the condition
+        if key is None:
+            continue
+        cause = _why_left_out(info, decoder, message, key.topic, names.get(key.topic, ()))
+        if cause is not None or message is None:
+            if key.topic in names and cause is not None:
+                left_out.add(info.channel.topic, cause)
+            continue
         stream = info.channel.topic, getattr(message, "boot_id", "")
         at_ns = message_time_ns(message, publish_ns)
-        yield RecordedMessage(log_ns, at_ns, stream, getattr(message, "seq", 0), (key.car, key.topic, message))
+        yield key.car, RecordedMessage(log_ns, at_ns, stream, getattr(message, "seq", 0), (key.topic, message))
+
+
+def _why_left_out(
+    info: ChannelInfo, decoder: MessageDecoder, message: Any, topic: str, names: Collection[str]
+) -> LeftOutCause | None:
+    """Return why a message has no value of these names; None if it has one, or could have."""
+    if message is None:
+        if info.channel.message_encoding != "protobuf":
+            return LeftOutCause.NOT_PROTOBUF
+        return LeftOutCause.BAD_SCHEMA if decoder.class_of(info) is None else LeftOutCause.UNREADABLE
+    if message.DESCRIPTOR.full_name != TOPICS[topic].message:
+        return LeftOutCause.OTHER_TYPE
+    return None if not names or any(is_in(name, message) for name in names) else LeftOutCause.OTHER_FIELD

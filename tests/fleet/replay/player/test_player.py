@@ -137,7 +137,7 @@ def test_who_watches_it_sees_the_hits_that_find_finds(
     fleet.bus.subscribe(key, on_sample)
     assert play(fleet, tmp_path / "made.mcap", "--as", "again", "--rate", "200").wait() == 0
     wait_for(lambda: came == 60, "all has come")
-    hits = find_in(Session(tmp_path / "made.mcap"), parse_condition(condition), ["red"], for_s)
+    hits = find_in(Session(tmp_path / "made.mcap"), parse_condition(condition), ["red"], for_s).hits
     assert hits
     spans = [(hit.begin_ns / S + for_s, hit.end_ns / S) for hit in hits]
     assert all(any(begin - 1e-3 <= at <= end + 1e-3 for begin, end in spans) for at in ended)
