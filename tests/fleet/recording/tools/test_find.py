@@ -267,7 +267,7 @@ def test_what_has_no_value_of_the_condition_is_named_with_its_count(
     encoding: str, schema: bytes, payload: bytes, tmp_path: Path
 ) -> None:
     with (tmp_path / "a.mcap").open("wb") as file:
-        writer = Writer(file)
+        writer: Any = Writer(file)
         writer.start()
         kind = writer.register_schema("fleet.v1.Range", "protobuf" if encoding == "protobuf" else "jsonschema", schema)
         channel = writer.register_channel("fleet/red/sensor/range", encoding, kind)
