@@ -146,7 +146,9 @@ def test_the_map_of_a_moment_is_that_of_the_recording(stage: ConsoleStage, place
     page.locator("input[name=scrub]").focus()
     for _ in range(5):
         page.keyboard.press("ArrowLeft")
-    shown_at(page, at_ms - 500)
+    earlier = int(page.locator("[data-past-at]").get_attribute("data-past-at") or 0)
+    assert abs(earlier - (at_ms - 500)) <= 100, "steps of the slider count from the first message"
+    shown_at(page, earlier)
     stage.person.car("blue").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["blue"].driving, "blue drives")
     page.keyboard.press("Escape")

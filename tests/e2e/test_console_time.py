@@ -104,6 +104,7 @@ def test_a_link_shows_a_moment_on_every_page(stage: ConsoleStage) -> None:
     assert "at=" in page.evaluate("location.hash"), "the link is that of this page, too"
     expect(page.locator(".newest").first).to_contain_text(re.compile(r"red [\d.]+"))
     page.locator("nav a", has_text="Inspect").click()
+    page.get_by_role("heading", name="Inspect").wait_for()
     page.locator("main select").select_option("red")
     expect(page.locator("tbody tr").filter(has_text="led by ann").first).to_be_visible()
     expect(page.locator("tbody tr").filter(has_text="$1,0,0,0").first).to_be_visible()
