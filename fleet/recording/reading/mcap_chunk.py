@@ -19,6 +19,10 @@ from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+MAX_CHUNK_BYTES: Final = 2**30
+MAX_RATIO: Final = 64
+"""Limits of a decompressed chunk over MAX_RECORD_BYTES: a few bytes must not fill the memory. Readings compress by 3
+to 20."""
 # Errors that the mcap library and the decompressors raise for corrupted bytes.
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
@@ -112,8 +116,12 @@ class ChunkPart:
             )
         chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(self.body)))
         size = chunk.uncompressed_size
-        if size > MAX_RECORD_BYTES:
-            raise ValueError(f"says that it has {size} bytes, more than the limit of {MAX_RECORD_BYTES}")
+        most = min(max(MAX_RECORD_BYTES, len(chunk.data) * MAX_RATIO), MAX_CHUNK_BYTES)
+        if size > most:
+            raise ValueError(
+                f"says that it has {size} bytes when decompressed from {len(chunk.data)}, more than the limit of "
+                f"{most}: it was not read, and may be intact"
+            )
         # Ask for one byte more: detects a larger chunk without decompressing all of it.
         data: bytes
         match chunk.compression:
@@ -122,17 +130,27 @@ class ChunkPart:
             case "zstd":
                 data = (
                     zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
-                    .stream_reader(chunk.data)
+                    .stream_reader(chunk.data, read_across_frames=True)
                     .read(size + 1)
                 )
             case "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+                data = _lz4(chunk.data, size + 1)
             case other:
                 raise ValueError(f"has a compression that is not known: {other[:20]!r}")
         if len(data) != size:
             raise EndOfFile
         plain: Chunk = replace(chunk, compression="", data=data)
         return plain
+
+
+def _lz4(data: bytes, most: int) -> bytes:
+    """Return the plain bytes of all frames, at most so many."""
+    plain = b""
+    while data and len(plain) < most:
+        frame = lz4.frame.LZ4FrameDecompressor()
+        plain += frame.decompress(data, max_length=most - len(plain))
+        data = (frame.unused_data or b"") if frame.eof else b""
+    return plain
 
 
 def read(file: IO[bytes], at: int, length: int) -> bytes:

@@ -7,8 +7,11 @@ import struct
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+import lz4.frame  # type: ignore[import-untyped]  # it has no types
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
@@ -29,6 +32,10 @@ ABSURD = (0, 1, 21, 2**16, MAX_RECORD_BYTES, MAX_RECORD_BYTES + 1, 2**31 - 1, 2*
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
     return written(tmp_path_factory.mktemp("original") / "0001.mcap")
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
 
 
 def flipped(data: bytes, at: int, bit: int) -> bytes:
@@ -278,6 +285,43 @@ def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> No
             cut = McapReader(path)
             list(cut.messages())
             assert "is cut" in cut.words
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_chunk_of_several_frames_is_read(compression: str, tmp_path: Path) -> None:
+    """Both formats allow it. A writer that compresses in parallel makes such chunks."""
+    schema = b""
+    messages = b"".join(record(5, struct.pack("<HIQQ", 1, number, number, number) + b"x" * 50) for number in range(9))
+    channel = record(4, struct.pack("<HHI", 1, 0, 1) + b"k" + struct.pack("<I", 4) + b"json" + struct.pack("<I", 0))
+    plain = channel + messages
+    compress = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
+    packed = compress(plain[:200]) + compress(plain[200:])
+    named = struct.pack("<I", len(compression)) + compression.encode()
+    body = struct.pack("<QQQI", 0, 8, len(plain), 0) + named + struct.pack("<Q", len(packed)) + packed
+    magic = b"\x89MCAP0\r\n"
+    head = record(1, struct.pack("<I", 0) + struct.pack("<I", 0))
+    end = record(15, struct.pack("<I", 0)) + record(2, bytes(20))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(magic + head + schema + record(6, body) + end + magic)
+    assert [each.sequence for each in Session(path).messages()] == list(range(9))
+    assert not Session(path).damage
+
+
+def test_a_chunk_over_the_limit_of_a_record_is_read_unless_a_few_bytes_would_fill_the_memory(tmp_path: Path) -> None:
+    count = MAX_RECORD_BYTES // 2**20 + 4
+    for name, is_read in (("real", True), ("bomb", False)):
+        path = tmp_path / f"{name}.mcap"
+        with path.open("wb") as file:
+            writer: Any = Writer(file, chunk_size=2**30)
+            writer.start()
+            channel = writer.register_channel("k", "json", 0)
+            for number in range(count):
+                payload = os.urandom(2**17) * 8 if is_read else bytes(2**20)
+                writer.add_message(channel, number, payload, number)
+            writer.finish()
+        found = Session(path)
+        assert len(list(found.messages())) == (count if is_read else 0)
+        assert ("may be intact" in found.damage_words) is not is_read
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 37, 4096, 100_000])
