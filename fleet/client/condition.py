@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from fleet.client.reading import Reading
-from fleet.conditions import BadExpression, Expression, fields_of, parse, topic_aliases_of, value_in
+from fleet.conditions import BadExpression, Expression, compared_in, fields_of, parse, topic_aliases_of
 from fleet.conditions.expression import format_literal
 from fleet.conditions.fields import LAST
 from fleet.conditions.satisfiability import explain_impossible
@@ -95,14 +95,14 @@ class KeyCondition:
     def holds(self, reading: Reading) -> bool | None:
         """Return True if it holds of this reading. None if the message lacks a field or it was not measured."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
-        return None if expression is None else expression.value(value_in(reading.value))
+        return None if expression is None else expression.value(compared_in(reading.value))
 
     def read(self, reading: Reading) -> list[str]:
         """Return the values that it reads in a message, such as `range_m=0.5`. Empty if the message lacks a field."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         if expression is None:
             return []
-        values = {name: value_in(reading.value)(name) for name in expression.names}
+        values = {name: compared_in(reading.value)(name) for name in expression.names}
         return [
             f"{name}={'not measured' if value is None else format_literal(value)}" for name, value in values.items()
         ]

@@ -6,7 +6,7 @@ from typing import Final
 
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
-from fleet.conditions import value_in
+from fleet.conditions import compared_in
 from fleet.conditions.holding import CLOCK_STEP_S, Holding
 from schemas import topics
 
@@ -66,7 +66,7 @@ class ConditionWait:
         self._seen[reading.key] = _LastMatch(reading.time, arrived_s, message, holding)
         holds = None
         if holding is not None:
-            holds = holding.add(reading.key, value_in(reading.value), _ns(reading.time)).value
+            holds = holding.add(reading.key, compared_in(reading.value), _ns(reading.time)).value
         if holds is None:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:

@@ -7,7 +7,7 @@ never be true).
 """
 
 from fleet.conditions.expression import Expression, Lookup
-from fleet.conditions.fields import aliases_of, fields_of, topic_aliases_of, value_in
+from fleet.conditions.fields import aliases_of, compared_in, fields_of, topic_aliases_of, value_in
 from fleet.conditions.parser import BadExpression, parse
 from fleet.conditions.satisfiability import is_contradictory
 
@@ -16,6 +16,7 @@ __all__ = [
     "Expression",
     "Lookup",
     "aliases_of",
+    "compared_in",
     "fields_of",
     "is_contradictory",
     "parse",

@@ -7,6 +7,8 @@ from typing import Any, Final
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
+from schemas.keys import person_of
+
 _TYPES: Final[Mapping[int, type]] = {
     FieldDescriptor.CPPTYPE_BOOL: bool,
     FieldDescriptor.CPPTYPE_STRING: str,
@@ -16,6 +18,8 @@ _TYPES: Final[Mapping[int, type]] = {
 LAST: Final = ("car", "seq", "boot_id")
 """Fields of every message; lists of names end with them."""
 
+OWNERS: Final = frozenset({"by", "holder", "owner", "sender"})
+"""Fields with a sender: a person, or the process of one (`mia@laptop-4711`)."""
 SHORT_NAMES: Final = MappingProxyType({"distance_m": "range.range_m", "battery_v": "battery.voltage_v"})
 """Everyday names of fields, each with topic and field."""
 
@@ -46,6 +50,17 @@ def fields_of(message_class: type[Message]) -> Mapping[str, type]:
 def value_in(message: Message) -> Callable[[str], object | None]:
     """Return a lookup of names in a message. It returns None if the field was not measured or its message is absent."""
     return lambda name: _value(message, name)
+
+
+def compared_in(message: Message) -> Callable[[str], object | None]:
+    """Return a lookup of what conditions compare: owners are people, whatever process of theirs it was."""
+    look = value_in(message)
+
+    def value(name: str) -> object | None:
+        found = look(name)
+        return person_of(found) if isinstance(found, str) and name.rpartition(".")[2] in OWNERS else found
+
+    return value
 
 
 def _fields(descriptor: Any, prefix: str = "") -> Iterator[tuple[str, type]]:

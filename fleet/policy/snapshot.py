@@ -10,9 +10,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any, Final
 
-from google.protobuf.descriptor import FieldDescriptor
-
-from fleet.conditions import Expression, aliases_of
+from fleet.conditions import Expression, aliases_of, compared_in, fields_of
 from fleet.conditions.expression import KINDS
 from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
 from gateway import drivers
@@ -20,12 +18,12 @@ from schemas import messages, topics
 from schemas.car_profile import CarProfile
 from schemas.messages import Observation
 
-_KIND_OF_CPPTYPE: Final[Mapping[int, type]] = {
-    FieldDescriptor.CPPTYPE_BOOL: bool,
-    FieldDescriptor.CPPTYPE_STRING: str,
-}
-"""All others are numbers."""
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
+
+
+@cache
+def _fields_of(message_class: Any) -> Mapping[str, type]:
+    return fields_of(message_class)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +44,13 @@ class _Field:
 
     def _measured(self, seen: Observation) -> Any:
         # The schema may be that of a recording: another version's, or somebody else's.
-        described = seen.message.DESCRIPTOR.fields_by_name.get(self.member)
-        if described is None or (described.has_presence and not seen.message.HasField(self.member)):
-            return None
-        value = getattr(seen.message, self.member)
+        value = compared_in(seen.message)(self.member) if self.is_in(seen.message) else None
         return value if KINDS.get(type(value)) is KINDS[self.kind] else None
+
+    def is_in(self, message: Any) -> bool:
+        """Return True if the schema of a message has this field, with its type."""
+        schema: Any = type(message)
+        return _fields_of(schema).get(self.member) is self.kind
 
 
 class _Fields(dict[str, _Field]):
@@ -69,12 +69,9 @@ def _fields() -> _Fields:
     for name, topic in topics.TOPICS.items():
         if topic.family not in ("sensor", "state"):
             continue
-        # Any: the stubs know two kinds of descriptor.
-        descriptors: Any = messages.message_class(topic.message).DESCRIPTOR.fields
-        for each in descriptors:
-            if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
-                kind = _KIND_OF_CPPTYPE.get(each.cpp_type, float)
-                result[f"{name.partition('/')[2]}.{each.name}"] = _Field(name, each.name, kind)
+        for member, kind in fields_of(messages.message_class(topic.message)).items():
+            if member not in _HEADER:
+                result[f"{name.partition('/')[2]}.{member}"] = _Field(name, member, kind)
     return result
 
 
@@ -101,11 +98,7 @@ def value_of(name: str, seen: Observation) -> Any:
 
 def is_in(name: str, message: Any) -> bool:
     """Return True if the schema of a message has the field of a name, with the type that it has in a condition."""
-    wanted = _FIELDS[name]
-    described = message.DESCRIPTOR.fields_by_name.get(wanted.member)
-    if described is None or described.is_repeated or described.message_type is not None:
-        return False
-    return _KIND_OF_CPPTYPE.get(described.cpp_type, float) is wanted.kind and described.enum_type is None
+    return _FIELDS[name].is_in(message)
 
 
 @dataclass(frozen=True, slots=True)
