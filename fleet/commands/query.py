@@ -39,7 +39,8 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
-    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read.
+    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read, or
+    if no disk has room for the tables.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
@@ -55,7 +56,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     with progress_bar("tables", count) as advance:
         try:
             catalog = Catalog(place, on_session=lambda _: advance(1))
-        except FormatMissing as error:
+        except (FormatMissing, QueryFailed) as error:
             raise click.ClickException(str(error)) from None
     for name, words in catalog.damage.items():
         echo_safely(f"{name}: only what is intact was read: {words}", err=True)

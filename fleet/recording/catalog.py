@@ -53,7 +53,10 @@ class QueryFailed(RuntimeError):
 
 
 class Catalog:
-    """All sessions of a directory. Raises FormatMissing without DuckDB; `damage` has what could not be read."""
+    """All sessions of a directory. `damage` has what could not be read.
+
+    Raises FormatMissing without DuckDB, and QueryFailed without a directory for temporary files.
+    """
 
     def __init__(
         self,
@@ -70,10 +73,17 @@ class Catalog:
         self.directory = Path(directory) if directory is not None else sessions_place()
         self.damage: dict[str, str] = {}
         """By name of a session, what of it could not be read."""
+        self.unanswered: dict[str, str] = {}
+        """By name of a session, why its tables could be written nowhere. Each question fails while there is one."""
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
         self._views: set[str] = set()
-        scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
+        try:
+            scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
+        except OSError as error:
+            raise QueryFailed(
+                f"no temporary file can be written: {error.strerror or error}. Make room, or set TMPDIR."
+            ) from None
         # DuckDB would write to `.tmp` here, and here may be read-only.
         weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._config: dict[str, Any] = {"memory_limit": MEMORY_LIMIT, "temp_directory": scratch}
@@ -83,6 +93,7 @@ class Catalog:
     def _find(self) -> None:
         """Look for the sessions, and begin without views."""
         self.damage.clear()
+        self.unanswered.clear()
         self.sessions.clear()
         drop_orphans(self.directory)
         for path in sorted(sessions_in(self.directory)):
@@ -94,7 +105,7 @@ class Catalog:
                 self.damage[path.name] = str(error)
                 continue
             except OSError as error:
-                self.damage[path.name] = f"its tables cannot be made: {error.strerror or error}"
+                self.unanswered[path.name] = error.strerror or str(error)
                 continue
             self.sessions.append(cached)
             if cached.words:
@@ -151,6 +162,12 @@ class Catalog:
             self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
+        if self.unanswered:  # what is missing there would be missing in the answer
+            name, why = next(iter(self.unanswered.items()))
+            which = f"{name} and {more} more" if (more := len(self.unanswered) - 1) else name
+            raise QueryFailed(
+                printable_lines(f"the tables of {which} can be written nowhere: {why}. Make room, or set TMPDIR.")
+            )
         self._define(sql)
         answer: Any = self._database.sql(sql, params=list(parameters) or None)
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()

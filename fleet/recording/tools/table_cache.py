@@ -38,7 +38,8 @@ _FORMAT: Final = "2"
 STALE_PART_S: Final = 600.0
 """Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
 every few seconds: a thousand messages each."""
-_READ_ONLY: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+_MAX_TRIES: Final = 4
+"""Maximum times that tables are made: another question deletes those of an old state of a session that grows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,45 +72,50 @@ class CachedTables:
 
 
 def tables_of(session: Path) -> CachedTables:
-    """Return the tables of a session, made now if they are not there. Raises NoSession, OSError, FormatMissing."""
-    for place in _places(session):
-        with suppress(FileNotFoundError):
-            return CachedTables.of(session, place)
-    if not session.exists():
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.")
-    errors: list[OSError] = []
-    for place in _places(session):
-        try:
-            return _made(session, place)
-        except OSError as error:
-            if error.errno not in _READ_ONLY:  # a full disk, for example: it is the same elsewhere
-                raise
-            errors.append(error)
-    raise errors[0]
+    """Return the tables of a session, made now if they are not there.
+
+    Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere.
+    """
+    for _ in range(_MAX_TRIES):
+        for place in _places(session):
+            with suppress(FileNotFoundError):
+                return CachedTables.of(session, place)
+        if not session.exists():
+            break
+        errors: list[OSError] = []
+        for place in _places(session):
+            try:
+                return _made(session, place)
+            except FileNotFoundError:  # the session is gone, or another question knows a newer state of it
+                break
+            # Reading raises none: what cannot be read is damage. So the disk is full or broken, or the folder is
+            # read-only, and another disk may take the tables.
+            except OSError as error:
+                errors.append(error)
+        else:
+            raise errors[0]
+    if session.exists():
+        raise OSError(errno.EAGAIN, f"the session grows too fast: {os.strerror(errno.EAGAIN)}")
+    raise NoSession(f"{session} is gone: it was deleted meanwhile.")
 
 
 def _made(session: Path, place: Path) -> CachedTables:
+    """Make the tables of a session. Raises OSError, a FileNotFoundError if the session or the tables are gone."""
     if place.parent != session:  # which must not appear again when the quota has deleted it
         place.parent.mkdir(parents=True, exist_ok=True)
     _drop_stale_parts(place.parent)
+    part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
     try:
-        part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
-        try:
-            read = Session(session)
-            export(read.rows(), part, _Sink)
-            if words := read.damage_words:
-                (part / _NOTE).write_text(words, encoding="utf-8")
-            with suppress(OSError):  # another question has made it meanwhile
-                part.rename(place)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-    except FileNotFoundError:
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
+        read = Session(session)
+        export(read.rows(), part, _Sink)
+        if words := read.damage_words:
+            (part / _NOTE).write_text(words, encoding="utf-8")
+        with suppress(OSError):  # another question has made it meanwhile
+            part.rename(place)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     _drop_others(place)
-    try:
-        return CachedTables.of(session, place)
-    except FileNotFoundError:
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
+    return CachedTables.of(session, place)
 
 
 class _Sink(ParquetSink):
