@@ -39,6 +39,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
+    Who sent a command is a process (tom@host-4711): person_of(sender) is the person.
     Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read, or
     if no disk has room for the tables.
     """

@@ -3,6 +3,7 @@
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
 as commanded and as seen, the motion, who drove, and the phase of the plan. Topics without a message have views, too.
+Who drove is a person. `sender` and other columns of the tables are as recorded; `person_of(sender)` is the person.
 
 A view is defined when a question names it: DuckDB then opens files, and a thousand sessions have twenty each.
 """
@@ -32,13 +33,17 @@ MEMORY_LIMIT: Final = "1GB"
 """Maximum memory of a question. DuckDB writes to a temporary directory beyond it."""
 CONTEXT: Final[tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = (
     ("state/mode", (("mode", "{c}.asked"), ("mode_seen", "{c}.inferred"), ("verdict", "{c}.verdict"))),
-    ("state/motion", (("motion", "{c}.motion"), ("owner", "{c}.owner"))),
-    ("state/safety", (("motors", "{c}.motors"), ("driver", "json_extract_string({c}.lease, '$.holder')"))),
+    ("state/motion", (("motion", "{c}.motion"), ("owner", "person_of({c}.owner)"))),
+    ("state/safety", (("motors", "{c}.motors"), ("driver", "person_of(json_extract_string({c}.lease, '$.holder'))"))),
     ("@coordinator/assignment", (("plan_phase", "{c}.phase"), ("plan_version", "{c}.plan_version"))),
 )
 """What `..._context` adds: topic, and for each column its expression. `{c}` is the row of the topic."""
 
 
+_PERSON_OF: Final = (
+    "CREATE MACRO person_of(sender) AS coalesce(nullif(split_part(sender, '@', 1), ''), nullif(sender, ''))"
+)
+"""`schemas.keys.name_of` for questions: the person of a sender, without the host and the process."""
 MAX_QUERY_ATTEMPTS: Final = 4
 """Each attempt looks for the sessions anew: the quota deletes them, and those that grow have other tables then."""
 _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
@@ -114,6 +119,7 @@ class Catalog:
             self._database.close()
         self._database = self._duckdb.connect(config=self._config)
         self._database.execute("SET TimeZone = 'UTC'")
+        self._database.execute(_PERSON_OF)
         self._views.clear()
 
     def _define(self, words: str | None) -> None:

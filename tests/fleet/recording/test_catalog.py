@@ -26,6 +26,7 @@ from fleet.recording.tools import table_cache
 from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
 from fleet.recording.writing.retention import Quota
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.keys import name_of
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, Made
 from tests.support import in_process
@@ -41,8 +42,10 @@ def make(path: Path, car: str, distances: list[float]) -> None:
     made = Made(path / "0001.mcap", Writer)
     for second, distance in enumerate(distances):
         made.put(f"fleet/{car}/state/mode", pb.Mode(asked="tracking" if second >= 2 else "manual"), second)
-        made.put(f"fleet/{car}/state/motion", pb.Motion(motion="forward"), second)
-        made.put(f"fleet/{car}/state/safety", pb.Safety(motors="on", lease=pb.Lease(holder="ann@desk")), second)
+        made.put(f"fleet/{car}/state/motion", pb.Motion(motion="forward", owner=f"ann@desk-{second}"), second)
+        made.put(
+            f"fleet/{car}/state/safety", pb.Safety(motors="on", lease=pb.Lease(holder=f"ann@desk-{second}")), second
+        )
         made.put(f"fleet/{car}/sensor/range", pb.Range(range_m=distance), second + 0.1)
     made.put(f"fleet/{car}/sensor/range", pb.Range(range_m=9.0), 60)
     made.close()
@@ -75,12 +78,27 @@ def test_a_question_reaches_every_session_and_says_which(sessions: Path) -> None
 def test_the_context_is_of_that_moment_and_stale_states_do_not_count(sessions: Path) -> None:
     rows = asked(
         sessions,
-        "SELECT range_m, mode, motion, driver FROM sensor_range_context WHERE car = 'red' ORDER BY publish_time",
+        "SELECT range_m, mode, motion, owner, driver FROM sensor_range_context WHERE car = 'red' ORDER BY publish_time",
     )
-    driven = {"motion": "forward", "driver": "ann@desk"}
+    driven = {"motion": "forward", "owner": "ann", "driver": "ann"}
     assert rows[0] == {"range_m": 1.0, "mode": "manual", **driven}
     assert rows[2] == {"range_m": 0.25, "mode": "tracking", **driven}
-    assert rows[3] == {"range_m": 9.0, "mode": None, "motion": None, "driver": None}, "57 s later nothing is known"
+    assert rows[3] == {"range_m": 9.0, "mode": None, **dict.fromkeys(driven)}, "57 s later nothing is known"
+
+
+def test_who_drove_is_a_person_and_not_a_process(sessions: Path) -> None:
+    for column in ("driver", "owner"):
+        rows = asked(
+            sessions, f"SELECT {column}, count(*) n FROM sensor_range_context WHERE mode = 'manual' GROUP BY ALL"
+        )
+        assert rows == [{column: "ann", "n": 4}], "each drive is of another process"
+
+
+def test_the_person_of_a_sender_is_that_of_all_texts(sessions: Path) -> None:
+    catalog = Catalog(sessions)
+    for sender in ("tom@vm-535", "tom", "tom@a@b", "@vm-535", "Zoë@x", None, ""):
+        (row,) = catalog.query("SELECT person_of(?) AS person", [sender]).to_pylist()
+        assert row["person"] == (name_of(sender) if sender else None)
 
 
 def test_every_topic_has_a_view_also_without_a_message(sessions: Path) -> None:
