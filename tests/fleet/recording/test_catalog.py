@@ -39,6 +39,7 @@ from tests.support.terminal import Terminal
 def make(path: Path, car: str, distances: list[float]) -> None:
     """Make a session: one distance a second, in tracking from the third second on, driven by ann."""
     path.mkdir()
+    SessionInfo("fleet", "2026-01-01T00:00:00Z", "h", {}, closed=True).write(path)
     made = Made(path / "0001.mcap", Writer)
     for second, distance in enumerate(distances):
         made.put(f"fleet/{car}/state/mode", pb.Mode(asked="tracking" if second >= 2 else "manual"), second)
