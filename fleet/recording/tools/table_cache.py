@@ -1,9 +1,10 @@
 """Keeps the tables of a session as Parquet beside it, for questions to many sessions.
 
 The tables of one state of a session are in the directory `.tables-<digest>`. The digest is of its files, their sizes
-and times, and of the columns of our tables. So a session that grew has another directory, and the old one goes. A
-directory has its name only when it is whole: two questions at once make it twice, and one of the two is kept. Whoever
-deletes it loses nothing but time. A table whose columns are not those of this version is named `.foreign.parquet`.
+and times, of what is said to be in them, and of the columns of our tables. So a session that grew has another
+directory, and the old one goes. A directory has its name only when it is whole: two questions at once make it twice,
+and one of the two is kept. Whoever deletes it loses nothing but time. A table whose columns are not those of this
+version is named `.foreign.parquet`.
 """
 
 import errno
@@ -16,14 +17,15 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Final, Self
 
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX
+from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX, SessionInfo, indexed_segments
 from fleet.recording.tools.export import export
+from fleet.recording.tools.summary import of_session
 from fleet.recording.tools.table_formats import ParquetSink
 from fleet.recording.tools.tables import Column, Layout
 from schemas import messages
@@ -33,7 +35,9 @@ _PART: Final = ".part"
 _NOTE: Final = "damage"
 """Name of the file that says what of the session could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
-_FORMAT: Final = "2"
+_OPEN: Final = "recording"
+"""Name of the empty file that says that the session was being recorded. If it has not ended since, it was cut."""
+_FORMAT: Final = "3"
 """Increase it if what is in a directory changes, so that all are made anew."""
 STALE_PART_S: Final = 600.0
 """Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
@@ -79,7 +83,8 @@ def tables_of(session: Path) -> CachedTables:
     for _ in range(_MAX_TRIES):
         for place in _places(session):
             with suppress(FileNotFoundError):
-                return CachedTables.of(session, place)
+                found = CachedTables.of(session, place)
+                return replace(found, words=found.words or _words(Session(session))) if _OPEN in found.names else found
         if not session.exists():
             break
         errors: list[OSError] = []
@@ -108,14 +113,21 @@ def _made(session: Path, place: Path) -> CachedTables:
     try:
         read = Session(session)
         export(read.rows(), part, _Sink)
-        if words := read.damage_words:
+        if words := _words(read):
             (part / _NOTE).write_text(words, encoding="utf-8")
+        if read.description is not None and not read.description.closed:
+            (part / _OPEN).touch()
         with suppress(OSError):  # another question has made it meanwhile
             part.rename(place)
     finally:
         shutil.rmtree(part, ignore_errors=True)
     _drop_others(place)
     return CachedTables.of(session, place)
+
+
+def _words(session: Session) -> str:
+    """Return what is not whole of a session, as `fleet find` and `fleet sessions` say it; empty if it is whole."""
+    return session.damage_words or of_session(session).words
 
 
 class _Sink(ParquetSink):
@@ -192,4 +204,13 @@ def _digest(session: Path) -> str:
         with suppress(FileNotFoundError):  # the quota deletes it meanwhile
             state = os.stat(f"{directory}{os.sep}{name}")  # noqa: PTH116
             facts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
+    facts.append(_described(session))
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
+
+
+def _described(session: Path) -> str:
+    """Return what the description says of the messages: from it follows what is missing. A new mark changes nothing."""
+    info = SessionInfo.read(session)
+    files = [each["file"] for each in indexed_segments(session)]
+    told = None if info is None else (info.closed, info.messages, info.error, info.gone, info.origin)
+    return repr((told, files))

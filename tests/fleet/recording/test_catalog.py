@@ -153,6 +153,46 @@ def test_a_damaged_session_is_named_and_its_rest_counts(sessions: Path) -> None:
     assert catalog.query("SELECT count(*) n FROM sensor_range WHERE car = 'red'").to_pylist() == [{"n": 4}]
 
 
+def describe(session: Path, **values: Any) -> None:
+    whole = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps({**whole, **values}))
+
+
+@pytest.mark.parametrize("asked_before", [False, True])
+def test_a_session_that_lacks_messages_is_named_as_by_find(sessions: Path, *, asked_before: bool) -> None:
+    if asked_before:
+        assert not Catalog(sessions).damage
+    describe(sessions / "one", messages=9000)
+    shutil.copytree(sessions / "two", sessions / "cut", ignore=shutil.ignore_patterns(".*"))
+    describe(sessions / "cut", closed=False, ended="2026-01-01T00:00:00Z")
+    catalog = Catalog(sessions)
+    assert set(catalog.damage) == {"one", "cut"}
+    assert "9000" in catalog.damage["one"]
+    assert named(query("FROM sensor_range", sessions), sessions) == {"one", "cut"}
+    assert named(find(sessions), sessions) == {"one", "cut"}
+    describe(sessions / "one", messages=0)
+    assert set(Catalog(sessions).damage) == {"cut"}
+
+
+def test_a_session_that_was_being_recorded_when_it_was_first_asked_is_named_once_it_is_cut(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    describe(sessions / "one", closed=False)
+    os.utime(sessions / "one" / "0001.mcap")
+    assert not Catalog(sessions).damage
+    (tables,) = (sessions / "one").glob(f"{TABLES_PREFIX}*")
+    now_s = time.time()
+    monkeypatch.setattr(time, "time", lambda: now_s + 60)
+    assert set(Catalog(sessions).damage) == {"one"}
+    assert tables.exists()
+
+
+def test_a_mark_makes_no_tables_anew(sessions: Path) -> None:
+    before = tables_of(sessions / "one").directory
+    describe(sessions / "one", marks=[{"time": "2026-01-01T00:00:00Z", "text": "a cat", "by": "mia"}])
+    assert tables_of(sessions / "one").directory == before
+
+
 def test_a_session_that_is_deleted_meanwhile_is_left_out(sessions: Path) -> None:
     catalog = Catalog(sessions)
     shutil.rmtree(sessions / "two")
