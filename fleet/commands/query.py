@@ -72,6 +72,9 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     except QueryFailed as error:
         raise click.ClickException(str(error)) from None
     _write(tuple(answer.column_names), _rows(answer), as_csv=as_csv, as_json=as_json)
+    for name, left_out in catalog.left_out().items():
+        for line in left_out.words():
+            echo_safely(f"{name}: not in the tables: {line}", err=True)
     if catalog.damage and not catalog.sessions:
         raise click.exceptions.Exit(1)
 

@@ -13,16 +13,18 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_lookup import sessions_in, sessions_place
 from fleet.recording.tools.table_cache import CachedTables, drop_orphans, tables_of
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
-from schemas import messages
+from schemas import messages, topics
 from schemas.printable import printable_lines
 from schemas.topics import TOPICS, Topic
 
@@ -177,6 +179,17 @@ class Catalog:
         self._define(sql)
         answer: Any = self._database.sql(sql, params=list(parameters) or None)
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
+
+    def left_out(self) -> dict[str, LeftOut]:
+        """Return by session the messages that are in no table asked so far: they could not be decoded."""
+        found: dict[str, LeftOut] = {}
+        for cached in self.sessions:
+            with suppress(OSError):  # deleted since it was asked
+                for (key, cause), count in cached.left_out().counts.items():
+                    topic = topics.of_key(key)
+                    if topic is not None and topic.name in self._views:
+                        found.setdefault(cached.session.name, LeftOut()).add(key, cause, count)
+        return found
 
     def close(self) -> None:
         """Free the memory."""

@@ -10,6 +10,7 @@ version is named `.foreign.parquet`.
 import errno
 import fnmatch
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final, Self
 
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX, SessionInfo, indexed_segments
 from fleet.recording.tools.export import export
@@ -37,7 +39,9 @@ _NOTE: Final = "damage"
 _FOREIGN: Final = ".foreign.parquet"
 _OPEN: Final = "recording"
 """Name of the empty file that says that the session was being recorded. If it has not ended since, it was cut."""
-_FORMAT: Final = "3"
+_LEFT_OUT: Final = "left_out"
+"""Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
+_FORMAT: Final = "4"
 """Increase it if what is in a directory changes, so that all are made anew."""
 STALE_PART_S: Final = 600.0
 """Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
@@ -69,6 +73,14 @@ class CachedTables:
         """Yield the tables of a message type. There are several if its fields changed within the session."""
         name = re.compile(rf"{re.escape(message)}(-\d+)?(\.foreign)?\.parquet")
         yield from (self.directory / each for each in self.names if each.startswith(message) and name.fullmatch(each))
+
+    def left_out(self) -> LeftOut:
+        """Return the messages that are not in the table of their key. Raises OSError."""
+        found = LeftOut()
+        if _LEFT_OUT in self.names:
+            for key, cause, count in json.loads((self.directory / _LEFT_OUT).read_text(encoding="utf-8")):
+                found.add(key, LeftOutCause(cause), count)
+        return found
 
     def is_foreign(self, file: Path) -> bool:
         """Return True if the columns of a table are not those of this version."""
@@ -112,7 +124,10 @@ def _made(session: Path, place: Path) -> CachedTables:
     part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
     try:
         read = Session(session)
-        export(read.rows(), part, _Sink)
+        exported = export(read.rows(), part, _Sink)
+        if exported.left_out.total:
+            counts = [(key, cause, count) for (key, cause), count in exported.left_out.counts.items()]
+            (part / _LEFT_OUT).write_text(json.dumps(counts), encoding="utf-8")
         if words := _words(read):
             (part / _NOTE).write_text(words, encoding="utf-8")
         if read.description is not None and not read.description.closed:

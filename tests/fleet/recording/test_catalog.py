@@ -20,11 +20,13 @@ from mcap.writer import Writer
 from fleet import Catalog
 from fleet.commands.query import MAX_CELL
 from fleet.recording.catalog import BadQuery, QueryFailed, view_name
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import TABLES_PREFIX, SessionInfo
 from fleet.recording.tools import table_cache
 from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
 from fleet.recording.writing.retention import Quota
+from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import name_of
 from schemas.topics import TOPICS
@@ -345,6 +347,36 @@ def old_schema(session: Path, kind: int) -> None:
         channel = writer.register_channel("fleet/old/sensor/range", "protobuf", schema)
         writer.add_message(channel, START_NS, made.SerializeToString(), START_NS, 1)
         writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "payload", "cause"),
+    [
+        ("json", b"", b"{}", LeftOutCause.NOT_PROTOBUF),
+        ("protobuf", b"garbage", b"", LeftOutCause.BAD_SCHEMA),
+        ("protobuf", messages.descriptor_set("fleet.v1.Range"), b"\xff\xff", LeftOutCause.UNREADABLE),
+    ],
+    ids=["json", "schema", "payload"],
+)
+def test_messages_that_cannot_be_decoded_are_named(
+    sessions: Path, encoding: str, schema: bytes, payload: bytes, cause: LeftOutCause
+) -> None:
+    key = "fleet/red/sensor/range"
+    (sessions / "odd").mkdir()
+    with (sessions / "odd" / "0001.mcap").open("wb") as out:
+        writer: Any = Writer(out)
+        writer.start()
+        number = writer.register_schema("fleet.v1.Range", "protobuf", schema) if schema else 0
+        channel = writer.register_channel(key, encoding, number)
+        for at in range(7):
+            writer.add_message(channel, START_NS + at, payload, START_NS + at, at)
+        writer.finish()
+    for _ in ("made", "kept"):
+        catalog = Catalog(sessions)
+        assert catalog.query("SELECT count(*) n FROM sensor_range").to_pylist() == [{"n": 7}]
+        assert {name: dict(each.counts) for name, each in catalog.left_out().items()} == {"odd": {(key, cause): 7}}
+    assert f"7 of {key}: {cause}" in query("FROM sensor_range", sessions).stderr
+    assert key not in query("FROM sensor_line", sessions).stderr, "the question was about another topic"
 
 
 @pytest.mark.parametrize("others", [True, False])
