@@ -17,7 +17,7 @@ from fleet.recording.session_lookup import sessions_in
 from schemas.printable import printable
 
 MAX_CELL: Final = 60
-"""Maximum characters of a cell on a terminal. --csv and --json have all of it."""
+"""Maximum characters of a cell on a terminal. A pipe, --csv and --json have all of it."""
 ROWS_AT_ONCE: Final = 1024
 """Rows that are Python's objects at the same time. Each block of a table has its own widths of columns."""
 
@@ -96,14 +96,16 @@ def _write(header: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, as_csv: 
         if (first := next(left, None)) is None:
             click.echo("No rows.", err=True)
             return
-        titles = tuple(printable(name, MAX_CELL) for name in header)
-        for line in aligned(chain((titles,), (tuple(map(_short, row)) for row in chain((first,), left)))):
+        limit = MAX_CELL if sys.stdout.isatty() else sys.maxsize
+        titles = tuple(printable(name, limit) for name in header)
+        texts = (tuple(_text(cell, limit) for cell in row) for row in chain((first,), left))
+        for line in aligned(chain((titles,), texts)):
             echo_safely(line)
 
 
-def _short(cell: Any) -> str:
+def _text(cell: Any, limit: int) -> str:
     text = "-" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(_cell(cell))
-    return printable(text, MAX_CELL)
+    return printable(text, limit)
 
 
 def _cell(value: Any) -> Any:

@@ -593,10 +593,17 @@ def test_cells_of_strangers_never_reach_a_terminal_raw(sessions: Path) -> None:
     assert "\x1b" not in shown
     assert "\x9b" not in shown
     assert len(shown.splitlines()) == 2
-    assert max(map(len, shown.splitlines())) <= MAX_CELL
+    assert "y" * 100_000 in shown, "a pipe gets all of a cell"
     wrong = query("SELECT CAST(chr(27) || ']0;x' AS INTEGER)", sessions)
     assert wrong.returncode == 2
     assert "\x1b" not in wrong.stderr
+    columns = query("--tables", cwd=sessions.parent).stdout
+    assert "voltage_v, charge, charge_error, level" in columns
+    short = Terminal("fleet", "query", f"{sql}, 'the end' AS z", str(sessions), environment={}, directory=sessions)
+    try:
+        assert "y" * (MAX_CELL + 1) not in short.until("the end")
+    finally:
+        short.close()
     on_terminal = Terminal("fleet", "query", sql, str(sessions), "--csv", environment={}, directory=sessions)
     try:
         assert "\\x1b]0;x" in on_terminal.until("yyy")
