@@ -17,7 +17,7 @@ from fleet.recording.session_lookup import sessions_in
 from schemas.printable import printable
 
 MAX_CELL: Final = 60
-"""Maximum characters of a cell on a terminal. --csv and --json have all of it."""
+"""Maximum characters of a cell on a terminal. A pipe, --csv and --json have all of it."""
 ROWS_AT_ONCE: Final = 1024
 """Rows that are Python's objects at the same time. Each block of a table has its own widths of columns."""
 
@@ -39,7 +39,9 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
     Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
     session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
-    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read.
+    Who sent a command is a process (tom@host-4711): person_of(sender) is the person.
+    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read, or
+    if no disk has room for the tables.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
@@ -55,7 +57,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     with progress_bar("tables", count) as advance:
         try:
             catalog = Catalog(place, on_session=lambda _: advance(1))
-        except FormatMissing as error:
+        except (FormatMissing, QueryFailed) as error:
             raise click.ClickException(str(error)) from None
     for name, words in catalog.damage.items():
         echo_safely(f"{name}: only what is intact was read: {words}", err=True)
@@ -70,6 +72,9 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     except QueryFailed as error:
         raise click.ClickException(str(error)) from None
     _write(tuple(answer.column_names), _rows(answer), as_csv=as_csv, as_json=as_json)
+    for name, left_out in catalog.left_out().items():
+        for line in left_out.words():
+            echo_safely(f"{name}: not in the tables: {line}", err=True)
     if catalog.damage and not catalog.sessions:
         raise click.exceptions.Exit(1)
 
@@ -91,14 +96,16 @@ def _write(header: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, as_csv: 
         if (first := next(left, None)) is None:
             click.echo("No rows.", err=True)
             return
-        titles = tuple(printable(name, MAX_CELL) for name in header)
-        for line in aligned(chain((titles,), (tuple(map(_short, row)) for row in chain((first,), left)))):
+        limit = MAX_CELL if sys.stdout.isatty() else sys.maxsize
+        titles = tuple(printable(name, limit) for name in header)
+        texts = (tuple(_text(cell, limit) for cell in row) for row in chain((first,), left))
+        for line in aligned(chain((titles,), texts)):
             echo_safely(line)
 
 
-def _short(cell: Any) -> str:
+def _text(cell: Any, limit: int) -> str:
     text = "-" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(_cell(cell))
-    return printable(text, MAX_CELL)
+    return printable(text, limit)
 
 
 def _cell(value: Any) -> Any:

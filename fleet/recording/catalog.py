@@ -3,6 +3,7 @@
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
 as commanded and as seen, the motion, who drove, and the phase of the plan. Topics without a message have views, too.
+Who drove is a person. `sender` and other columns of the tables are as recorded; `person_of(sender)` is the person.
 
 A view is defined when a question names it: DuckDB then opens files, and a thousand sessions have twenty each.
 """
@@ -12,16 +13,18 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_lookup import sessions_in, sessions_place
 from fleet.recording.tools.table_cache import CachedTables, drop_orphans, tables_of
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
-from schemas import messages
+from schemas import messages, topics
 from schemas.printable import printable_lines
 from schemas.topics import TOPICS, Topic
 
@@ -32,13 +35,17 @@ MEMORY_LIMIT: Final = "1GB"
 """Maximum memory of a question. DuckDB writes to a temporary directory beyond it."""
 CONTEXT: Final[tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = (
     ("state/mode", (("mode", "{c}.asked"), ("mode_seen", "{c}.inferred"), ("verdict", "{c}.verdict"))),
-    ("state/motion", (("motion", "{c}.motion"), ("owner", "{c}.owner"))),
-    ("state/safety", (("motors", "{c}.motors"), ("driver", "json_extract_string({c}.lease, '$.holder')"))),
+    ("state/motion", (("motion", "{c}.motion"), ("owner", "person_of({c}.owner)"))),
+    ("state/safety", (("motors", "{c}.motors"), ("driver", "person_of(json_extract_string({c}.lease, '$.holder'))"))),
     ("@coordinator/assignment", (("plan_phase", "{c}.phase"), ("plan_version", "{c}.plan_version"))),
 )
 """What `..._context` adds: topic, and for each column its expression. `{c}` is the row of the topic."""
 
 
+_PERSON_OF: Final = (
+    "CREATE MACRO person_of(sender) AS coalesce(nullif(split_part(sender, '@', 1), ''), nullif(sender, ''))"
+)
+"""`schemas.keys.name_of` for questions: the person of a sender, without the host and the process."""
 MAX_QUERY_ATTEMPTS: Final = 4
 """Each attempt looks for the sessions anew: the quota deletes them, and those that grow have other tables then."""
 _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
@@ -53,7 +60,10 @@ class QueryFailed(RuntimeError):
 
 
 class Catalog:
-    """All sessions of a directory. Raises FormatMissing without DuckDB; `damage` has what could not be read."""
+    """All sessions of a directory. `damage` has what could not be read.
+
+    Raises FormatMissing without DuckDB, and QueryFailed without a directory for temporary files.
+    """
 
     def __init__(
         self,
@@ -70,10 +80,17 @@ class Catalog:
         self.directory = Path(directory) if directory is not None else sessions_place()
         self.damage: dict[str, str] = {}
         """By name of a session, what of it could not be read."""
+        self.unanswered: dict[str, str] = {}
+        """By name of a session, why its tables could be written nowhere. Each question fails while there is one."""
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
         self._views: set[str] = set()
-        scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
+        try:
+            scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
+        except OSError as error:
+            raise QueryFailed(
+                f"no temporary file can be written: {error.strerror or error}. Make room, or set TMPDIR."
+            ) from None
         # DuckDB would write to `.tmp` here, and here may be read-only.
         weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._config: dict[str, Any] = {"memory_limit": MEMORY_LIMIT, "temp_directory": scratch}
@@ -83,6 +100,7 @@ class Catalog:
     def _find(self) -> None:
         """Look for the sessions, and begin without views."""
         self.damage.clear()
+        self.unanswered.clear()
         self.sessions.clear()
         drop_orphans(self.directory)
         for path in sorted(sessions_in(self.directory)):
@@ -94,7 +112,7 @@ class Catalog:
                 self.damage[path.name] = str(error)
                 continue
             except OSError as error:
-                self.damage[path.name] = f"its tables cannot be made: {error.strerror or error}"
+                self.unanswered[path.name] = error.strerror or str(error)
                 continue
             self.sessions.append(cached)
             if cached.words:
@@ -103,6 +121,7 @@ class Catalog:
             self._database.close()
         self._database = self._duckdb.connect(config=self._config)
         self._database.execute("SET TimeZone = 'UTC'")
+        self._database.execute(_PERSON_OF)
         self._views.clear()
 
     def _define(self, words: str | None) -> None:
@@ -151,9 +170,26 @@ class Catalog:
             self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
+        if self.unanswered:  # what is missing there would be missing in the answer
+            name, why = next(iter(self.unanswered.items()))
+            which = f"{name} and {more} more" if (more := len(self.unanswered) - 1) else name
+            raise QueryFailed(
+                printable_lines(f"the tables of {which} can be written nowhere: {why}. Make room, or set TMPDIR.")
+            )
         self._define(sql)
         answer: Any = self._database.sql(sql, params=list(parameters) or None)
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
+
+    def left_out(self) -> dict[str, LeftOut]:
+        """Return by session the messages that are in no table asked so far: they could not be decoded."""
+        found: dict[str, LeftOut] = {}
+        for cached in self.sessions:
+            with suppress(OSError):  # deleted since it was asked
+                for (key, cause), count in cached.left_out().counts.items():
+                    topic = topics.of_key(key)
+                    if topic is not None and topic.name in self._views:
+                        found.setdefault(cached.session.name, LeftOut()).add(key, cause, count)
+        return found
 
     def close(self) -> None:
         """Free the memory."""

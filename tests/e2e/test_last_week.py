@@ -94,12 +94,13 @@ def test_five_questions_to_a_week_are_answered(room: TwoTerminals, tmp_path: Pat
     def answer(begin: str) -> str:
         return next(text for command, text in answers.items() if command.startswith(begin))
 
-    runaway = answer('fleet find "motors').splitlines()
+    runaway = answer('fleet find "trust').splitlines()
     assert [line.split()[:2] for line in runaway[1::2]] == [[wednesday, "red"]]
     assert re.search(rf"{wednesday} +red +teacher@", answer('fleet query "SELECT session, car, sender, words'))
     assert [line.split()[:2] for line in answer('fleet find "state').splitlines()[1::2]] == [[friday, "blue"]]
     assert answer('fleet query "SELECT session, arg_max').count("\n") == 4
-    drivers = answer('fleet query "SELECT session, sender')
-    assert re.search(rf"{monday} +mia@\S+ +red +1", drivers)
+    drivers = answer('fleet query "SELECT session, person_of')
+    assert re.search(rf"{monday} +mia +red +drive +1", drivers)
+    assert re.search(rf"{wednesday} +mia +red +mode +1", drivers)
     marked = [line for line in answers["fleet sessions"].splitlines() if " kept" in line]
     assert [line.split()[0] for line in marked] == [wednesday]

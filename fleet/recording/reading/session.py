@@ -158,6 +158,12 @@ class Session:
         """Return the name of the directory, or of the file without its suffix."""
         return self.path.resolve().name if self.path.is_dir() else self.path.stem
 
+    @property
+    def undescribed(self) -> str:
+        """Return what is wrong with session.json of a directory, in words; empty if it can be read."""
+        unread = self.description is None and self.path.is_dir()
+        return "is missing or unreadable: it names recorder and marks" if unread else ""
+
     def lacking(self, messages: int) -> str:
         """Return which messages session.json counts beyond these, in words; empty if none or unknown."""
         info = self.description

@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError, Message
 
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import MessageDecoder, message_of
+from fleet.recording.reading.message_decoder import MessageDecoder, message_of, why_not_decoded
 from fleet.recording.tools import tables
 from fleet.recording.tools.table_formats import ArrowSink, FileSink, Sink
 from schemas import keys, topics
@@ -157,7 +157,7 @@ class _Export:
                 self._write(table)
         for table in list(self.tables.values()):
             self._write(table)
-        if (None, False) in self.tables:
+        if (None, False) in self.tables:  # what the others could not decode
             self.tables[None, False].write()
 
     def _write(self, table: _Table) -> None:
@@ -169,6 +169,10 @@ class _Export:
         unreadable = Counter(info.channel.topic for info in bad.infos)
         for key, count in unreadable.items():
             self.left_out.add(key, LeftOutCause.UNREADABLE, count)
+        if table.message_class is None:
+            for info in infos:
+                if own_type(info.channel.topic) and self._decoder.class_of(info) is None:
+                    self.left_out.add(info.channel.topic, why_not_decoded(self._decoder, info))
         if table.stray:
             for key, count in Counter(info.channel.topic for info in infos).items():
                 self.left_out.add(key, LeftOutCause.OTHER_TYPE, count - unreadable[key])

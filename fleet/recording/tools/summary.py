@@ -31,7 +31,7 @@ class SessionState(StrEnum):
     WHOLE = "whole"
     RECORDING = "recording"
     CUT = "cut"  # the recorder did not close it
-    DAMAGED = "damaged"  # files are missing or no MCAP files
+    DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is no MCAP file
     THINNED = "thinned"  # whole but for what the quota took
     RECOVERED = "recovered"  # whole, but made from an incomplete session
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
@@ -132,7 +132,7 @@ def of_session(session: Session) -> SessionSummary:
         found.pins, found.gone = list(description.pins), session_dir.gone_of(description)
         found.stops = description.stops if description.closed else None  # else the last ones may be uncounted
     found.state, found.words = _state(session, read)
-    if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
+    if found.state is SessionState.WHOLE and (words := session.undescribed or session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
     if found.state is SessionState.WHOLE and found.gone:
         found.state = SessionState.THINNED

@@ -1,14 +1,16 @@
 """Keeps the tables of a session as Parquet beside it, for questions to many sessions.
 
 The tables of one state of a session are in the directory `.tables-<digest>`. The digest is of its files, their sizes
-and times, and of the columns of our tables. So a session that grew has another directory, and the old one goes. A
-directory has its name only when it is whole: two questions at once make it twice, and one of the two is kept. Whoever
-deletes it loses nothing but time. A table whose columns are not those of this version is named `.foreign.parquet`.
+and times, of what is said to be in them, and of the columns of our tables. So a session that grew has another
+directory, and the old one goes. A directory has its name only when it is whole: two questions at once make it twice,
+and one of the two is kept. Whoever deletes it loses nothing but time. A table whose columns are not those of this
+version is named `.foreign.parquet`.
 """
 
 import errno
 import fnmatch
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -16,14 +18,16 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Final, Self
 
+from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX
+from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX, SessionInfo, indexed_segments
 from fleet.recording.tools.export import export
+from fleet.recording.tools.summary import of_session
 from fleet.recording.tools.table_formats import ParquetSink
 from fleet.recording.tools.tables import Column, Layout
 from schemas import messages
@@ -33,12 +37,17 @@ _PART: Final = ".part"
 _NOTE: Final = "damage"
 """Name of the file that says what of the session could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
-_FORMAT: Final = "2"
+_OPEN: Final = "recording"
+"""Name of the empty file that says that the session was being recorded. If it has not ended since, it was cut."""
+_LEFT_OUT: Final = "left_out"
+"""Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
+_FORMAT: Final = "4"
 """Increase it if what is in a directory changes, so that all are made anew."""
 STALE_PART_S: Final = 600.0
 """Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
 every few seconds: a thousand messages each."""
-_READ_ONLY: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+_MAX_TRIES: Final = 4
+"""Maximum times that tables are made: another question deletes those of an old state of a session that grows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,51 +74,75 @@ class CachedTables:
         name = re.compile(rf"{re.escape(message)}(-\d+)?(\.foreign)?\.parquet")
         yield from (self.directory / each for each in self.names if each.startswith(message) and name.fullmatch(each))
 
+    def left_out(self) -> LeftOut:
+        """Return the messages that are not in the table of their key. Raises OSError."""
+        found = LeftOut()
+        if _LEFT_OUT in self.names:
+            for key, cause, count in json.loads((self.directory / _LEFT_OUT).read_text(encoding="utf-8")):
+                found.add(key, LeftOutCause(cause), count)
+        return found
+
     def is_foreign(self, file: Path) -> bool:
         """Return True if the columns of a table are not those of this version."""
         return file.name.endswith(_FOREIGN)
 
 
 def tables_of(session: Path) -> CachedTables:
-    """Return the tables of a session, made now if they are not there. Raises NoSession, OSError, FormatMissing."""
-    for place in _places(session):
-        with suppress(FileNotFoundError):
-            return CachedTables.of(session, place)
-    if not session.exists():
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.")
-    errors: list[OSError] = []
-    for place in _places(session):
-        try:
-            return _made(session, place)
-        except OSError as error:
-            if error.errno not in _READ_ONLY:  # a full disk, for example: it is the same elsewhere
-                raise
-            errors.append(error)
-    raise errors[0]
+    """Return the tables of a session, made now if they are not there.
+
+    Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere.
+    """
+    for _ in range(_MAX_TRIES):
+        for place in _places(session):
+            with suppress(FileNotFoundError):
+                found = CachedTables.of(session, place)
+                return replace(found, words=found.words or _words(Session(session))) if _OPEN in found.names else found
+        if not session.exists():
+            break
+        errors: list[OSError] = []
+        for place in _places(session):
+            try:
+                return _made(session, place)
+            except FileNotFoundError:  # the session is gone, or another question knows a newer state of it
+                break
+            # Reading raises none: what cannot be read is damage. So the disk is full or broken, or the folder is
+            # read-only, and another disk may take the tables.
+            except OSError as error:
+                errors.append(error)
+        else:
+            raise errors[0]
+    if session.exists():
+        raise OSError(errno.EAGAIN, f"the session grows too fast: {os.strerror(errno.EAGAIN)}")
+    raise NoSession(f"{session} is gone: it was deleted meanwhile.")
 
 
 def _made(session: Path, place: Path) -> CachedTables:
+    """Make the tables of a session. Raises OSError, a FileNotFoundError if the session or the tables are gone."""
     if place.parent != session:  # which must not appear again when the quota has deleted it
         place.parent.mkdir(parents=True, exist_ok=True)
     _drop_stale_parts(place.parent)
+    part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
     try:
-        part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
-        try:
-            read = Session(session)
-            export(read.rows(), part, _Sink)
-            if words := read.damage_words:
-                (part / _NOTE).write_text(words, encoding="utf-8")
-            with suppress(OSError):  # another question has made it meanwhile
-                part.rename(place)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-    except FileNotFoundError:
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
+        read = Session(session)
+        exported = export(read.rows(), part, _Sink)
+        if exported.left_out.total:
+            counts = [(key, cause, count) for (key, cause), count in exported.left_out.counts.items()]
+            (part / _LEFT_OUT).write_text(json.dumps(counts), encoding="utf-8")
+        if words := _words(read):
+            (part / _NOTE).write_text(words, encoding="utf-8")
+        if read.description is not None and not read.description.closed:
+            (part / _OPEN).touch()
+        with suppress(OSError):  # another question has made it meanwhile
+            part.rename(place)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     _drop_others(place)
-    try:
-        return CachedTables.of(session, place)
-    except FileNotFoundError:
-        raise NoSession(f"{session} is gone: it was deleted meanwhile.") from None
+    return CachedTables.of(session, place)
+
+
+def _words(session: Session) -> str:
+    """Return what is not whole of a session, as `fleet find` and `fleet sessions` say it; empty if it is whole."""
+    return session.damage_words or of_session(session).words
 
 
 class _Sink(ParquetSink):
@@ -186,4 +219,13 @@ def _digest(session: Path) -> str:
         with suppress(FileNotFoundError):  # the quota deletes it meanwhile
             state = os.stat(f"{directory}{os.sep}{name}")  # noqa: PTH116
             facts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
+    facts.append(_described(session))
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
+
+
+def _described(session: Path) -> str:
+    """Return what the description says of the messages: from it follows what is missing. A new mark changes nothing."""
+    info = SessionInfo.read(session)
+    files = [each["file"] for each in indexed_segments(session)]
+    told = None if info is None else (info.closed, info.messages, info.error, info.gone, info.origin)
+    return repr((told, files))

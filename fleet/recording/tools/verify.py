@@ -257,9 +257,7 @@ def verify(
                 for begin, iso_end in ((each["from"], each["to"]) for each in gone)
             )
         ]
-    if session.path.is_dir() and description is None:
-        verdict.damage[session_dir.SESSION_FILE] = "is missing or unreadable: it names recorder and marks"
-    if words := session.lacking(verdict.messages):
+    if words := session.undescribed or session.lacking(verdict.messages):
         verdict.damage[session_dir.SESSION_FILE] = words
     verdict.lost = lost_words(session)
     if description is not None:

@@ -20,12 +20,15 @@ from mcap.writer import Writer
 from fleet import Catalog
 from fleet.commands.query import MAX_CELL
 from fleet.recording.catalog import BadQuery, QueryFailed, view_name
+from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import TABLES_PREFIX, SessionInfo
 from fleet.recording.tools import table_cache
 from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
 from fleet.recording.writing.retention import Quota
+from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.keys import name_of
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, Made
 from tests.support import in_process
@@ -38,11 +41,14 @@ from tests.support.terminal import Terminal
 def make(path: Path, car: str, distances: list[float]) -> None:
     """Make a session: one distance a second, in tracking from the third second on, driven by ann."""
     path.mkdir()
+    SessionInfo("fleet", "2026-01-01T00:00:00Z", "h", {}, closed=True).write(path)
     made = Made(path / "0001.mcap", Writer)
     for second, distance in enumerate(distances):
         made.put(f"fleet/{car}/state/mode", pb.Mode(asked="tracking" if second >= 2 else "manual"), second)
-        made.put(f"fleet/{car}/state/motion", pb.Motion(motion="forward"), second)
-        made.put(f"fleet/{car}/state/safety", pb.Safety(motors="on", lease=pb.Lease(holder="ann@desk")), second)
+        made.put(f"fleet/{car}/state/motion", pb.Motion(motion="forward", owner=f"ann@desk-{second}"), second)
+        made.put(
+            f"fleet/{car}/state/safety", pb.Safety(motors="on", lease=pb.Lease(holder=f"ann@desk-{second}")), second
+        )
         made.put(f"fleet/{car}/sensor/range", pb.Range(range_m=distance), second + 0.1)
     made.put(f"fleet/{car}/sensor/range", pb.Range(range_m=9.0), 60)
     made.close()
@@ -75,12 +81,27 @@ def test_a_question_reaches_every_session_and_says_which(sessions: Path) -> None
 def test_the_context_is_of_that_moment_and_stale_states_do_not_count(sessions: Path) -> None:
     rows = asked(
         sessions,
-        "SELECT range_m, mode, motion, driver FROM sensor_range_context WHERE car = 'red' ORDER BY publish_time",
+        "SELECT range_m, mode, motion, owner, driver FROM sensor_range_context WHERE car = 'red' ORDER BY publish_time",
     )
-    driven = {"motion": "forward", "driver": "ann@desk"}
+    driven = {"motion": "forward", "owner": "ann", "driver": "ann"}
     assert rows[0] == {"range_m": 1.0, "mode": "manual", **driven}
     assert rows[2] == {"range_m": 0.25, "mode": "tracking", **driven}
-    assert rows[3] == {"range_m": 9.0, "mode": None, "motion": None, "driver": None}, "57 s later nothing is known"
+    assert rows[3] == {"range_m": 9.0, "mode": None, **dict.fromkeys(driven)}, "57 s later nothing is known"
+
+
+def test_who_drove_is_a_person_and_not_a_process(sessions: Path) -> None:
+    for column in ("driver", "owner"):
+        rows = asked(
+            sessions, f"SELECT {column}, count(*) n FROM sensor_range_context WHERE mode = 'manual' GROUP BY ALL"
+        )
+        assert rows == [{column: "ann", "n": 4}], "each drive is of another process"
+
+
+def test_the_person_of_a_sender_is_that_of_all_texts(sessions: Path) -> None:
+    catalog = Catalog(sessions)
+    for sender in ("tom@vm-535", "tom", "tom@a@b", "@vm-535", "Zoë@x", None, ""):
+        (row,) = catalog.query("SELECT person_of(?) AS person", [sender]).to_pylist()
+        assert row["person"] == (name_of(sender) if sender else None)
 
 
 def test_every_topic_has_a_view_also_without_a_message(sessions: Path) -> None:
@@ -132,6 +153,46 @@ def test_a_damaged_session_is_named_and_its_rest_counts(sessions: Path) -> None:
     catalog = Catalog(sessions)
     assert set(catalog.damage) >= {"two"}
     assert catalog.query("SELECT count(*) n FROM sensor_range WHERE car = 'red'").to_pylist() == [{"n": 4}]
+
+
+def describe(session: Path, **values: Any) -> None:
+    whole = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps({**whole, **values}))
+
+
+@pytest.mark.parametrize("asked_before", [False, True])
+def test_a_session_that_lacks_messages_is_named_as_by_find(sessions: Path, *, asked_before: bool) -> None:
+    if asked_before:
+        assert not Catalog(sessions).damage
+    describe(sessions / "one", messages=9000)
+    shutil.copytree(sessions / "two", sessions / "cut", ignore=shutil.ignore_patterns(".*"))
+    describe(sessions / "cut", closed=False, ended="2026-01-01T00:00:00Z")
+    catalog = Catalog(sessions)
+    assert set(catalog.damage) == {"one", "cut"}
+    assert "9000" in catalog.damage["one"]
+    assert named(query("FROM sensor_range", sessions), sessions) == {"one", "cut"}
+    assert named(find(sessions), sessions) == {"one", "cut"}
+    describe(sessions / "one", messages=0)
+    assert set(Catalog(sessions).damage) == {"cut"}
+
+
+def test_a_session_that_was_being_recorded_when_it_was_first_asked_is_named_once_it_is_cut(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    describe(sessions / "one", closed=False)
+    os.utime(sessions / "one" / "0001.mcap")
+    assert not Catalog(sessions).damage
+    (tables,) = (sessions / "one").glob(f"{TABLES_PREFIX}*")
+    now_s = time.time()
+    monkeypatch.setattr(time, "time", lambda: now_s + 60)
+    assert set(Catalog(sessions).damage) == {"one"}
+    assert tables.exists()
+
+
+def test_a_mark_makes_no_tables_anew(sessions: Path) -> None:
+    before = tables_of(sessions / "one").directory
+    describe(sessions / "one", marks=[{"time": "2026-01-01T00:00:00Z", "text": "a cat", "by": "mia"}])
+    assert tables_of(sessions / "one").directory == before
 
 
 def test_a_session_that_is_deleted_meanwhile_is_left_out(sessions: Path) -> None:
@@ -288,6 +349,36 @@ def old_schema(session: Path, kind: int) -> None:
         writer.finish()
 
 
+@pytest.mark.parametrize(
+    ("encoding", "schema", "payload", "cause"),
+    [
+        ("json", b"", b"{}", LeftOutCause.NOT_PROTOBUF),
+        ("protobuf", b"garbage", b"", LeftOutCause.BAD_SCHEMA),
+        ("protobuf", messages.descriptor_set("fleet.v1.Range"), b"\xff\xff", LeftOutCause.UNREADABLE),
+    ],
+    ids=["json", "schema", "payload"],
+)
+def test_messages_that_cannot_be_decoded_are_named(
+    sessions: Path, encoding: str, schema: bytes, payload: bytes, cause: LeftOutCause
+) -> None:
+    key = "fleet/red/sensor/range"
+    (sessions / "odd").mkdir()
+    with (sessions / "odd" / "0001.mcap").open("wb") as out:
+        writer: Any = Writer(out)
+        writer.start()
+        number = writer.register_schema("fleet.v1.Range", "protobuf", schema) if schema else 0
+        channel = writer.register_channel(key, encoding, number)
+        for at in range(7):
+            writer.add_message(channel, START_NS + at, payload, START_NS + at, at)
+        writer.finish()
+    for _ in ("made", "kept"):
+        catalog = Catalog(sessions)
+        assert catalog.query("SELECT count(*) n FROM sensor_range").to_pylist() == [{"n": 7}]
+        assert {name: dict(each.counts) for name, each in catalog.left_out().items()} == {"odd": {(key, cause): 7}}
+    assert f"7 of {key}: {cause}" in query("FROM sensor_range", sessions).stderr
+    assert key not in query("FROM sensor_line", sessions).stderr, "the question was about another topic"
+
+
 @pytest.mark.parametrize("others", [True, False])
 def test_a_session_of_another_schema_has_the_columns_of_ours(sessions: Path, *, others: bool) -> None:
     if not others:
@@ -339,7 +430,7 @@ def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
     shutil.rmtree(sessions / "two")
     with pytest.raises(NoSession):
         tables_of(sessions / "two")
-    with pytest.raises(NoSession):  # it was there a moment ago
+    with pytest.raises(FileNotFoundError):  # it was there a moment ago
         table_cache._made(sessions / "two", sessions / "two" / f"{TABLES_PREFIX}x")
     assert [each.name for each in sessions.iterdir()] == ["one"]
 
@@ -399,21 +490,72 @@ def test_ctrl_c_leaves_nothing_half_made(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
-def test_a_disk_that_fills_during_a_question_costs_tables_only(tmp_path: Path) -> None:
+@pytest.mark.parametrize("both", [False, True])
+def test_a_disk_that_fills_costs_no_row_of_an_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, both: bool
+) -> None:
     with disk("really full", tmp_path) as full:
-        full.root.mkdir()
+        elsewhere = full.root / ".tmp" if both else tmp_path / "tmp"
+        elsewhere.mkdir(parents=True)
+        monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+        full.root.mkdir(exist_ok=True)
         make(full.root / "one", "red", [1.0] * 3000)
         make(full.root / "two", "blue", [1.0, 2.0])
         recorded = (full.root / "one" / "0001.mcap").read_bytes()
         tables_of(full.root / "two")
         full.fill(but=16_384)
-        done = query("SELECT car, count(*) n FROM sensor_range GROUP BY ALL", full.root, "--csv")
-        assert (done.returncode, done.stdout.splitlines()) == (0, ["car,n", "blue,3"])
-        assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["one"]
+        done = query("SELECT car, count(*) n FROM sensor_range GROUP BY ALL ORDER BY 1", full.root, "--csv")
+        if both:
+            assert (done.returncode, done.stdout) == (1, "")
+            assert "one" in done.stderr
+            assert os.strerror(errno.ENOSPC) in done.stderr
+        else:
+            assert (done.returncode, done.stdout.splitlines()) == (0, ["car,n", "blue,3", "red,3001"])
         assert no_tables(full.root / "one")
         assert (full.root / "one" / "0001.mcap").read_bytes() == recorded
         full.free()
         assert asked(full.root, "SELECT count(*) n FROM sensor_range") == [{"n": 3004}]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EFBIG])
+@pytest.mark.parametrize("places", [1, 2])
+def test_tables_that_can_be_written_nowhere_are_no_answer(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch, code: int, places: int
+) -> None:
+    elsewhere = sessions.parent / "tmp"
+    elsewhere.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+    add = table_cache._Sink.add
+
+    def fails(sink: table_cache._Sink, values: Any) -> None:
+        if "two" in sink._path.parts and (places == 2 or not sink._path.is_relative_to(elsewhere)):
+            raise OSError(code, os.strerror(code))
+        add(sink, values)
+
+    monkeypatch.setattr(table_cache._Sink, "add", fails)
+    done = query("SELECT count(*) n FROM sensor_range", sessions)
+    assert (done.returncode, done.stdout.split()) == ((0, ["n", "7"]) if places == 1 else (1, []))
+    if places == 2:
+        assert "two" in done.stderr
+        assert no_tables(sessions / "two")
+
+
+def test_no_temporary_directory_is_one_line(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(sessions / "nowhere"))
+    done = query("SELECT count(*) n FROM sensor_range", sessions)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+
+
+def test_tables_that_another_question_deletes_are_made_again(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drop, meanwhile = table_cache._drop_others, [shutil.rmtree]
+
+    def and_another_question(place: Path) -> None:
+        drop(place)
+        while meanwhile:
+            meanwhile.pop()(place)
+
+    monkeypatch.setattr(table_cache, "_drop_others", and_another_question)
+    assert asked(sessions, "SELECT count(*) n FROM sensor_range") == [{"n": 7}]
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
@@ -451,10 +593,17 @@ def test_cells_of_strangers_never_reach_a_terminal_raw(sessions: Path) -> None:
     assert "\x1b" not in shown
     assert "\x9b" not in shown
     assert len(shown.splitlines()) == 2
-    assert max(map(len, shown.splitlines())) <= MAX_CELL
+    assert "y" * 100_000 in shown, "a pipe gets all of a cell"
     wrong = query("SELECT CAST(chr(27) || ']0;x' AS INTEGER)", sessions)
     assert wrong.returncode == 2
     assert "\x1b" not in wrong.stderr
+    columns = query("--tables", cwd=sessions.parent).stdout
+    assert "voltage_v, charge, charge_error, level" in columns
+    short = Terminal("fleet", "query", f"{sql}, 'the end' AS z", str(sessions), environment={}, directory=sessions)
+    try:
+        assert "y" * (MAX_CELL + 1) not in short.until("the end")
+    finally:
+        short.close()
     on_terminal = Terminal("fleet", "query", sql, str(sessions), "--csv", environment={}, directory=sessions)
     try:
         assert "\\x1b]0;x" in on_terminal.until("yyy")

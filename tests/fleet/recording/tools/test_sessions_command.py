@@ -188,6 +188,10 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
     broken = fleet("verify", session)
     assert broken.returncode == 1
     assert "damage: session.json is missing or unreadable" in broken.stdout
+    told = fleet("info", session).stdout.splitlines()[0]
+    assert told.startswith(f"{session.name}: damaged (session.json is missing or unreadable")
+    assert f"{session.name}: session.json is missing" in fleet(session.parent).stderr
+    assert f"{session.name}: " in in_process.fleet("find", "range_m < 0.3", session.parent).stderr
     assert fleet("recover", session).returncode == 0
     assert session_dir.SessionInfo.read(session.with_name(f"{session.name}-recovered")) is not None
 

@@ -54,7 +54,7 @@ def test_strays_are_tables_of_their_own(mixed: Session, tmp_path: Path) -> None:
     (out := tmp_path / "out").mkdir()
     done = export(mixed.rows(), out, FORMATS["parquet"])
     assert done.rows == {"stray.fleet.v1.Range": 2, "fleet.v1.Link": 50, "other": 1, "fleet.v1.Range": 3}
-    assert done.left_out.counts == {(LINK, LeftOutCause.OTHER_TYPE): 2}
+    assert done.left_out.counts == {(LINK, LeftOutCause.OTHER_TYPE): 2, (LINK, LeftOutCause.NOT_PROTOBUF): 1}
     assert {path.stem: pq.read_table(path).num_rows for path in out.iterdir()} == done.rows
 
 
