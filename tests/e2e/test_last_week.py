@@ -94,7 +94,7 @@ def test_five_questions_to_a_week_are_answered(room: TwoTerminals, tmp_path: Pat
     def answer(begin: str) -> str:
         return next(text for command, text in answers.items() if command.startswith(begin))
 
-    runaway = answer('fleet find "trust').splitlines()
+    runaway = answer('fleet find "motors').splitlines()
     assert [line.split()[:2] for line in runaway[1::2]] == [[wednesday, "red"]]
     assert re.search(rf"{wednesday} +red +teacher@", answer('fleet query "SELECT session, car, sender, words'))
     assert [line.split()[:2] for line in answer('fleet find "state').splitlines()[1::2]] == [[friday, "blue"]]
