@@ -114,6 +114,11 @@ def rooms(functions: set[Function]) -> list[str]:
     return sorted({module for module, _ in functions})
 
 
+def _stands(fleet: FleetProcesses) -> bool:
+    safety = fleet.state("safety")
+    return safety is not None and safety.motors_basis == "shown"
+
+
 async def stop_walk(directory: Path, *, whole: bool = False) -> tuple[Walk, Walk]:
     """Return the walks of an idle gateway, and of `fleet stop red` until the car has shown it."""
     car, fleet = TcpCar(), FleetProcesses(free_endpoint(), directory)
@@ -129,7 +134,7 @@ async def stop_walk(directory: Path, *, whole: bool = False) -> tuple[Walk, Walk
             async with served(fleet, car.link, directory):
                 await asyncio.to_thread(wait_for, partial(car.received.count, MODE00), "the gateway has begun its stop")
                 car.obey()
-                await asyncio.to_thread(wait_for, lambda: fleet.state("safety").motors_basis == "shown", "it stands")
+                await asyncio.to_thread(wait_for, partial(_stands, fleet), "it stands")
                 tracer.walk = idle
                 await asyncio.sleep(IDLE_S if whole else 0.0)
                 tracer.walk = stop

@@ -572,6 +572,7 @@ def test_a_disk_that_is_read_only_is_asked(sessions: Path, monkeypatch: pytest.M
     assert no_tables(sessions)
 
 
+@pytest.mark.soak
 def test_a_million_rows_are_written_a_block_at_a_time(sessions: Path) -> None:
     sql = "SELECT range AS n FROM range(1000000)"
     for format_option in ("--csv", "--json"):

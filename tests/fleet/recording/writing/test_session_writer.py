@@ -145,7 +145,7 @@ def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp
     after = SessionWriter(tmp_path, "fleet", Options(quota=Quota(100_000)), BEGUN_NS + SECOND_NS)
     after.tick(BEGUN_NS + SECOND_NS)
     assert "has more than its quota, by 0." in after.warning
-    assert "MB that are marked, in use or not to be removed" in after.warning
+    assert "MB that are marked, pinned, in use or not to be removed" in after.warning
     assert after.quota_news == []
     after.close(BEGUN_NS + SECOND_NS)
     assert payloads([tape.path]) == 400
