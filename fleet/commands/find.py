@@ -13,7 +13,7 @@ import click
 from fleet.client.client import default_sender
 from fleet.commands.group import chosen_person
 from fleet.commands.options import cli_errors, json_option
-from fleet.commands.output import aligned, echo_csv, echo_safely
+from fleet.commands.output import MAX_CELL, aligned, echo_csv, echo_safely
 from fleet.commands.params import Duration, car_option, existing_sessions_place
 from fleet.console import DEFAULT_PORT
 from fleet.policy.car_condition import parse_condition
@@ -26,14 +26,12 @@ from schemas.printable import printable
 
 if TYPE_CHECKING:
     from fleet.conditions import Expression
-    from fleet.recording.tools.find import Hit
+    from fleet.recording.tools.find import Found, Hit
 
 MAX_FOR_S: Final = 86_400.0
 """Maximum of --for: recordings of lessons and demos are no longer than a day."""
 FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open", "link")
 """Fields of a hit as JSON and CSV."""
-MAX_CELL: Final = 60
-"""Maximum length of a cell. Names of a recording are anybody's."""
 _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
 
 
@@ -81,8 +79,8 @@ def find(
     except ValueError as error:
         raise click.UsageError(f"--since: {error}") from None
     place = existing_sessions_place(directory)
-    longest_s: list[float] = []
-    found = list(_hits(place, expression, cars, for_s or 0.0, since_ns, longest_s))
+    answers = list(_answers(place, expression, cars, for_s or 0.0, since_ns))
+    found = [(path, hit) for path, answer in answers for hit in answer.hits]
     if as_json:
         for path, hit in found:
             click.echo(json.dumps(_to_dict(path, hit)))
@@ -96,23 +94,15 @@ def find(
     if mark and not _marked(found, expression):
         raise click.exceptions.Exit(1)
     if not found:
-        most_s = max(longest_s, default=-1.0)
+        most_s = max((answer.longest_s for _, answer in answers), default=-1.0)
         how_long = "" if most_s < 0 else f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)}"
         raise click.ClickException(f"{expression} was never true{how_long} in the sessions of {place}.")
 
 
-def _hits(
-    place: Path,
-    expression: "Expression",
-    cars: tuple[str, ...],
-    for_s: float,
-    since_ns: int,
-    longest_s: list[float],
-) -> Iterator[tuple[Path, "Hit"]]:
-    """Yield the hits of all sessions. What could not be searched is named on stderr.
-
-    longest_s: is filled with the longest time for which it held in each session.
-    """
+def _answers(
+    place: Path, expression: "Expression", cars: tuple[str, ...], for_s: float, since_ns: int
+) -> Iterator[tuple[Path, "Found"]]:
+    """Yield each session with what was found in it. What could not be searched is named on stderr."""
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.find import find_in
     from fleet.recording.tools.summary import of_session
@@ -133,9 +123,7 @@ def _hits(
         if is_searched := about.end_ns >= since_ns:
             searched = [*({*about.cars} & {*(cars or about.cars)})]
             found = find_in(session, expression, searched, for_s, since_ns)
-            longest_s.append(found.longest_s)
-            for hit in found.hits:
-                yield path, hit
+            yield path, found
             for words in found.left_out.words():
                 echo_safely(f"{path.name}: not searched: {words}", err=True)
         # A file that cannot be read may be younger than the rest.

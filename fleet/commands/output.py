@@ -25,7 +25,10 @@ from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
-_ROWS_AT_ONCE: Final = 1024
+ROWS_AT_ONCE: Final = 1024
+"""Rows of a table that are Python's objects at the same time."""
+MAX_CELL: Final = 60
+"""Maximum characters of a cell. Names and texts of a recording are anybody's."""
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -82,7 +85,7 @@ def aligned(rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """
     left = iter(rows)
     widths: Iterable[int] = repeat(0)
-    while block := list(islice(left, _ROWS_AT_ONCE)):
+    while block := list(islice(left, ROWS_AT_ONCE)):
         columns = zip(*block, strict=True)
         widths = [max(width, *map(_width, column)) for width, column in zip(widths, columns, strict=False)]
         for row in block:
@@ -110,7 +113,7 @@ def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """
     on_terminal = sys.stdout.isatty()
     left = chain((header,), rows)
-    while block := [["" if cell is None else cell for cell in row] for row in islice(left, _ROWS_AT_ONCE)]:
+    while block := [["" if cell is None else cell for cell in row] for row in islice(left, ROWS_AT_ONCE)]:
         lines = io.StringIO(newline="")
         csv.writer(lines, lineterminator="\n" if on_terminal else "\r\n").writerows(block)
         text = lines.getvalue()

@@ -6,20 +6,15 @@ import sys
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import click
 
 from fleet.commands.options import json_option
-from fleet.commands.output import aligned, echo_csv, echo_safely, progress_bar
+from fleet.commands.output import MAX_CELL, ROWS_AT_ONCE, aligned, echo_csv, echo_safely, progress_bar
 from fleet.commands.params import existing_sessions_place
 from fleet.recording.session_lookup import sessions_in
 from schemas.printable import printable
-
-MAX_CELL: Final = 60
-"""Maximum characters of a cell on a terminal. A pipe, --csv and --json have all of it."""
-ROWS_AT_ONCE: Final = 1024
-"""Rows that are Python's objects at the same time. Each block of a table has its own widths of columns."""
 
 
 @click.command(

@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from fleet.conditions import Expression, aliases_of, compared_in, fields_of
-from fleet.conditions.expression import KINDS
 from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
 from gateway import drivers
 from schemas import messages, topics
@@ -44,8 +43,7 @@ class _Field:
 
     def _measured(self, seen: Observation) -> Any:
         # The schema may be that of a recording: another version's, or somebody else's.
-        value = compared_in(seen.message)(self.member) if self.is_in(seen.message) else None
-        return value if KINDS.get(type(value)) is KINDS[self.kind] else None
+        return compared_in(seen.message)(self.member) if self.is_in(seen.message) else None
 
     def is_in(self, message: Any) -> bool:
         """Return True if the schema of a message has this field, with its type."""

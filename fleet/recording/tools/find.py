@@ -15,7 +15,7 @@ from fleet.policy.car_condition import CarCondition
 from fleet.policy.snapshot import is_in, topic_of
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo
-from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.car_timeline import message_time_ns
@@ -97,7 +97,7 @@ class ConditionRun:
 
 @dataclass(slots=True)
 class Found:
-    """What a question found in one session."""
+    """The hits of one session, and what was left out."""
 
     hits: list[Hit]
     """Sorted by time."""
@@ -146,8 +146,8 @@ def _messages(
         if key is None:
             continue
         cause = _why_left_out(info, decoder, message, key.topic, names.get(key.topic, ()))
-        if cause is not None or message is None:
-            if key.topic in names and cause is not None:
+        if cause is not None:
+            if key.topic in names:
                 left_out.add(info.channel.topic, cause)
             continue
         stream = info.channel.topic, getattr(message, "boot_id", "")
@@ -160,9 +160,7 @@ def _why_left_out(
 ) -> LeftOutCause | None:
     """Return why a message has no value of these names; None if it has one, or could have."""
     if message is None:
-        if info.channel.message_encoding != "protobuf":
-            return LeftOutCause.NOT_PROTOBUF
-        return LeftOutCause.BAD_SCHEMA if decoder.class_of(info) is None else LeftOutCause.UNREADABLE
+        return why_not_decoded(decoder, info)
     if message.DESCRIPTOR.full_name != TOPICS[topic].message:
         return LeftOutCause.OTHER_TYPE
     return None if not names or any(is_in(name, message) for name in names) else LeftOutCause.OTHER_FIELD

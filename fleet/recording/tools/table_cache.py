@@ -1,7 +1,7 @@
 """Keeps the tables of a session as Parquet beside it, for questions to many sessions.
 
 The tables of one state of a session are in the directory `.tables-<digest>`. The digest is of its files, their sizes
-and times, of what is said to be in them, and of the columns of our tables. So a session that grew has another
+and times, of their description, and of the columns of our tables. So a session that grew has another
 directory, and the old one goes. A directory has its name only when it is whole: two questions at once make it twice,
 and one of the two is kept. Whoever deletes it loses nothing but time. A table whose columns are not those of this
 version is named `.foreign.parquet`.

@@ -68,7 +68,7 @@ class Backfill:
         now = time.monotonic()
         with self._lock:
             for key, age_s in keys.items():
-                self._gaps[key] = min(now - age_s, self._gaps.get(key, now))
+                self._gaps[key] = min(now - age_s - GAP_MARGIN_S, self._gaps.get(key, now))
 
     def take_answers(self) -> list[zenoh.Sample]:
         """Return the answers since the last call. Some may be recorded already."""
@@ -85,7 +85,7 @@ class Backfill:
             with self._lock:
                 gaps, self._gaps = self._gaps, {}
             if gaps:
-                self._plan(QUERY_AFTER_GAP_S, min([polls[0], *gaps.values()]) - GAP_MARGIN_S, gaps)
+                self._plan(QUERY_AFTER_GAP_S, min([polls[0], *gaps.values()]), gaps)
             if connected and connected != hubs:
                 self._plan(QUERY_AFTER_RECONNECT_S, connected_since, None)
             hubs = connected
@@ -100,7 +100,7 @@ class Backfill:
         with self._lock:
             gaps = self._gaps
         if gaps or self._due:
-            self._plan((), min([polls[0], *gaps.values()]) - GAP_MARGIN_S, gaps or None)
+            self._plan((), min([polls[0], *gaps.values()]), gaps or None)
             self._query()
 
     def _plan(self, after: Sequence[float], since: float, keys: Collection[str] | None) -> None:

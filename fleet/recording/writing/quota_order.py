@@ -104,8 +104,9 @@ def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:
         if not session.segments and taking.freed < over:  # its recorder was killed before the first
             taking.removed.append(session.name)
             taking.freed += session.table_bytes + session.other_bytes
-    rest = iter(pinned)
-    while taking.freed < over and too_many > 0 and (segment := next(rest, None)) is not None:
+    for segment in pinned:
+        if taking.freed >= over or too_many <= 0:
+            break
         take(segment)
         too_many -= segment.bytes
     for segment in segments:

@@ -18,7 +18,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
 from fleet import Catalog
-from fleet.commands.query import MAX_CELL
+from fleet.commands.output import MAX_CELL
 from fleet.recording.catalog import BadQuery, QueryFailed, view_name
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession
