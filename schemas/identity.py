@@ -80,6 +80,12 @@ def parse(identity: str) -> tuple[IdentityRole, str] | None:
     return IdentityRole(role), name
 
 
+def role_of(identity: str) -> IdentityRole | None:
+    """Return the role of an identity; None if it is none."""
+    known = parse(identity)
+    return None if known is None else known[0]
+
+
 def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
     """Return True if an identity may send this command in the name of a sender of this kind.
 

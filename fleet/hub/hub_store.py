@@ -229,7 +229,7 @@ class HubStore:
         settings = {
             LISTEN: chosen,
             ACCESS_CONTROL: access_control(sorted(allowed)),
-            OF_SITES: access_control(sorted(allowed), first_hub=HUB),
+            OF_SITES: access_control(sorted(allowed), of_site=True),
         }
         made = json.dumps(settings, indent=1).encode()
         if not path.exists() or path.read_bytes() != made:

@@ -22,7 +22,7 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
 from schemas.bus import BusError
 from schemas.bus.credentials import CA_FILE, HUB, OF_SITES
-from schemas.identity import IdentityRole, parse
+from schemas.identity import IdentityRole, role_of
 from schemas.printable import printable
 
 JOIN_PORT: Final = 7448
@@ -106,7 +106,7 @@ class Invitation:
 
     def _take(self, guess: str, request: bytes, addresses: list[str], source: str) -> tuple[int, dict[str, Any]]:
         """Return the answer to a request to join: HTTP status and fields. addresses: of the computer that asks."""
-        is_site = parse(self._identity) is not None and self._identity.startswith(f"{IdentityRole.SITE}.")
+        is_site = role_of(self._identity) is IdentityRole.SITE
         with self._lock:
             if self._over.is_set():
                 return 410, {"error": "this code is used or over: `fleet hub invite` makes another one"}
@@ -200,7 +200,7 @@ def join(
     found = _ask(where, known, "POST", json.dumps(asked).encode())
     try:
         certificate = str(found["certificate"]).encode()
-        if parse(str(found["identity"])) is None:  # it becomes the name of a file
+        if role_of(str(found["identity"])) is None:  # it becomes the name of a file
             raise NotJoined(f"{where} gave no identity: {printable(str(found['identity']))}")
         if authority.expires(certificate).timestamp() <= clock():
             raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")

@@ -1,7 +1,6 @@
 """Makes this computer the hub, lets it join another one's, and ends that."""
 
 import getpass
-import json
 import os
 import re
 import shutil
@@ -15,8 +14,8 @@ from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
 from schemas.bus import Credentials, is_secure
-from schemas.bus.credentials import ACCESS_CONTROL, CA_FILE, CONNECT, HUB, HUB_FILE, LISTEN, ME_FILE
-from schemas.identity import Service
+from schemas.bus.credentials import CA_FILE, HUB, ME_FILE
+from schemas.identity import IdentityRole, Service, role_of
 from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 
@@ -84,25 +83,22 @@ def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) 
     endpoint = f"tls/{at}:{site_port or joined.port}"
     if is_hub_here(endpoint):
         raise NotJoined(f"this computer is the hub at {endpoint}: its user is {Credentials.of(endpoint).me}")
-    directory = Credentials.of(endpoint).directory
+    credentials = Credentials.of(endpoint)
+    directory = credentials.directory
     directory.mkdir(parents=True, exist_ok=True)
     os.chmod(directory, 0o700)  # noqa: PTH101 - it has a key
     name = HUB if joined.rules else joined.identity
     files = {CA_FILE: joined.ca, f"{name}.key": joined.key, f"{name}.pem": joined.certificate}
-    if joined.rules:
-        settings = {LISTEN: [everywhere(endpoint)], CONNECT: [first], ACCESS_CONTROL: dict(joined.rules)}
-        files[HUB_FILE] = json.dumps(settings, indent=1).encode()
-    elif _is_person(joined.identity) or not _is_person(Credentials.of(endpoint).me):
+    if not joined.rules and (
+        role_of(joined.identity) is IdentityRole.PERSON or role_of(credentials.me) is not IdentityRole.PERSON
+    ):
         files[ME_FILE] = joined.identity.encode()
     for name, data in files.items():
         write_atomically(directory / name, data, sync=True, private=True)
+    if joined.rules:
+        credentials.store_site([everywhere(endpoint)], [first], joined.rules)
     use(endpoint)
     return endpoint
-
-
-def _is_person(name: str) -> bool:
-    known = identity.parse(name)
-    return known is not None and known[0] is identity.IdentityRole.PERSON
 
 
 def leave() -> tuple[str, Path | None]:

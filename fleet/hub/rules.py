@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from schemas import keys
 from schemas.bus.credentials import HUB
-from schemas.identity import IdentityRole, Service, parse, service
+from schemas.identity import IdentityRole, Service, parse, role_of, service
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 """Messages that ask for something."""
@@ -49,11 +49,11 @@ _OWN_SERVICE: Final = {
 }
 
 
-def access_control(names: Iterable[tuple[str, str]], *, first_hub: str = "") -> dict[str, Any]:
+def access_control(names: Iterable[tuple[str, str]], *, of_site: bool = False) -> dict[str, Any]:
     """Return the rules for identities, each with the common name of its certificate.
 
-    first_hub: for the hub of another site, the common name of the hub to which it links. A hub passes on what it has
-    checked by the same rules, so all of it is allowed to another hub.
+    of_site: for the hub of another site, which links to the first one. A hub passes on what it has checked by the same
+    rules, so all of it is allowed to another hub.
     """
     rules = [
         _rule("passes on", "ingress", _READS + _TELLS, (*_PUBLIC, *_COMMANDS, keys.HUB_RULES)),
@@ -64,8 +64,8 @@ def access_control(names: Iterable[tuple[str, str]], *, first_hub: str = "") -> 
     ]
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for identity, common_name in (*names, *([(HUB, first_hub)] if first_hub else ())):
-        if identity == HUB or ((known := parse(identity)) and known[0] is IdentityRole.SITE):
+    for identity, common_name in (*names, *([(HUB, HUB)] if of_site else ())):
+        if identity == HUB or role_of(identity) is IdentityRole.SITE:
             subjects.append({"id": identity, "cert_common_names": [common_name]})
             policies.append({"subjects": [identity], "rules": ["passes on", "gets"]})
             continue

@@ -6,11 +6,13 @@ identity of its sender in its key, so a gateway knows who sent it.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
+from schemas.atomic_file import write_atomically
 from schemas.bus.errors import BusError
 from schemas.identity import AS_THE_USER, IdentityRole
 from schemas.state_dir import directory_of
@@ -142,6 +144,11 @@ class Credentials:
             return list(self.hub_settings()[CONNECT])
         except NoCredentials:
             return []
+
+    def store_site(self, listens: list[str], first_hubs: list[str], rules: Mapping[str, Any]) -> None:
+        """Write the file of the hub of another site: where it listens and links to, and its rules. Raises OSError."""
+        made = {LISTEN: listens, CONNECT: first_hubs, ACCESS_CONTROL: dict(rules)}
+        write_atomically(self.directory / HUB_FILE, json.dumps(made, indent=1).encode(), sync=True, private=True)
 
     def hub_settings(self) -> dict[str, Any]:
         """Return what the hub's file has. Raises NoCredentials."""

@@ -17,7 +17,7 @@ import zenoh
 from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
-from schemas.bus.credentials import ACCESS_CONTROL, CONNECT, HUB, HUB_FILE, LISTEN, OF_SITES
+from schemas.bus.credentials import HUB, HUB_FILE, OF_SITES
 from schemas.identity import IdentityRole
 from schemas.process import signals
 
@@ -78,17 +78,14 @@ def _take_rules(endpoint: str, session: zenoh.Session) -> None:
     """Ask the first hub for its rules, if this is that of another site, and store them. Cut off, it keeps the last."""
     if not is_secure(endpoint) or not (credentials := Credentials.of(endpoint)).first_hubs:
         return
-    settings = credentials.hub_settings()
     for reply in session.get(keys.HUB_RULES, timeout=RULES_TIMEOUT_S):
         if reply.ok is None:
             continue
         with contextlib.suppress(ValueError):
             rules = json.loads(reply.ok.payload.to_bytes())
-            if isinstance(rules, dict) and rules and rules != settings[ACCESS_CONTROL]:
-                path, own = credentials.directory / HUB_FILE, (LISTEN, CONNECT)
-                made = {**{name: settings[name] for name in own}, ACCESS_CONTROL: rules}
+            if isinstance(rules, dict) and rules and rules != credentials.access_control:
                 with contextlib.suppress(OSError):  # asked again
-                    write_atomically(path, json.dumps(made, indent=1).encode(), private=True)
+                    credentials.store_site(credentials.listens, credentials.first_hubs, rules)
 
 
 def _rules_changed_at(endpoint: str) -> tuple[int, ...]:
