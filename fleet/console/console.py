@@ -69,7 +69,7 @@ _MAX_STOP_IDS: Final = 256
 GUEST_MESSAGES: Final = frozenset(
     {"echo", "ping", Verb.STOP, "plot", "lanes", "lanes_end", "map", "map_end", "inspect", "inspect_end"}
 )
-"""What a page of a guest may send, beside stops of some cars: it watches."""
+"""Messages that a page of a guest may send, beside stops of some cars: it watches."""
 
 OnOutcomes = Callable[[list[dict[str, Any]]], object]
 _BUS_LOST: Final = "The console has lost the bus. Press again when it is back."
@@ -375,7 +375,7 @@ class Console:
             raise
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
-        # What another guest has stopped, this one has not.
+        # All guests share a sender: the stop of another guest is not one of this page.
         names = {"sender": None if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)

@@ -1,14 +1,12 @@
 // The board: what a whole room reads from the wall. Who leads lets a class join here, and gives each device a person and a car.
 
-import { ask, command, isRefused, store, who } from "./console.js";
+import { command, isRefused, store, who } from "./console.js";
 import { troublesOf } from "./fleet-page.js";
+import { post, useCode, useLan } from "./people-page.js";
 import { arrows, modes, t } from "./texts.js";
-import { html, Results, useEffect, useState } from "./ui.js";
+import { html, Results, useState } from "./ui.js";
 
-const READ_MS = 2000;
 const LESSON_MINUTES = [10, 45, 90];
-
-const post = (message) => ask("/people", JSON.stringify(message));
 
 // Who has a car, and how: a drive that runs, a loan, a lease.
 function holderOf(car) {
@@ -30,42 +28,15 @@ function Tile({ car }) {
   </li>`;
 }
 
-function useLan() {
-  const [found, setFound] = useState(null);
-  const read = async () => {
-    const answer = await ask("/people");
-    setFound("may_pair" in answer ? answer : null);
-  };
-  useEffect(() => {
-    read();
-    const timer = setInterval(read, READ_MS);
-    return () => clearInterval(timer);
-  }, []);
-  return [found, read];
-}
-
 function ClassCode() {
-  const [answer, setAnswer] = useState(null);
-  const [endsAt, setEndsAt] = useState(0);
-  const [now, setNow] = useState(performance.now());
-  useEffect(() => {
-    const timer = setInterval(() => setNow(performance.now()), 1000);
-    return () => clearInterval(timer);
-  }, []);
-  const open = async () => {
-    const found = await post({ t: "open_class" });
-    setAnswer(found);
-    setNow(performance.now());
-    setEndsAt(performance.now() + 1000 * (found.lifetime_s ?? 0));
-  };
+  const { answer, left_s, make, end, setAnswer } = useCode({ t: "open_class" });
   const close = async () => {
     const found = await post({ t: "close_class" });
-    if (found.ok) setEndsAt(0);
+    if (found.ok) end();
     else setAnswer(found);
   };
-  const left_s = Math.ceil((endsAt - now) / 1000);
   if (answer === null || !answer.ok || left_s <= 0) {
-    return html`<div><button class="main" data-class="open" onClick=${open}>${t.classOpen}</button>
+    return html`<div><button class="main" data-class="open" onClick=${make}>${t.classOpen}</button>
       <p role="status">${answer === null ? "" : answer.ok ? t.classOver : answer.words}</p></div>`;
   }
   return html`<div class="class-code">

@@ -7,11 +7,25 @@ import { html, useEffect, useState } from "./ui.js";
 const READ_MS = 2000;
 const RANKS = ["person", "lead"];
 
-const post = (message) => ask("/people", JSON.stringify(message));
+export const post = (message) => ask("/people", JSON.stringify(message));
 
-function NewCode({ address, people }) {
-  const [name, setName] = useState("");
-  const [rank, setRank] = useState(RANKS[0]);
+// What the console tells of the devices on the network, and the function that reads it again. null: nothing yet.
+export function useLan() {
+  const [found, setFound] = useState(null);
+  const read = async () => {
+    const answer = await ask("/people");
+    setFound("may_pair" in answer ? answer : null);
+  };
+  useEffect(() => {
+    read();
+    const timer = setInterval(read, READ_MS);
+    return () => clearInterval(timer);
+  }, []);
+  return [found, read];
+}
+
+// A code that ends: the last answer, the seconds that it is good for, and the functions that make one, end it, and show another answer.
+export function useCode(message) {
   const [answer, setAnswer] = useState(null);
   const [endsAt, setEndsAt] = useState(0);
   const [now, setNow] = useState(performance.now());
@@ -19,16 +33,26 @@ function NewCode({ address, people }) {
     const timer = setInterval(() => setNow(performance.now()), 1000);
     return () => clearInterval(timer);
   }, []);
-  const ask = async (event) => {
-    event.preventDefault();
-    const found = await post({ t: "pair", name, rank });
+  const make = async () => {
+    const found = await post(message);
     setAnswer(found);
+    setNow(performance.now());
     setEndsAt(performance.now() + 1000 * (found.lifetime_s ?? 0));
   };
-  const left_s = Math.ceil((endsAt - now) / 1000);
+  return { answer, left_s: Math.ceil((endsAt - now) / 1000), make, end: () => setEndsAt(0), setAnswer };
+}
+
+function NewCode({ address, people }) {
+  const [name, setName] = useState("");
+  const [rank, setRank] = useState(RANKS[0]);
+  const { answer, left_s, make } = useCode({ t: "pair", name, rank });
+  const onSubmit = (event) => {
+    event.preventDefault();
+    make();
+  };
   return html`<section>
     <h2>${t.pairTitle}</h2>
-    <form class="controls" onSubmit=${ask}>
+    <form class="controls" onSubmit=${onSubmit}>
       <label>${t.pairName} <input name="person" list="people" maxlength="32" required value=${name} onInput=${(event) => setName(event.target.value)} /></label>
       <datalist id="people">${people.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
       <label>${t.pairRank} <select name="rank" value=${rank} onChange=${(event) => setRank(event.target.value)}>
@@ -60,16 +84,7 @@ function Device({ device, onRevoke }) {
 }
 
 export function PeoplePage() {
-  const [found, setFound] = useState(null);
-  const read = async () => {
-    const answer = await ask("/people");
-    setFound("may_pair" in answer ? answer : null);
-  };
-  useEffect(() => {
-    read();
-    const timer = setInterval(read, READ_MS);
-    return () => clearInterval(timer);
-  }, []);
+  const [found, read] = useLan();
   if (found === null) return html`<h1>${t.people}</h1>`;
   if (!found.may_pair || found.lan === null) {
     return html`<h1>${t.people}</h1><p>${found.may_pair ? t.notOnNetwork : t.mayNotPair}</p>`;
