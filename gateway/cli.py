@@ -18,6 +18,8 @@ from schemas.suggestion import did_you_mean
 from schemas.words import BatteryAction, BatteryLevel
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from _typeshed import SupportsWrite
 
     from schemas.bus import Bus
@@ -218,11 +220,9 @@ def _run(arguments: argparse.Namespace) -> int:
             # The car is on the bus now. The following imports take as long again.
             import asyncio
             import logging
-            from pathlib import Path
 
             from gateway.car import Settings, serve
             from gateway.control.battery import BatteryPolicy
-            from schemas.state_dir import directory_of
 
             logging.basicConfig(
                 format="%(asctime)s %(levelname)s %(message)s",
@@ -230,13 +230,12 @@ def _run(arguments: argparse.Namespace) -> int:
                 level=logging.INFO,
                 stream=sys.stderr,
             )
-            state_dir = directory_of(opened.endpoint, Path(arguments.state_dir) if arguments.state_dir else None)
             settings = Settings(
                 car,
                 url,
                 platform,
                 fleet,
-                state_dir,
+                _state_dir(arguments, opened.endpoint),
                 arguments.retry,
                 battery=BatteryPolicy(
                     BatteryAction(arguments.on_battery_low),
@@ -270,14 +269,18 @@ def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: s
     except BadEndpoint:
         raise
     except BusError as error:
-        from pathlib import Path
-
         from gateway.stop_alone import stop_alone
-        from schemas.state_dir import directory_of
 
-        where = resolve_endpoint(arguments.connect)
-        state_dir = directory_of(where, Path(arguments.state_dir) if arguments.state_dir else None)
+        state_dir = _state_dir(arguments, resolve_endpoint(arguments.connect))
         raise BusError(f"{error} {stop_alone(car, url, platform, fleet, state_dir)}") from error
+
+
+def _state_dir(arguments: argparse.Namespace, endpoint: str) -> "Path":
+    from pathlib import Path
+
+    from schemas.state_dir import directory_of
+
+    return directory_of(endpoint, Path(arguments.state_dir) if arguments.state_dir else None)
 
 
 def _failed(message: str, code: int) -> int:
