@@ -13,7 +13,7 @@ from enum import StrEnum
 from math import inf
 from typing import Any, Final, Self
 
-from schemas.keys import NAME_RULE, is_name, person_of
+from schemas.keys import NAME_RULE, is_name, name_of, person_of
 from schemas.messages import stamp_ns
 from schemas.words import Rank, Reason, Scope
 
@@ -44,6 +44,10 @@ class Sender:
     def person(self) -> str:
         """Return the person: `group_a` of `group_a@host-4711`."""
         return person_of(self.name)
+
+    def told_beside(self, other: "Sender") -> str:
+        """Return the person, or the whole name beside another program of the same person."""
+        return self.name if self.person == other.person else name_of(self.name)
 
 
 class PersonRole(StrEnum):

@@ -1,5 +1,6 @@
 """The outcome of one command on one car, from its answer and its events. Pure: time is an argument."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -84,7 +85,8 @@ class Outcome:
     def __str__(self) -> str:
         text = self.effect or self.words or self.phase
         if self.ok and self.basis == Basis.SENT and self.worst_case_s is not None:
-            text += f"; motors off within {self.worst_case_s:.1f} s if the frames arrived"
+            at_most_s = math.ceil(round(self.worst_case_s * 10, 6)) / 10  # rounded down, it would be no maximum
+            text += f"; motors off within {at_most_s:.1f} s if the frames arrived"
         if self.next_step:
             text += f". {self.next_step}"
         return with_code(f"{self.car}: {text}", self.code)
@@ -311,7 +313,8 @@ class Progress:
                 took_s=took_s,
             )
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
-            after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
+            is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop that no reading shows is in force, too
+            after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if is_in_force else ""
             # Of what was done, the gateway says only what is odd about it, often nothing. The effect has that, too.
             told = (effect or words) if ok else (words or effect)
             told = told or f"{self._verb or 'command'} {phase}"

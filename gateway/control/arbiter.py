@@ -23,6 +23,7 @@ from gateway.control.commands import (
     Unpause,
 )
 from schemas.authority import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
+from schemas.keys import name_of
 from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Rank, Reason
 
@@ -228,7 +229,7 @@ def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right
     deed = "" if right is None else _DEEDS.get(right, "").format(car=car)
     mark = denial.mark
     why = f': "{mark.why}"' if isinstance(mark, Estop | FleetPause) and mark.why else ""
-    by = mark.by if mark is not None else ""
+    by = name_of(mark.by) if mark is not None else ""
     match denial.bar:
         case Bar.NOT_A_LEAD:
             return f"{person} may not {deed}: only a lead may ({', '.join(people.leads)})."
@@ -262,7 +263,7 @@ def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right
             return f"{car} is on hold: {by} stopped it, and {_only_leads(context)}"
         case Bar.LEASED if isinstance(mark, LeaseState):
             holder, left_s = mark.holder, mark.until - context.now
-            words = f"{car} is driven by {holder.name} ({holder.kind}) for another {left_s:.1f} s."
+            words = f"{car} is driven by {holder.told_beside(sender)} ({holder.kind}) for another {left_s:.1f} s."
             if sender.kind is holder.kind and sender.kind in (Rank.PERSON, Rank.LEAD):
                 return f"{words} Wait, or take the car over (--take)."
             return f"{words} Wait until the car is free."

@@ -35,6 +35,7 @@ from gateway.control.events import Record
 from gateway.control.safety import LEASE_S, PersistedSafety, Safety
 from gateway.control.senders import Senders
 from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
+from schemas.keys import name_of
 from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
@@ -243,7 +244,7 @@ class Controller(Generic[D_co]):
             return
         why = f": {latched[0].why}" if latched[0].why else ""
         words = (
-            f"{self.car} is emergency-stopped with the whole fleet by {latched[0].by}{why} "
+            f"{self.car} is emergency-stopped with the whole fleet by {name_of(latched[0].by)}{why} "
             f"(e-stop {latched[0].id}, seen from {source})"
         )
         self._log.log(Level.ERROR, "estop_joined", words, now)
@@ -258,7 +259,7 @@ class Controller(Generic[D_co]):
             )
         if joined:
             why = f": {joined[0].why}" if joined[0].why else ""
-            words = f"{self.car} is paused with the whole fleet by {joined[0].by}{why} (seen from {source})"
+            words = f"{self.car} is paused with the whole fleet by {name_of(joined[0].by)}{why} (seen from {source})"
             self._log.log(Level.WARNING, "paused", words, now)
             self._halt(words, now)
 
@@ -280,7 +281,7 @@ class Controller(Generic[D_co]):
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Rank.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
-        self.driver.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
+        self.driver.halt(f"{command.verb} by {name_of(sender.name)}", now, by=sender.name)
         if not self.driver.model.link_open or self.driver.shutting_down:
             words = self._not_stopped("emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped")
             words = f"{words} ({command.note})" if command.note else words
@@ -324,7 +325,7 @@ class Controller(Generic[D_co]):
             parts.append("e-stop released" if count == 1 else f"{count} e-stops released")
         hold = safety.hold
         if not resume.ids and authority.may(sender, Right.RESUME) is None:
-            parts.append(f"resumed: the hold by {hold.by} has ended" if hold else "resumed: was not on hold")
+            parts.append(f"resumed: the hold by {name_of(hold.by)} has ended" if hold else "resumed: was not on hold")
             self._end_hold(sender, now)
         if safety.estops:
             if not resume.ids and not ended:
@@ -333,9 +334,9 @@ class Controller(Generic[D_co]):
         elif safety.hold is not None:
             ends = self.people.may_end(sender, safety.hold.by, safety.hold.rank)
             fix = f": `fleet resume {self.car}`" if ends else " (a lead)"
-            parts.append(f"still on hold by {safety.hold.by}{fix}")
+            parts.append(f"still on hold by {name_of(safety.hold.by)}{fix}")
         if safety.pauses and not resume.ids:
-            parts.append(f"still paused by {binding_pause(safety.pauses).by}: `fleet unpause`")
+            parts.append(f"still paused by {name_of(binding_pause(safety.pauses).by)}: `fleet unpause`")
         stays = Reason.ESTOPPED if safety.estops else Reason.HELD if safety.hold else None
         return self._done(pending, "; ".join(parts), now, None if resume.ids else stays)
 
@@ -344,7 +345,7 @@ class Controller(Generic[D_co]):
     def _latch_pause(self, command: Command, why: str, now: float) -> str:
         pause = FleetPause(command.id, command.sender.name, why, command.asked_ns, command.sender.kind)
         if self.safety.pause(pause):
-            words = f"{self.car} is paused with the whole fleet by {pause.by}{f': {why}' if why else ''}"
+            words = f"{self.car} is paused with the whole fleet by {name_of(pause.by)}{f': {why}' if why else ''}"
             self._log.log(Level.WARNING, "paused", words, now)
         if pause.id in self.safety.ended_pauses:
             return "this pause has ended already, and the car only stops"
@@ -371,7 +372,7 @@ class Controller(Generic[D_co]):
         loan = self.safety.loan_at(now)
         if loan is None:
             return self._done(pending, "was not lent", now)
-        words = f"the loan to {loan.to} was ended by {pending.command.sender.name}"
+        words = f"the loan to {loan.to} was ended by {name_of(pending.command.sender.name)}"
         self._end_loan(words, now)
         return self._done(pending, f"the loan to {loan.to} has ended", now)
 
@@ -399,7 +400,9 @@ class Controller(Generic[D_co]):
         estops = self.safety.estops
         several = len(estops) > 1
         each = [
-            f"by {estop.by}" + (f' ("{estop.why}")' if estop.why else "") + (f" [{estop.id}]" if several else "")
+            f"by {name_of(estop.by)}"
+            + (f' ("{estop.why}")' if estop.why else "")
+            + (f" [{estop.id}]" if several else "")
             for estop in estops
         ]
         words, them = f"still emergency-stopped {', '.join(each)}", "them" if several else "it"
@@ -421,7 +424,8 @@ class Controller(Generic[D_co]):
         self.safety.grant(sender, now + lasts_s)
         if before is None or before.holder == sender:
             return
-        words = f"taken over by {sender.name} ({sender.kind}) from {before.holder.name} ({before.holder.kind})"
+        by, of = sender.told_beside(before.holder), before.holder.told_beside(sender)
+        words = f"taken over by {by} ({sender.kind}) from {of} ({before.holder.kind})"
         self._log.log(Level.INFO, "lease_taken", f"{self.car}: {words}", now)
         if (
             self._queue.held is not None
@@ -432,12 +436,13 @@ class Controller(Generic[D_co]):
 
     def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
         sender = pending.command.sender
+        name = name_of(sender.name)
         if not release:
-            return self._done(pending, f"reserved for {sender.name} for {LEASE_S:g} s, and while it drives", now)
+            return self._done(pending, f"reserved for {name} for {LEASE_S:g} s, and while it drives", now)
         if not self.safety.release(sender):
-            return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
+            return self._done(pending, f"{name} had no lease of {self.car}", now)
         if self._queue.held is not None and self._queue.held.sender == sender:
-            self.driver.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
+            self.driver.release(Phase.COMPLETE, None, f"released by {name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
     def _busy_s(self, now: float) -> float:
@@ -473,7 +478,7 @@ class Controller(Generic[D_co]):
         sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._prolong_drive(held, pending, drive.duration_s, now)
-        words = f"{drive.motion} by {sender.name}"
+        words = f"{drive.motion} by {name_of(sender.name)}"
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.held = HeldMotion(drive.motion, pending, *self._times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
@@ -523,7 +528,7 @@ class Controller(Generic[D_co]):
         return self._queued(pending, now, self._wait(pending, now))
 
     def _release(self, pending: Pending, now: float) -> Answer:
-        sender = pending.command.sender.name
+        sender = name_of(pending.command.sender.name)
         self.driver.end_drive(f"released by {sender}", now)
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
         if not self.driver.is_stopping and self.driver.model.at_rest:
@@ -535,13 +540,14 @@ class Controller(Generic[D_co]):
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
-        self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
+        by = name_of(pending.command.sender.name)
+        self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {by}", now)
         answer = self._queued(pending, now)
         self.driver.stop(FrameOrigin.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
-        words = f"mode {mode} by {pending.command.sender.name}"
+        words = f"mode {mode} by {name_of(pending.command.sender.name)}"
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         model = self.driver.model

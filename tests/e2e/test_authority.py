@@ -138,7 +138,7 @@ def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
         assert teacher.lend(["blue"], "bob", 600.0)[0].ok
         refused = bob.car("blue").drive("forward")
         assert refused.reason == "paused"
-        assert "paused with the whole fleet (teacher@" in refused.words
+        assert "paused with the whole fleet (teacher:" in refused.words
         assert teacher.car("red").drive("forward", 0.2).ok
         assert [outcome.effect for outcome in teacher.unpause()] == ["the pause has ended"] * 2
         assert ann.car("blue").drive("forward").reason == "lent"

@@ -66,7 +66,7 @@ def test_a_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, 
         # On a busy machine the report that shows the stop of one of the cars may come too late.
         assert estopped.returncode == 0 or "NOT CONFIRMED" in estopped.stderr
         assert safety("fleet").estops[0].why == safety("two").estops[0].why == "smoke"
-        for command in proposed(estopped.stdout):
+        for command in proposed(estopped.stdout + estopped.stderr):
             assert run(*command).returncode == 0, command
         wait_for(lambda: not safety("fleet").estops and not safety("two").estops, "both are released")
 

@@ -177,6 +177,12 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
             ("complete", "", "", "shown"),
             "emergency-stopped (1.0 s). One release frees all cars: `fleet resume --estops`",
         ),
+        (
+            "estop",
+            "",
+            ("failed", "not_shown", "is silent", ""),
+            "stop sent, NOT CONFIRMED: red is silent. Release it with `fleet resume red --estops` [not_shown]",
+        ),
         ("resume", "", ("sent", "estopped", "still e-stopped", ""), "still e-stopped [estopped]"),
         ("release", "", ("sent", "", "red is at rest", ""), "nothing to stop (red is at rest)"),
         ("drive", "1.0 s", ("sent", "", "sent for 1.0 s", "sent"), "sent for 1.0 s"),

@@ -253,11 +253,11 @@ def test_a_pause_stops_as_a_stop_does_and_only_a_lead_drives(desk: Workbench) ->
         refused = desk.ask(SetMode(Mode.TRACKING), sender)
         assert refused.reason is Reason.PAUSED
         assert refused.words == (
-            'red is paused with the whole fleet (teacher@lab: "listen"). A lead ends it with `fleet unpause`.'
+            'red is paused with the whole fleet (teacher: "listen"). A lead ends it with `fleet unpause`.'
         )
     assert desk.ask(Unpause(), ANN).words == "ann may not end the pause: only a lead may (teacher)."
     assert desk.ask(Resume(all=True), ANN).words == (
-        "resumed: was not on hold; still paused by teacher@lab: `fleet unpause`"
+        "resumed: was not on hold; still paused by teacher: `fleet unpause`"
     )
     assert desk.ask(FORWARD, TEACHER).status is Phase.QUEUED
     desk.ask(Stop(), ANN)
@@ -303,7 +303,7 @@ def test_a_pause_that_another_gateway_shows_stops_this_car_and_an_ended_one_stay
     desk.control.merge_pauses([pause], [], "blue", desk.now)
     desk.run(5.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
-    assert "paused with the whole fleet by teacher@lab: listen (seen from blue)" in desk.logs[0].words
+    assert "paused with the whole fleet by teacher: listen (seen from blue)" in desk.logs[0].words
     desk.control.merge_pauses([pause], ["p1"], "green", desk.now)
     assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
     desk.control.merge_pauses([pause], [], "blue", desk.now)
@@ -320,7 +320,7 @@ def test_what_a_lead_stops_only_a_lead_ends(desk: Workbench) -> None:
     desk.ask(Stop(), ANN)
     assert desk.control.safety.hold is not None
     assert desk.control.safety.hold.by == "teacher@lab"
-    words = "red is on hold: teacher@lab stopped it, and only a lead ends what a lead began (teacher)."
+    words = "red is on hold: teacher stopped it, and only a lead ends what a lead began (teacher)."
     for what in (FORWARD, Resume(), Resume(all=True), SetMode(Mode.MANUAL)):
         answer = desk.ask(what, ANN)
         assert (answer.reason, answer.words) == (Reason.HELD, words)
@@ -329,15 +329,15 @@ def test_what_a_lead_stops_only_a_lead_ends(desk: Workbench) -> None:
     answer = desk.ask(Resume(("e1",)), ANN)
     assert (answer.reason, answer.words) == (
         Reason.ESTOPPED,
-        'red stays emergency-stopped: teacher@lab did it: "wall", and only a lead ends what a lead began (teacher).',
+        'red stays emergency-stopped: teacher did it: "wall", and only a lead ends what a lead began (teacher).',
     )
     some = desk.ask(Resume(all=True), ANN)
     assert (some.status, some.reason, some.words) == (
         Phase.SENT,
         Reason.ESTOPPED,
-        'e-stop released; still emergency-stopped by teacher@lab ("wall"). ann cannot release it',
+        'e-stop released; still emergency-stopped by teacher ("wall"). ann cannot release it',
     )
-    assert desk.ask(Resume(all=True), TEACHER).words == "e-stop released; resumed: the hold by teacher@lab has ended"
+    assert desk.ask(Resume(all=True), TEACHER).words == "e-stop released; resumed: the hold by teacher has ended"
     desk.run(5.0)
     desk.ask(Stop(), TEACHER)
     desk.run(5.0)
@@ -377,7 +377,7 @@ def test_a_lent_car_is_the_borrowers_until_the_end_which_stops_it(desk: Workbenc
     assert desk.ask(Lend("cid", 60.0), TEACHER).words == "lent to cid for 60 s"
     desk.run(5.0)
     assert desk.frames == [RUN, *SHOWN_STOP], "lending stops who drives"
-    words = "red is lent to cid for another 55 s. teacher@lab ends that with `fleet lend red --end`."
+    words = "red is lent to cid for another 55 s. teacher ends that with `fleet lend red --end`."
     for sender in (ANN, PLAN, Sender("ann@lab", SCRIPT)):
         answer = desk.ask(FORWARD, sender)
         assert (answer.reason, answer.words) == (Reason.LENT, words)
