@@ -13,6 +13,7 @@ import click
 
 from fleet.client.claims import is_bad_rest
 from fleet.client.client import certified_sender
+from fleet.client.services import ask_recorder
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.fleets import client_in, the_fleet
 from fleet.commands.group import chosen_person, say
@@ -21,10 +22,10 @@ from fleet.commands.options import bus_options, json_option, not_running
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from schemas import keys, messages
-from schemas.bus import Bus, BusError, messages_of, resolve_endpoint
+from schemas.bus import Bus, BusError, Failure, messages_of, resolve_endpoint
 from schemas.process import signals, startup
 from schemas.suggestion import did_you_mean
-from schemas.words import Phase, RunState
+from schemas.words import Phase, RecorderVerb, RunState
 
 FLEET_DOWN_TIMEOUT_S: Final = 120.0
 """Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
@@ -49,6 +50,8 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
         found = ask_status(bus, fleet)
         if not found:
             raise not_running(fleet, connect)
+        records = not as_json and any(each.session and not each.unrecorded for each in found)
+        warning = _warning_of_recorder(bus, fleet) if records else ""
     for each in found:
         if as_json:
             click.echo(messages.to_json(each))
@@ -71,6 +74,14 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
             say(f"not ready: {name.lstrip('@')} ({why})")
         if each.unrecorded:
             say(f"not recorded: {each.unrecorded}")
+    if warning:
+        say(f"recorder: {warning}")
+
+
+def _warning_of_recorder(bus: Bus, fleet: str) -> str:
+    """Return what the recorder warns of, such as a quota that marked sessions exceed. Empty if there is none."""
+    found = ask_recorder(bus, fleet, RecorderVerb.STATUS)
+    return "" if found is None or isinstance(found, Failure) else str(found.warning)
 
 
 def _describe_process(process: Any) -> str:

@@ -41,6 +41,8 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
 
+    if tables and directory is None and sql is not None and Path(sql).is_dir():  # no question: the one argument is DIR
+        directory, sql = Path(sql), None
     if (sql is None) is not tables or (as_csv and as_json):
         raise click.UsageError("give one question, or --tables; and --csv or --json, not both")
     place = existing_sessions_place(directory)
@@ -70,6 +72,9 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     for name, left_out in catalog.left_out().items():
         for line in left_out.words():
             echo_safely(f"{name}: not in the tables: {line}", err=True)
+    for name, lines in catalog.nulled().items():
+        for line in lines:
+            echo_safely(f"{name}: null in the tables: {line}", err=True)
     if catalog.damage and not catalog.sessions:
         raise click.exceptions.Exit(1)
 

@@ -14,6 +14,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -85,6 +86,7 @@ class Catalog:
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
         self._views: set[str] = set()
+        self._casts: list[_Cast] = []
         try:
             scratch = tempfile.mkdtemp(prefix="zenoh-car-fleet-query-")
         except OSError as error:
@@ -103,7 +105,7 @@ class Catalog:
         self.unanswered.clear()
         self.sessions.clear()
         drop_orphans(self.directory)
-        for path in sorted(sessions_in(self.directory)):
+        for path in sorted(sessions_in(self.directory), key=str):  # paths themselves compare slowly
             if self._on_session is not None:
                 self._on_session(path)
             try:
@@ -123,6 +125,7 @@ class Catalog:
         self._database.execute("SET TimeZone = 'UTC'")
         self._database.execute(_PERSON_OF)
         self._views.clear()
+        self._casts.clear()
 
     def _define(self, words: str | None) -> None:
         """Define the views whose names are in a text, and those that they need. None: all views."""
@@ -191,6 +194,19 @@ class Catalog:
                         found.setdefault(cached.session.name, LeftOut()).add(key, cause, count)
         return found
 
+    def nulled(self) -> dict[str, list[str]]:
+        """Return by session the columns asked so far in which values are null: their type was another one, no number.
+
+        Each in words, with the number of values.
+        """
+        found: dict[str, list[str]] = {}
+        for cast in self._casts:
+            with suppress(self._duckdb.Error):  # deleted since it was asked
+                for session, count in self._database.execute(cast.count()).fetchall():
+                    words = f"{count} of {cast.topic} {cast.column}: not {cast.kind}"
+                    found.setdefault(session, []).append(printable_lines(words))
+        return found
+
     def close(self) -> None:
         """Free the memory."""
         self._database.close()
@@ -212,6 +228,11 @@ class Catalog:
         for group, files in groups.items():
             there = dict(group)
             chosen = [_column(column, kind, there.get(column)) for column, kind in ours.items()]
+            self._casts += [
+                _Cast(topic.name, column, kind, tuple(files))
+                for column, kind in ours.items()
+                if there.get(column, kind) != kind
+            ]
             chosen += [
                 f"CAST({_quoted(column)} AS VARCHAR) AS {_quoted(column)}" for column in there.keys() - ours.keys()
             ]
@@ -221,8 +242,7 @@ class Catalog:
                 f"FROM read_parquet([{listed}], filename=true)"
             )
         source = " UNION ALL BY NAME ".join(parts[1:] or parts)
-        # Several topics may share a message.
-        own = f"SELECT * FROM ({source}) WHERE key LIKE {_text('%/' + topic.name)}"  # noqa: S608 - quoted
+        own = f"SELECT * FROM ({source}) WHERE {_is_of(topic.name)}"  # noqa: S608 - quoted
         self._database.execute(f'CREATE VIEW "{name}" AS {own}')
 
     def _columns(self, source: str) -> dict[str, str]:
@@ -251,6 +271,31 @@ class Catalog:
 _FOLDERS: Final = r"([^/\\]+)[/\\][^/\\]+[/\\][^/\\]+$"
 # The session is the directory above that of its tables. That of a single file is hidden, beside it.
 _SESSION: Final = f"regexp_replace(regexp_extract(filename, '{_FOLDERS}', 1), '^\\.(.*)$', '\\1')"
+
+
+@dataclass(frozen=True, slots=True)
+class _Cast:
+    """A column that some files have with another type."""
+
+    topic: str
+    column: str
+    kind: str
+    """Its type in our tables."""
+    files: tuple[str, ...]
+
+    def count(self) -> str:
+        """Return the question how many values of each session are null in our type only."""
+        files, column = ", ".join(map(_text, self.files)), _quoted(self.column)
+        return (
+            f"SELECT {_SESSION}, count(*) FROM read_parquet([{files}], filename=true) "  # noqa: S608 - quoted
+            f"WHERE {_is_of(self.topic)} AND {column} IS NOT NULL AND TRY_CAST({column} AS {self.kind}) IS NULL "
+            "GROUP BY 1 ORDER BY 1"
+        )
+
+
+def _is_of(topic: str) -> str:
+    """Return the condition that a row is of a topic: several may share a message."""
+    return f"key LIKE {_text('%/' + topic)}"
 
 
 def view_name(topic: str) -> str:

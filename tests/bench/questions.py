@@ -14,6 +14,7 @@ import duckdb
 from mcap.writer import Writer
 
 from fleet import Catalog
+from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.table_cache import tables_of
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.bench.measured import Measured, Scale, in_turns
@@ -40,6 +41,7 @@ def _sessions(place: Path, count: int, rows: int, frames: int) -> None:
             shutil.copytree(place / f"s{number % DIFFERENT:04d}", session, copy_function=os.link)
             continue
         session.mkdir(parents=True)
+        SessionInfo("fleet", "2026-01-01T00:00:00Z", "bench", {}, closed=True).write(session)
         made = Made(session / "0001.mcap", Writer)
         drive_about(made, "red", number, 5)
         for row in range(rows):

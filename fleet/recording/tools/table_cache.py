@@ -5,6 +5,10 @@ and times, of their description, and of the columns of our tables. So a session 
 directory, and the old one goes. A directory has its name only when it is whole: two questions at once make it twice,
 and one of the two is kept. Whoever deletes it loses nothing but time. A table whose columns are not those of this
 version is named `.foreign.parquet`.
+
+To read the descriptions of a thousand sessions takes as long as a question. So a directory has a stamp, an empty file
+named by the sizes and times of all files and of the description. While it is right, the description is not read. After
+a mark it is not: the description is read, says nothing new of the messages, and the stamp is replaced.
 """
 
 import errno
@@ -20,12 +24,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Final, Self
 
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.session_dir import SEGMENTS, TABLES_PREFIX, SessionInfo, indexed_segments
+from fleet.recording.session_dir import (
+    INDEX_FILE,
+    SEGMENTS,
+    SESSION_FILE,
+    TABLES_PREFIX,
+    SessionInfo,
+    indexed_segments,
+)
 from fleet.recording.tools.export import export
 from fleet.recording.tools.summary import of_session
 from fleet.recording.tools.table_formats import ParquetSink
@@ -41,6 +53,8 @@ _OPEN: Final = "recording"
 """Name of the empty file that says that the session was being recorded. If it has not ended since, it was cut."""
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
+_STAMP: Final = "stamp-"
+"""Begin of the name of the empty file that says for which state of the session the digest was made."""
 _FORMAT: Final = "4"
 """Increase it if what is in a directory changes, so that all are made anew."""
 STALE_PART_S: Final = 600.0
@@ -69,6 +83,10 @@ class CachedTables:
         note = directory / _NOTE
         return cls(session, directory, note.read_text(encoding="utf-8") if _NOTE in names else "", names)
 
+    def with_words_of_now(self) -> Self:
+        """Return the tables of a session that was being recorded with what is to say of it now."""
+        return replace(self, words=self.words or _words(Session(self.session))) if _OPEN in self.names else self
+
     def files(self, message: str) -> Iterator[Path]:
         """Yield the tables of a message type. There are several if its fields changed within the session."""
         name = re.compile(rf"{re.escape(message)}(-\d+)?(\.foreign)?\.parquet")
@@ -82,6 +100,18 @@ class CachedTables:
                 found.add(key, LeftOutCause(cause), count)
         return found
 
+    def has(self, stamp: str) -> bool:
+        """Return True if the session was in this state when its description was last read."""
+        return f"{_STAMP}{stamp}" in self.names
+
+    def put(self, stamp: str) -> None:
+        """Note the state of the session for the next question, where the directory can be written."""
+        with suppress(OSError):
+            (self.directory / f"{_STAMP}{stamp}").touch()
+            for name in self.names:
+                if name.startswith(_STAMP):
+                    (self.directory / name).unlink(missing_ok=True)
+
     def is_foreign(self, file: Path) -> bool:
         """Return True if the columns of a table are not those of this version."""
         return file.name.endswith(_FOREIGN)
@@ -93,16 +123,22 @@ def tables_of(session: Path) -> CachedTables:
     Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere.
     """
     for _ in range(_MAX_TRIES):
-        for place in _places(session):
+        state = _State.of(session)
+        if (found := _stamped(session, state)) is not None:
+            return found
+        name = f"{TABLES_PREFIX}{state.digest(session)}"
+        places = [home / name for home in _homes(session)]
+        for place in places:
             with suppress(FileNotFoundError):
                 found = CachedTables.of(session, place)
-                return replace(found, words=found.words or _words(Session(session))) if _OPEN in found.names else found
+                found.put(state.stamp)
+                return found.with_words_of_now()
         if not session.exists():
             break
         errors: list[OSError] = []
-        for place in _places(session):
+        for place in places:
             try:
-                return _made(session, place)
+                return _made(session, place, state.stamp)
             except FileNotFoundError:  # the session is gone, or another question knows a newer state of it
                 break
             # Reading raises none: what cannot be read is damage. So the disk is full or broken, or the folder is
@@ -116,7 +152,21 @@ def tables_of(session: Path) -> CachedTables:
     raise NoSession(f"{session} is gone: it was deleted meanwhile.")
 
 
-def _made(session: Path, place: Path) -> CachedTables:
+def _stamped(session: Path, state: "_State") -> CachedTables | None:
+    """Return the tables whose stamp is that of this state, from the session or else from the temporary files."""
+    stamp = state.stamp
+    elsewhere = ((home, _names(home)) for home in _homes(session) if home != session)
+    for home, names in chain([(session, state.names)], elsewhere):
+        for name in names:
+            if name.startswith(TABLES_PREFIX) and not name.endswith(_PART):
+                with suppress(OSError):
+                    found = CachedTables.of(session, home / name)
+                    if found.has(stamp):
+                        return found.with_words_of_now()
+    return None
+
+
+def _made(session: Path, place: Path, stamp: str) -> CachedTables:
     """Make the tables of a session. Raises OSError, a FileNotFoundError if the session or the tables are gone."""
     if place.parent != session:  # which must not appear again when the quota has deleted it
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -132,6 +182,7 @@ def _made(session: Path, place: Path) -> CachedTables:
             (part / _NOTE).write_text(words, encoding="utf-8")
         if read.description is not None and not read.description.closed:
             (part / _OPEN).touch()
+        (part / f"{_STAMP}{stamp}").touch()
         with suppress(OSError):  # another question has made it meanwhile
             part.rename(place)
     finally:
@@ -192,15 +243,20 @@ def _drop_others(place: Path) -> None:
             shutil.rmtree(other, ignore_errors=True)
 
 
-def _places(session: Path) -> Iterator[Path]:
+def _homes(session: Path) -> Iterator[Path]:
     """Yield where the tables may be: in the session, or for a folder that is read-only among temporary files."""
-    name = f"{TABLES_PREFIX}{_digest(session)}"
     home = session if session.is_dir() else session.parent / f".{session.name}"
-    yield home / name
+    yield home
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
     # Each user has a directory: another one's cannot be written.
     user = f"zenoh-car-fleet-tables-{os.getuid() if hasattr(os, 'getuid') else 0}"
-    yield Path(tempfile.gettempdir()) / user / owner / session.name / name
+    yield Path(tempfile.gettempdir()) / user / owner / session.name
+
+
+def _names(directory: Path) -> list[str]:
+    with suppress(NotADirectoryError, FileNotFoundError):
+        return os.listdir(directory)  # noqa: PTH208 - a path for each name costs half of a question
+    return []
 
 
 @cache
@@ -208,18 +264,53 @@ def _layouts_text() -> str:
     return repr(sorted(_layouts().items()))
 
 
-def _digest(session: Path) -> str:
-    # Where a version names a column differently, all are made anew.
-    facts = [_FORMAT, _layouts_text()]
+@dataclass(frozen=True, slots=True)
+class _State:
+    """Sizes and times of the files of a session."""
+
+    names: tuple[str, ...]
+    """All names in the session; empty if it is a file."""
+    segments: tuple[str, ...]
+    """Each segment with its size and time."""
+    description: tuple[str, ...]
+    """Size, time and number of the files that describe the messages: each change replaces the file."""
+
+    @classmethod
+    def of(cls, session: Path) -> Self:
+        names = tuple(sorted(_names(session)))
+        if names or session.is_dir():
+            directory, files = os.fspath(session), fnmatch.filter(names, SEGMENTS)
+        else:
+            directory, files = os.fspath(session.parent), [session.name]
+        segments = [
+            f"{name} {state.st_size} {state.st_mtime_ns}" for name in files if (state := _stat(directory, name))
+        ]
+        description = [
+            f"{name} {state.st_size} {state.st_mtime_ns} {state.st_ino}"
+            for name in (SESSION_FILE, INDEX_FILE)
+            if name in names and (state := _stat(directory, name))
+        ]
+        return cls(names, tuple(segments), tuple(description))
+
+    @property
+    def stamp(self) -> str:
+        """Return the stamp of the tables that were made for this state by this version."""
+        return _hash(_FORMAT, _layouts_text(), *self.segments, *self.description)
+
+    def digest(self, session: Path) -> str:
+        """Return the digest of this state. It reads the description."""
+        # Where a version names a column differently, all are made anew.
+        return _hash(_FORMAT, _layouts_text(), *self.segments, _described(session))
+
+
+def _stat(directory: str, name: str) -> os.stat_result | None:
     # A question looks at a thousand sessions: os.stat takes a third of the time of Path.glob and Path.stat.
-    directory, names = os.fspath(session.parent), [session.name]
-    with suppress(NotADirectoryError, FileNotFoundError):
-        directory, names = os.fspath(session), fnmatch.filter(os.listdir(session), SEGMENTS)  # noqa: PTH208
-    for name in sorted(names):
-        with suppress(FileNotFoundError):  # the quota deletes it meanwhile
-            state = os.stat(f"{directory}{os.sep}{name}")  # noqa: PTH116
-            facts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
-    facts.append(_described(session))
+    with suppress(FileNotFoundError):  # the quota deletes it meanwhile
+        return os.stat(f"{directory}{os.sep}{name}")  # noqa: PTH116
+    return None
+
+
+def _hash(*facts: str) -> str:
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
 
 

@@ -195,6 +195,29 @@ def test_a_mark_makes_no_tables_anew(sessions: Path) -> None:
     assert tables_of(sessions / "one").directory == before
 
 
+def test_the_descriptions_are_read_once(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+
+    def noting(session: Path) -> str:
+        read.append(session)
+        return described(session)
+
+    described = table_cache._described
+    monkeypatch.setattr(table_cache, "_described", noting)
+    one, two = sessions / "one", sessions / "two"
+    for _ in range(3):
+        Catalog(sessions)
+    assert read == [one, two]
+    describe(one, marks=[{"time": "2026-01-01T00:00:00Z", "text": "a cat", "by": "mia"}])
+    for _ in range(3):
+        Catalog(sessions)
+    assert read == [one, two, one]
+    describe(two, error="the disk was full")
+    for _ in range(3):
+        Catalog(sessions)
+    assert read == [one, two, one, two], "its tables were made anew"
+
+
 def test_a_session_that_is_deleted_meanwhile_is_left_out(sessions: Path) -> None:
     catalog = Catalog(sessions)
     shutil.rmtree(sessions / "two")
@@ -224,10 +247,10 @@ def test_tables_of_a_folder_that_is_read_only_go_elsewhere(sessions: Path, monke
     monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
     made = table_cache._made
 
-    def refuses(session: Path, place: Path) -> table_cache.CachedTables:
+    def refuses(session: Path, place: Path, stamp: str) -> table_cache.CachedTables:
         if place.parent == session:  # root may write everywhere, so the answer of the system is given here
             raise PermissionError(13, "Permission denied", str(place))
-        return made(session, place)
+        return made(session, place, stamp)
 
     monkeypatch.setattr(table_cache, "_made", refuses)
     assert tables_of(sessions / "one").directory.is_relative_to(elsewhere)
@@ -250,6 +273,8 @@ def test_the_command_answers_as_a_table_csv_and_json(sessions: Path) -> None:
         json.loads(line)["table"] for line in query("--tables", "--json", cwd=sessions.parent).stdout.splitlines()
     }
     assert {"sensor_range", "sensor_range_context", "event_command"} <= listed
+    elsewhere = query("--tables", "--json", sessions, cwd=sessions / "one").stdout
+    assert {json.loads(line)["table"] for line in elsewhere.splitlines()} == listed
 
 
 @pytest.mark.parametrize("arguments", [(), ("SELECT 1", "--tables"), ("SELECT 1", "--csv", "--json"), ("SELEKT",)])
@@ -327,7 +352,7 @@ def test_of_many_sessions_the_damaged_ones_are_named_and_their_intact_rest_count
     assert found == 295, "five are noise"
 
 
-def old_schema(session: Path, kind: int) -> None:
+def old_schema(session: Path, kind: int, words: str = "0.75") -> None:
     """Make a session of an older version: another type of range_m, a field that we have not, and none that is newer."""
     file = descriptor_pb2.FileDescriptorProto(name="old.proto", package="fleet.v1", syntax="proto3")
     message = file.message_type.add(name="Range")
@@ -337,7 +362,7 @@ def old_schema(session: Path, kind: int) -> None:
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     made: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName("fleet.v1.Range"))()
-    made.echo_us, made.range_m = 7, "0.75" if kind == message.field[0].TYPE_STRING else 3
+    made.echo_us, made.range_m = 7, words if kind == message.field[0].TYPE_STRING else 3
     session.mkdir()
     with (session / "0001.mcap").open("wb") as out:
         writer: Any = Writer(out)
@@ -396,6 +421,17 @@ def test_a_session_of_another_schema_has_the_columns_of_ours(sessions: Path, *, 
     assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE range_m < 0.6") == [{"n": 2 if others else 0}]
 
 
+def test_a_value_that_is_null_for_want_of_its_type_is_named(sessions: Path) -> None:
+    old_schema(sessions / "words", 9, "far away")
+    old_schema(sessions / "numbers", 9)
+    done = query("SELECT count(*) n FROM sensor_range WHERE range_m IS NULL", "--csv", sessions)
+    assert (done.returncode, done.stdout.split()) == (0, ["n", "1"])
+    assert [line for line in done.stderr.splitlines() if "null" in line] == [
+        "words: null in the tables: 1 of sensor/range range_m: not DOUBLE"
+    ]
+    assert "null" not in query("SELECT count(*) FROM sensor_line", sessions).stderr, "nobody asked for it"
+
+
 @pytest.mark.parametrize("name", ["it's", 'a"b', "s[12]", "s*", "s?", "ü {x}", "-- x; DROP"])
 def test_any_name_is_a_name(sessions: Path, name: str) -> None:
     make(sessions / name, "green", [7.0])
@@ -431,7 +467,7 @@ def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
     with pytest.raises(NoSession):
         tables_of(sessions / "two")
     with pytest.raises(FileNotFoundError):  # it was there a moment ago
-        table_cache._made(sessions / "two", sessions / "two" / f"{TABLES_PREFIX}x")
+        table_cache._made(sessions / "two", sessions / "two" / f"{TABLES_PREFIX}x", "x")
     assert [each.name for each in sessions.iterdir()] == ["one"]
 
 
