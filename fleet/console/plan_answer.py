@@ -11,12 +11,11 @@ from fleet.coordinator.observer import FleetObserver
 from fleet.policy.difference import plan_changes
 from fleet.policy.lint.lint import PlanFault, find_faults
 from fleet.policy.plan.models import PlanEntry
-from fleet.policy.plan.parser import BadPlan, parse
+from fleet.policy.plan.parser import BadPlan, parse, parse_entry
 from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.trial import PlanInForce, Trial, try_plan
 from schemas.bus import Sample
-from schemas.yaml_document.document import Document
 
 MAX_TOLD: Final = 100
 """Maximum number of changes, of cars and of roles without a car that a page is told: it shows no more."""
@@ -43,7 +42,7 @@ class PlanQuestion:
 def answer_to(question: PlanQuestion, listed: Mapping[str, CarSnapshot]) -> dict[str, Any]:
     """Return faults, roles, changes and dry run as JSON values. `listed`: the cars of the fleet file, empty: none."""
     try:
-        plan = parse(question.text)
+        entry, plan = parse_entry(question.text)
     except BadPlan as error:
         return {"ok": False, "words": str(error)}
     faults = find_faults(plan, listed or None, question.present)
@@ -51,7 +50,7 @@ def answer_to(question: PlanQuestion, listed: Mapping[str, CarSnapshot]) -> dict
         "ok": not faults.errors,
         "words": _lines(faults.errors),
         "warnings": _lines(faults.warnings),
-        "roles": _roles(question.text),
+        "roles": _roles(entry),
     }
     if faults.errors:
         return found
@@ -81,10 +80,8 @@ def _lines(faults: Iterable[PlanFault]) -> str:
     return "\n".join(each.at("plan") for each in list(faults)[:MAX_TOLD])
 
 
-def _roles(text: str) -> list[list[Any]]:
+def _roles(entry: PlanEntry) -> list[list[Any]]:
     """Return the name and the written fields of each role: a form shows some of them, and keeps the others."""
-    entry = Document(text, "plan").validate(PlanEntry)
-    assert entry is not None  # it was parsed
     return [
         [name, each.model_dump(mode="json", by_alias=True, exclude_unset=True)] for name, each in entry.roles.items()
     ]

@@ -48,6 +48,11 @@ _MISSING: Final = {"mode": Mode.MANUAL, "when": "true", "then": []}
 
 def parse(text: str, source: str = "plan") -> Plan:
     """Parse a plan; raises BadPlan with all faults. `source` is its name in errors, usually its path."""
+    return parse_entry(text, source)[1]
+
+
+def parse_entry(text: str, source: str = "plan") -> tuple[PlanEntry, Plan]:
+    """Parse a plan as `parse` does. Return what is written in it, too."""
     document = Document(text, source)
     entry = document.validate(PlanEntry) or document.validate_partial(PlanEntry, _MISSING)
     if entry is None:
@@ -55,7 +60,7 @@ def parse(text: str, source: str = "plan") -> Plan:
     assert entry is not None  # else there was a problem
     plan = _PlanParser(document, entry).plan(text)
     document.raise_faults()
-    return plan
+    return entry, plan
 
 
 class _PlanParser:
