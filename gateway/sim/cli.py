@@ -48,6 +48,7 @@ options of the simulator only:
   +gray=MAX +constants                  the grayscale goes up to MAX; constants for line, obstacle, light and grayscale
                                         (arduino, stm32)
   +mission +no_encoder +quiet           its boot mission drives; the left encoder counts nothing; it repeats no line
+  +arm +gimbal                          it reports an arm in the place of angles; it searches a gimbal that is not there
                                         (wave_rover, ugv01, ugv02, ugv_rover, ugv_beast; no other option)
 an stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows the frames of
 the motions, dies at any other and sends nothing.

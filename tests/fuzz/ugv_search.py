@@ -4,18 +4,21 @@ Virtual time; the true state of the simulated car is the judge. `play(seed)` ret
 """
 
 import json
+import math
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gateway import drivers
 from gateway.control.commands import Action, ChangeSpeed, Command, Drive, EmergencyStop, Find, Resume, SetLight, Stop
 from gateway.control.controller import Controller
-from gateway.control.driver import Driver
+from gateway.control.driver import Driver, Fields
 from gateway.control.events import CommandRecord, LogRecord
 from gateway.drivers.waveshare.driver import ALLOWED, DRIVE, PWM
+from gateway.sim.car_options import UGV_OPTIONS
 from gateway.sim.model.factory import build_ugv
 from gateway.sim.model.ir_remote import Button
-from gateway.sim.model.ugv import LOOP_S, UGV_BUILDS, UGV_DEAD_MAN_S
+from gateway.sim.model.ugv import LOOP_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S
 from gateway.sim.model.world import World
 from schemas.authority import Sender
 from schemas.words import Basis, Light, Motion, Motors, Phase, Rank, Reason, SpeedStep
@@ -28,6 +31,14 @@ SETTLED_S = 9.0
 """Time without an accident after which a car is set up: a boot of 2 s, the silence after it, the stop, the set-up."""
 IN_A_ROW_S = 0.3
 """Maximum motion with the wrong chassis: a line that was under way when the car restarted, and the stop behind it."""
+OTHERS = (
+    '{"T":11,"L":200,"R":2',  # cut in "R":-200: it spins
+    '{"T":404,"ap_ssid":"UGV"',
+    '{"T":242,"name":"dance","interval":10}',
+    '{"T":4,"cmd":1}',
+    '{"T":143,"cmd":0}',
+)
+"""What other programs send to its web interface."""
 ANN = Sender("ann@desk", Rank.PERSON)
 
 
@@ -52,7 +63,7 @@ class UgvEpisode:
         moments = self.moments
         self.car_platform = self.car_platform or moments.choice(list(UGV_BUILDS))
         self.told = self.told or self.car_platform
-        options = {each for each in ("mission", "no_encoder", "quiet") if moments.random() < 0.12}
+        options = {each for each in UGV_OPTIONS if moments.random() < 0.12}
         self.options = frozenset(options) if self.frozen_options is None else self.frozen_options
         self.car = build_ugv(self.car_platform, World.room(), 0, moments, options=self.options)
         self.control: Controller[Driver] = Controller("red", drivers.driver_of(self.told, {}))
@@ -65,6 +76,8 @@ class UgvEpisode:
         self.to_car: list[tuple[float, bytes]] = []
         self.to_host: list[tuple[float, bytes]] = []
         self.calm_since = 0.0
+        self.busy_until = 0.0
+        """When a search for Wi-Fi is over, and what another program let it do."""
         self.page_until = float("-inf")
         self.cut_at: float | None = None
         self.stop_due: float | None = None
@@ -90,7 +103,7 @@ class UgvEpisode:
                 self.to_host.append((self.now + self.delay_s, data))
         while self.to_host and self.to_host[0][0] <= self.now:
             for event in driver.feed(self.to_host.pop(0)[1], self.now):
-                driver.measured(event)
+                self._check_measured(driver.measured(event))
                 self.control.driver.on_event(event, self.now)
         if self.now >= self._tick_at:
             self._tick_at = self.now + TICK_S
@@ -116,6 +129,11 @@ class UgvEpisode:
     def _is_lost(self) -> bool:
         return self.loss > 0 and self.moments.random() < self.loss
 
+    def _check_measured(self, topics: Mapping[str, Fields]) -> None:
+        attitude = topics.get("sensor/attitude")
+        if attitude is not None and abs(attitude["yaw_rad"]) > math.pi:
+            self.faults.append(f"{self.now:.2f} publishes a number of its arm as an angle")
+
     def _check_line(self, data: bytes) -> None:
         for text in data.strip().split(b"\n"):
             found = json.loads(text)
@@ -131,6 +149,10 @@ class UgvEpisode:
     def is_alone(self) -> bool:
         """Return True if nothing but the gateway moves the car: no web page, no mission."""
         return self.now > self.page_until and "mission" not in self.options
+
+    @property
+    def _calm_from(self) -> float:
+        return max(self.calm_since, self.busy_until)
 
     def _judge(self) -> None:
         car, model, now = self.car, self.control.driver.model, self.now
@@ -172,7 +194,7 @@ class UgvEpisode:
         self.ids += 1
         answer = self.control.command(Command(f"c{self.ids}", "any", ANN, what), self.now)
         self._take_records()
-        is_calm = not self.loss and self.linked and self.now > self.calm_since + SETTLED_S
+        is_calm = not self.loss and self.linked and self.now > self._calm_from + SETTLED_S
         if isinstance(what, Stop | EmergencyStop) and is_calm:
             self.stop_due = self.now + answer.worst_case_s + 2 * self.delay_s + 0.1
         elif isinstance(what, Drive) and what.motion is not Motion.STOP:
@@ -181,7 +203,7 @@ class UgvEpisode:
 
     def drive_usefully(self) -> None:
         """Drive a calm car. It moves soon, and stands soon after its drive."""
-        self.run(max(0.0, self.calm_since + SETTLED_S - self.now))
+        self.run(max(0.0, self._calm_from + SETTLED_S - self.now))
         self.page_until = min(self.page_until, self.now)
         self.run(1.0)
         for estop in self.control.safety.estops:
@@ -205,10 +227,18 @@ class UgvEpisode:
         self.run(1.0)
         self.shown += self.control.driver.model.basis is Basis.SHOWN
 
+    def _let_others_send(self, text: str) -> None:
+        """Let another program send this to its web interface. The car may be busy for a while after it."""
+        self.car.take_http(text, self.now)
+        self.page_until = self.now + WIFI_S + UGV_DEAD_MAN_S + BRAKE_S
+        self.stop_due = None
+        self.run(self.moments.uniform(0.3, WIFI_S))
+        self.busy_until = self.page_until
+
     def accident(self) -> None:
         """Let something happen."""
         moments = self.moments
-        match moments.randrange(12):
+        match moments.randrange(14):
             case 0:
                 self.cut()
                 self.run(moments.uniform(0.1, 5.0))
@@ -240,6 +270,8 @@ class UgvEpisode:
             case 9:
                 for estop in self.control.safety.estops:
                     self.ask(Resume((estop.id,)))
+            case 10:
+                self._let_others_send(moments.choice(OTHERS))
             case _:
                 self.ask(Drive(moments.choice(list(Motion)), moments.uniform(0.2, 3.0)))
 

@@ -19,6 +19,8 @@ MAX_M_S: Final = 5.0
 MAX_V: Final = 13.0
 """Maximum speed of a wheel, and of the voltage of three cells. A greater number is no measurement."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
+_OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
+"""Fields of an arm. Its places have the names of the yaw, or of the acceleration, and stand in their place."""
 _DECODER: Final = json.JSONDecoder()
 
 
@@ -74,6 +76,7 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
     if max(abs(left), abs(right)) > MAX_M_S:
         return Rejected(raw, at, Cause.OUT_OF_RANGE)
     firmware = _firmware(found)
+    has_arm = not _OF_ARM.isdisjoint(found)
     return Feedback(
         raw,
         at,
@@ -81,9 +84,9 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
         left,
         right,
         _voltage(found, firmware),
-        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is UgvFirmware.GENERAL else None,
+        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is UgvFirmware.GENERAL and not has_arm else None,
         _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None,
-        _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS else None,
+        _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None,
     )
 
 

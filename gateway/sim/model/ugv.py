@@ -9,6 +9,7 @@ loop (a delay, a mission) keeps the dead-man from being checked, too.
 """
 
 import json
+import re
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,6 +36,10 @@ PAGE_S: Final = 1.5
 """Interval at which the car's own web page drives it on, for as long as it is open."""
 PAGE_ASKS_S: Final = ((1.0, 130), (2.5, 405))
 """Intervals of the questions that it asks meanwhile. The answers go to the UART, too."""
+WIFI_S: Final = 15.0
+"""Time for which `T:403`, `T:404` and `T:407` look for a network. Nothing else runs meanwhile, nor the dead-man."""
+SERVO_SEARCH_S: Final = 0.1
+"""Time for which a servo is searched that does not answer."""
 PAGE_OPEN_S: Final = 10.0
 """Time after the last press in which it is closed."""
 KP: Final = 20.0
@@ -52,6 +57,8 @@ _SETUP: Final = (
 """What a boot prints, by the time since the ROM's text."""
 UGV_BOOT_S: Final = 2.0
 """Time from a reset until the loop runs."""
+_PARTS: Final = re.compile(r'"(\w+)"\s*:\s*(-?\d+(?:\.\d+)?)')
+"""The fields of a text that its web interface takes, also of one that ends too early."""
 UART_S: Final = 0.3
 """Time from a reset until the program has its UART. Bytes that arrive before are lost."""
 
@@ -78,7 +85,8 @@ class UgvCar:
     """One car and its UART on virtual time. Times: s from any origin, that must not run backwards.
 
     options: `mission` (its boot mission drives for 2 s), `no_encoder` (a loose wire: the left encoder counts nothing),
-    `quiet` (`T:605` is 0: no echo).
+    `quiet` (`T:605` is 0: no echo), `arm` (its boot mission says that it has one: the arm's numbers take the places of
+    angles), `gimbal` (it says that it has one, and there is none: each turn of the loop searches two servos).
     """
 
     def __init__(
@@ -95,6 +103,8 @@ class UgvCar:
         self._tx_free = now
         self._kept_main = 2 if build.is_ros else 1
         """The chassis after a reset. The ROS firmware keeps what it was told."""
+        self._kept_module = 1 if "arm" in options else 2 if "gimbal" in options else 0
+        """What is mounted on it, after a reset: 1 an arm, 2 a gimbal."""
         self._odometer = [0.0, 0.0]
         self._wheels = [0.0, 0.0]
         """The true speed of each wheel, m/s."""
@@ -187,6 +197,11 @@ class UgvCar:
             self._obey({"T": 1, "L": 0, "R": 0})
         return True
 
+    def take_http(self, text: str, now: float) -> None:
+        """Run what its web interface gets. It runs what it could parse, also of a text that ends too early."""
+        self._run(now)
+        self._obey({name: float(value) for name, value in _PARTS.findall(text)})
+
     def due(self) -> float:
         """Return the time at which the program next runs."""
         return self._next_turn
@@ -211,7 +226,9 @@ class UgvCar:
         """Forget everything that is in RAM, as a reset does."""
         ros = self._build.is_ros
         self._main = self._kept_main
-        self._loop_on = True
+        self._module = self._kept_module
+        self._plays = False
+        """True if it plays a mission without an end. A byte that waits ends it."""
         self._target = [0.0, 0.0]
         self._integral = [0.0, 0.0]
         self._duty = [0.0, 0.0]
@@ -257,12 +274,15 @@ class UgvCar:
         now = self._now
         if now >= self._boot_until:
             self._run_mission(now)
-            if now >= self._blocked_until and not self._mission:
+            if self._plays and self._arrivals and self._arrivals[0][0] <= now:
+                self._plays = False
+            if now >= self._blocked_until and not self._mission and not self._plays:
                 self._take_lines(now)
                 self._press_on(now)
                 self._control(now)
                 self._report(now)
                 self._check_dead_man(now)
+                self._search_servos(now)
         self._move(now)
 
     def _run_mission(self, now: float) -> None:
@@ -274,6 +294,13 @@ class UgvCar:
             self._obey(json.loads(self._mission.pop(0)[1]))
             if not self._is_closed:
                 self._control(now)
+
+    def _search_servos(self, now: float) -> None:
+        """Search the two servos of a gimbal that is not there."""
+        if self._module == 2:
+            self._blocked_until = now + 2 * SERVO_SEARCH_S
+            for number in (1, 2):
+                self._print(b'{"T":1005,"id":%d,"status":0}\r\n' % number)
 
     def _press_on(self, now: float) -> None:
         if self._page is not None and now >= self._page_at:
@@ -396,6 +423,10 @@ class UgvCar:
                 self._set_target(forward - turn * 0.0625, forward + turn * 0.0625)
             case 111:
                 self._blocked_until = self._now + number / 1000
+            case 242:
+                self._plays = True
+            case 403 | 404 | 407:
+                self._blocked_until = self._now + WIFI_S
             case 130:
                 self._report(self._now, asked=True)
             case 131:
@@ -416,9 +447,12 @@ class UgvCar:
                 self._reset(self._now, text=True)
             case 605:
                 self._talks = number != 0
+            case 4:
+                self._module = int(number)
             case 900:
-                self._main = int(_number(command, "main"))
-                self._kept_main = self._main if self._build.is_ros else self._kept_main
+                self._main, self._module = int(_number(command, "main")), int(_number(command, "module"))
+                if self._build.is_ros:
+                    self._kept_main, self._kept_module = self._main, self._module
             case _:
                 pass
 
@@ -450,6 +484,11 @@ class UgvCar:
                 wheels = {"L": round(self._duty[0]), "R": round(self._duty[1])}  # the command itself
             yaw = round(degrees(self._body.pose(now).heading_rad), 2)
             fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
+        if self._module == 1:  # one object with the numbers of both: the last one of a name counts
+            places = [f"a{each}" for each in "xyz"] if self._build.is_ros else list("xyz")
+            fields |= dict(zip(places, (310.2, -194.1, 228.6), strict=True)) | {"torB": -56, "torS": 12}
+        elif self._module == 2:
+            fields |= {"pan": 0, "tilt": 0}
         self._print(json.dumps(fields, separators=(",", ":")).encode() + b"\r\n")
 
     def _print(self, data: bytes) -> None:

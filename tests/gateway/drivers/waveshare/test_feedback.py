@@ -48,6 +48,14 @@ def test_the_two_firmwares_are_told_apart_and_read_in_one_unit() -> None:
     assert one.odometer_m is one.imu_raw is two.attitude_rad is None
 
 
+def test_the_numbers_of_an_arm_are_no_angles() -> None:
+    """Another program may say at any time that there is one. Its places have the names of other fields."""
+    one, two = read({**GENERAL, "y": -194.1, "torB": -56}), read({**ROS, "ax": 310.2, "torS": 12})
+    assert one.attitude_rad is None
+    assert two.imu_raw is None
+    assert (one.voltage_v, two.odometer_m) == (11.64, pytest.approx((1.2, -0.03)))
+
+
 @pytest.mark.parametrize(
     ("fields", "cause"),
     [

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.sim.model.factory import build_ugv
-from gateway.sim.model.ugv import UGV_BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, UgvCar
+from gateway.sim.model.ugv import UGV_BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S, UgvCar
 from gateway.sim.model.world import World
 
 
@@ -158,3 +158,39 @@ def test_an_answer_without_a_line_end_glues_the_next_feedback() -> None:
     host.heard = b""
     host.send('{"T":405}\n').run(0.3)
     assert b'"ssid":"UGV"}{"T":1001' in host.heard
+
+
+def test_http_runs_a_command_that_is_cut() -> None:
+    host = Host("ugv_rover")
+    host.car.take_http('{"T":11,"L":200,"R":2', host.now)
+    assert host.run(0.1).duty == (200, 2)
+    assert not host.run(UGV_DEAD_MAN_S + 0.5).car.moving
+
+
+def test_a_search_for_wifi_keeps_commands_and_the_dead_man_waiting() -> None:
+    host = Host("wave_rover").send(FORWARD)
+    host.car.take_http('{"T":404}', host.now)
+    host.run(UGV_DEAD_MAN_S).send('{"T":1,"L":0,"R":0}\n').run(WIFI_S - UGV_DEAD_MAN_S - 1.0)
+    assert host.car.moving
+    assert not host.run(1.5).car.moving
+
+
+def test_a_mission_without_an_end_keeps_the_dead_man_waiting_until_a_byte_comes() -> None:
+    host = Host("wave_rover").send(FORWARD, '{"T":242,"name":"dance"}\n').run(20.0)
+    assert host.car.moving
+    assert not host.send("\n").run(0.5).car.moving, "the dead-man was due for long"
+
+
+@pytest.mark.parametrize("platform", ["ugv01", "ugv_rover"])
+def test_the_numbers_of_an_arm_stand_in_the_place_of_others(platform: str) -> None:
+    host, place = Host(platform, "arm").send('{"T":130}\n'), "y" if platform == "ugv01" else "ay"
+    of_arm = host.feedback()[place]
+    main = UGV_BUILDS[platform].main
+    assert host.send(f'{{"T":900,"main":{main},"module":0}}\n', '{"T":130}\n').feedback()[place] != of_arm
+
+
+def test_a_gimbal_that_is_not_there_slows_its_loop() -> None:
+    host = Host("ugv01", "gimbal").send('{"T":131,"cmd":1}\n')
+    host.heard = b""
+    assert host.run(2.0).heard.count(b'{"T":1001') in (9, 10, 11)
+    assert host.heard.count(b'{"T":1005') == pytest.approx(20, abs=2)
