@@ -28,6 +28,7 @@ class LeftOutCause(StrEnum):
     NO_FLEET = "not a key of a car or service that is replayed"
     COMMAND = "a command, which is never published again"
     BAD_KEY = "the bus cannot carry its key"
+    TOO_MANY_TOPICS = "of too many topics"
     LONG_ENCODING = "the bus cannot carry its encoding: over 255 bytes"
 
 

@@ -22,14 +22,11 @@ _Schema = tuple[str | bytes, ...]
 
 
 @dataclass(slots=True)
-class OneSchema:
-    """Counts and topics of a written file."""
+class TopicNames:
+    """Names topics for Foxglove, so that each has one schema: those of a session, and those of a fleet live."""
 
-    messages: int = 0
     schemas: dict[str, _Schema] = field(default_factory=dict)
     """Schema by topic."""
-    strays: LeftOut = field(default_factory=LeftOut)
-    """Messages with a topic of their own, by key."""
 
     @property
     def fleet(self) -> str:
@@ -44,14 +41,27 @@ class OneSchema:
     def _own_keys(self) -> list[keys.Key]:
         return [parsed for topic in self.schemas if own_type(topic) and (parsed := keys.parse(topic)) is not None]
 
-    def topic_of(self, info: ChannelInfo) -> str:
-        """Return the topic of a channel: its key, or `stray/KEY/TYPE` if the key has another schema."""
-        key, kind, encoding = info.channel.topic, message_of(info), info.channel.message_encoding
-        schema = (encoding, *((each.name, each.encoding, each.data) if (each := info.schema) is not None else ()))
+    def name(self, key: str, kind: str, encoding: str, *schema: str | bytes) -> str:
+        """Return the topic of a message of a type: its key, or `stray/KEY/TYPE` if the key has another schema."""
+        found = (encoding, *schema)
         own = own_type(key)
         strays = numbered(f"stray/{key}/{kind or encoding or 'unknown'}", "-")
         names = strays if own and kind != own else chain((key,), strays)
-        return next(name for name in names if self.schemas.setdefault(name, schema) == schema)
+        return next(name for name in names if self.schemas.setdefault(name, found) == found)
+
+
+@dataclass(slots=True)
+class OneSchema(TopicNames):
+    """Counts and topics of a written file."""
+
+    messages: int = 0
+    strays: LeftOut = field(default_factory=LeftOut)
+    """Messages with a topic of their own, by key."""
+
+    def topic_of(self, info: ChannelInfo) -> str:
+        """Return the topic of a channel."""
+        schema = () if (each := info.schema) is None else (each.name, each.encoding, each.data)
+        return self.name(info.channel.topic, message_of(info), info.channel.message_encoding, *schema)
 
 
 def write(rows: Iterable[Row], extras: Iterable[Extra], out: Path) -> OneSchema:

@@ -21,6 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 from fleet.client.supervision import ask_colors
 from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, may_have_enum
+from fleet.replay.panels import ON_CHANGE_TOPICS
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.export import APPLICATION
@@ -39,8 +40,6 @@ MAX_PATH_POINTS: Final = 3_000
 DEFAULT_VIEW_S: Final = 120.0
 """Time span in view. The view can also show all."""
 VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
-_ON_CHANGE_TOPICS: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
-"""Topics published only on change, so queried at the start."""
 COORDINATOR_TIMEOUT_S: Final = 3.0
 """Timeout for the coordinator's answer; skipped if there is no coordinator."""
 
@@ -78,7 +77,7 @@ class Live:
         for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, VIEW_QUEUE_SIZE))
         self._reader.start()
-        for topic in _ON_CHANGE_TOPICS:
+        for topic in ON_CHANGE_TOPICS:
             found = self._bus.query(f"{self._fleet}/{topic}", timeout_s=COORDINATOR_TIMEOUT_S)
             answers = [each for each in found if isinstance(each, Sample)]
             with self._lock:
