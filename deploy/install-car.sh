@@ -42,7 +42,7 @@ usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [
   --platform P      arduino, stm32, raspberry_pi, ... (default: auto)
   --options TEXT    more options of `gateway run`
   --ble             also what Bluetooth links need
-  --all             also hub, recorder, console and exporter: for the computer of the hub
+  --all             also hub, recorder, console, exporter, ...: for the computer of the hub
   --wheel FILE      install this file (default: the newest version from PyPI)
   --clone           install the clone that this script is in
   --uninstall       remove what this script has made, apart from files that were changed since
@@ -216,7 +216,7 @@ if [ -n "$clone" ]; then
 fi
 what=${wheel:-$package}
 if [ -n "$all" ]; then
-    pip install --quiet --upgrade "${what}[secure,console,metrics]"
+    pip install --quiet --upgrade "${what}[secure,console,metrics,foxglove,mqtt]"
 else
     # shellcheck disable=SC2086 # a list of words
     pip install --quiet --upgrade $needs ${ble:+"$needs_ble"}
@@ -243,7 +243,7 @@ put "$rules" 0644 <"$here/70-fleet-cars.rules"
 put "$units/car-gateway@.service" 0644 <"$here/car-gateway@.service"
 if [ -n "$all" ]; then
     for unit in car-hub.service car-hub-certificates.service car-hub-certificates.timer car-recorder.service \
-        car-console.service car-exporter.service; do
+        car-console.service car-exporter.service car-foxglove.service car-mqtt.service; do
         put "$units/$unit" 0644 <"$here/$unit"
     done
 fi

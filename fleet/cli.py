@@ -53,6 +53,8 @@ COMMANDS: Final = {
             "fleet.commands.exporter:exporter",
             "The fleet as metrics for Prometheus.",
         ),
+        "foxglove": ("fleet.commands.foxglove_live:foxglove", "The fleet live in Foxglove."),
+        "mqtt": ("fleet.commands.mqtt:mqtt", "The cars as devices of Home Assistant, by MQTT."),
         "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),
     },
     "Several computers": {
@@ -133,6 +135,8 @@ _EXTRAS: Final = {
     **dict.fromkeys(("cryptography", "ifaddr"), "secure"),
     "bleak": "ble",
     "prometheus_client": "metrics",
+    "foxglove": "foxglove",
+    **dict.fromkeys(("aiomqtt", "paho"), "mqtt"),
 }
 """The extra that installs a module."""
 

@@ -19,6 +19,8 @@ UNITS: Final = {
     "recorder": "car-recorder.service",
     "console": "car-console.service",
     "exporter": "car-exporter.service",
+    "foxglove": "car-foxglove.service",
+    "mqtt": "car-mqtt.service",
 }
 
 

@@ -35,7 +35,7 @@ def settings(name: str) -> dict[str, list[str]]:
 
 
 def test_there_is_one_for_each_service() -> None:
-    kinds = ["console", "exporter", "gateway@", "hub-certificates", "hub", "recorder"]
+    kinds = ["console", "exporter", "foxglove", "gateway@", "hub-certificates", "hub", "mqtt", "recorder"]
     assert [f"car-{kind}.service" for kind in kinds] == SERVICES
 
 

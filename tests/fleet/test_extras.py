@@ -13,6 +13,8 @@ from tests.fleet.replay.make_session import Made
 
 VIEW = (1, "pip install 'zenoh-car-fleet[view]'")
 CONSOLE = (1, "pip install 'zenoh-car-fleet[console]'")
+FOXGLOVE = (1, "pip install 'zenoh-car-fleet[foxglove]'")
+MQTT = (1, "pip install 'zenoh-car-fleet[mqtt]'")
 METRICS = (1, "pip install 'zenoh-car-fleet[metrics]'")
 ANALYSIS = (1, "pip install 'zenoh-car-fleet[analysis]'")
 WORKS = (0, "")
@@ -52,6 +54,8 @@ EXPECTED = {
     "view": VIEW,
     "console": CONSOLE,
     "exporter": METRICS,
+    "foxglove": FOXGLOVE,
+    "mqtt": MQTT,
     "up --sim 1 --console": CONSOLE,
     "view --save OUT/live.rrd": VIEW,
     "sessions export SESSION --parquet OUT/parquet": ANALYSIS,

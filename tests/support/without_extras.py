@@ -7,7 +7,7 @@ from types import ModuleType
 
 HIDDEN = frozenset(
     {"rerun", "rerun_cli", "rerun_sdk", "pyarrow", "numpy", "pandas", "PIL", "matplotlib", "bleak"}
-    | {"starlette", "uvicorn", "websockets", "prometheus_client"}
+    | {"starlette", "uvicorn", "websockets", "prometheus_client", "foxglove", "aiomqtt", "paho"}
 )
 
 

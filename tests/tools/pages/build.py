@@ -48,6 +48,7 @@ PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
     "plan": ("docs/reference/plan-file.md", lambda: files.schema_tables(files.plan_schema())),
     "world": ("docs/reference/world-file.md", lambda: files.schema_tables(files.world_schema())),
     "metrics": ("docs/how-to/watch-with-prometheus.md", tables.metric_table),
+    "entities": ("docs/how-to/show-in-home-assistant.md", tables.entity_table),
     "any_client": ("docs/how-to/use-any-zenoh-client.md", any_client),
     "tank": ("docs/how-to/write-a-driver.md", tank),
     "drive_one": ("docs/how-to/drive-from-python.md", drive_one),

@@ -8,6 +8,7 @@ from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
+from fleet.bridges.home_assistant import ENTITIES
 from fleet.conditions.fields import LAST, fields_of
 from fleet.exporter.metrics import METRICS
 from gateway.control.driver import STALL_S
@@ -21,7 +22,7 @@ from gateway.drivers.yahboom.stops.cases import CASES
 from schemas import messages, topics
 from schemas.commands import COMMANDS
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_PAUSE_S
-from schemas.words import CarTrust, Mode, Platform
+from schemas.words import UNKNOWN, CarTrust, Mode, Platform
 from tests.support import vectors
 from tests.tools.vectors import STOPS
 
@@ -57,6 +58,16 @@ def metric_table() -> str:
     rows = ["| metric | labels | what |", "|---|---|---|"]
     for metric in METRICS:
         rows.append(f"| `{metric.sample}` | {', '.join(metric.label_names) or '-'} | {metric.about} |")
+    return "\n".join(rows)
+
+
+def entity_table() -> str:
+    """Return the table of the entities of a car in Home Assistant."""
+    rows = ["| value | name | unit or words |", "|---|---|---|"]
+    for entity in ENTITIES:
+        words = entity.config.get("options", ("true", "false") if entity.config["platform"] == "binary_sensor" else ())
+        unit = entity.config.get("unit_of_measurement") or ", ".join(word for word in words if word != UNKNOWN)
+        rows.append(f"| `{entity.name}` | {entity.title} | {unit} |")
     return "\n".join(rows)
 
 

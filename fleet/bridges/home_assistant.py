@@ -1,0 +1,309 @@
+"""What Home Assistant reads of a fleet by MQTT: which messages are published, and when. Pure: time is an argument.
+
+Each car is a device with a few entities. One retained message announces it (device discovery, Home Assistant 2024.11
+and later). Then there are two topics for each car: `state`, one JSON object with a value for each entity, and
+`availability`.
+
+**A number is never older than it looks.** A value that was not measured, or is stale, is null, which Home Assistant
+shows as unknown. States are not retained: who connects gets the next one, at most REPEAT_S later, and none of
+yesterday. An entity expires after EXPIRE_S without a state, so a bridge that hangs leaves no value behind. Availability
+is retained, since Home Assistant asks for it when it starts. It is `offline` for a car whose gateway has gone, whose
+gateway says nothing any more, or whose link is lost. The bridge has an availability of its own, `offline` by its last
+will, and an entity needs both.
+
+**What stays after a crash.** An announcement and an `online` of a bridge that was killed stay in the broker. The next
+bridge hears them when it begins (`adopt`) and says `offline` for cars that are not there. A clean end takes all of it
+back, so Home Assistant forgets the devices.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from fleet.client.car_state import CarState
+from schemas import keys
+from schemas.words import UNKNOWN, BatteryLevel, LinkState, Mode, Motors
+
+BASE: Final = "car-fleet"
+"""First part of all topics but the announcements."""
+DISCOVERY_PREFIX: Final = "homeassistant"
+"""Home Assistant's own default."""
+ONLINE: Final = "online"
+OFFLINE: Final = "offline"
+STATE_INTERVAL_S: Final = 1.0
+"""Minimum interval of the states of a car."""
+REPEAT_S: Final = 10.0
+"""Maximum interval of the states of a car that is available."""
+EXPIRE_S: Final = 30
+"""Time without a state after which Home Assistant shows no value."""
+MAX_ANNOUNCED_CARS: Final = 256
+"""Maximum devices, as of the exporter: anybody on an open bus may invent names."""
+_DIGITS: Final = 3
+_AVAILABILITY_PARTS: Final = 4
+"""Parts of the topic of a car's availability."""
+
+
+class Publication(NamedTuple):
+    """One MQTT message. An empty retained one removes what the broker keeps."""
+
+    topic: str
+    payload: str
+    retain: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Entity:
+    """One value of a car."""
+
+    name: str
+    """Its field of the state, and the last part of its id."""
+    title: str
+    value: Callable[[CarState, float], Any]
+    """The value at a time. None: it was not measured, or is stale."""
+    config: Mapping[str, Any]
+    """Its settings for Home Assistant. In a template, {0} is its name."""
+    of_absent: bool = False
+    """True if it has a value also of a car that is not available."""
+
+    def component(self, car_id: str) -> dict[str, Any]:
+        """Return its part of the announcement of a car, without its availability."""
+        template = self.config.get("value_template", "{{{{ value_json.{0} }}}}").format(self.name)
+        return {
+            **self.config,
+            "name": self.title,
+            "unique_id": f"{car_id}_{self.name}",
+            "value_template": template,
+            "expire_after": EXPIRE_S,
+        }
+
+
+def is_available(state: CarState, now: float) -> bool:
+    """Return True if the car's gateway is there and speaks, and its link is not lost."""
+    link = state.fresh("state/link", now) if state.present else None
+    return link is not None and link.state != LinkState.LOST
+
+
+def _of(topic: str, read: Callable[[Any], Any]) -> Callable[[CarState, float], Any]:
+    """Return the value of a field of a topic's newest message; None if it is stale."""
+    return lambda state, now: None if (found := state.fresh(topic, now)) is None else read(found)
+
+
+def _known(words: Iterable[str], word: str) -> str | None:
+    return word if word in words and word != UNKNOWN else None
+
+
+def _number(value: float) -> float:
+    return round(value, _DIGITS)
+
+
+def _sensor(device_class: str, unit: str) -> dict[str, Any]:
+    return {
+        "platform": "sensor",
+        "device_class": device_class,
+        "unit_of_measurement": unit,
+        "state_class": "measurement",
+    }
+
+
+def _words(*words: str) -> dict[str, Any]:
+    # Home Assistant rejects a value that is no option, and null is none.
+    return {
+        "platform": "sensor",
+        "device_class": "enum",
+        "options": [*words, UNKNOWN],
+        "value_template": "{{{{ value_json.{0} if value_json.{0} is not none else '" + UNKNOWN + "' }}}}",
+    }
+
+
+def _flag(device_class: str | None = None) -> dict[str, Any]:
+    config = {"platform": "binary_sensor", "payload_on": "True", "payload_off": "False"}  # as templates print them
+    return {**config, "device_class": device_class} if device_class else config
+
+
+ENTITIES: Final = (
+    Entity(
+        "connected",
+        "Connection",
+        lambda state, now: is_available(state, now) and state.link.state == LinkState.ONLINE,
+        {**_flag("connectivity"), "entity_category": "diagnostic"},
+        of_absent=True,
+    ),
+    Entity(
+        "battery_v",
+        "Battery voltage",
+        _of("sensor/battery", lambda battery: _number(battery.voltage_v)),
+        _sensor("voltage", "V"),
+    ),
+    Entity(
+        "battery_level",
+        "Battery level",
+        _of("sensor/battery", lambda battery: _known(tuple(BatteryLevel), battery.level)),
+        _words(*BatteryLevel),
+    ),
+    Entity(
+        "distance_m",
+        "Distance",
+        _of("sensor/range", lambda each: _number(each.range_m) if each.HasField("range_m") else None),
+        _sensor("distance", "m"),
+    ),
+    Entity(
+        "mode",
+        "Mode asked",
+        _of("state/mode", lambda mode: _known(tuple(Mode), mode.asked)),
+        _words(*Mode),
+    ),
+    Entity(
+        "mode_inferred",
+        "Mode by its readings",
+        _of("state/mode", lambda mode: _known(tuple(Mode), mode.inferred)),
+        _words(*Mode),
+    ),
+    Entity(
+        "moving",
+        "Motors",
+        _of("state/safety", lambda safety: {Motors.ON: True, Motors.OFF: False}.get(safety.motors)),
+        _flag("moving"),
+    ),
+    Entity(
+        "estopped",
+        "Emergency stop",
+        _of("state/safety", lambda safety: bool(safety.estops)),
+        _flag(),
+    ),
+)
+"""All entities of a car."""
+
+
+class HomeAssistant:
+    """Decides what is published about one fleet. Times: s, of one clock that the caller chooses."""
+
+    def __init__(self, fleet: str, prefix: str = DISCOVERY_PREFIX, version: str = "") -> None:
+        self._fleet = fleet
+        self._prefix = prefix
+        self._version = version
+        self._said: dict[str, bool] = {}
+        """Availability that was said of each announced car, the one that changed first at the front."""
+        self._states: dict[str, tuple[str, float]] = {}
+        """Last state of each car, and its time."""
+
+    @property
+    def bridge_availability(self) -> str:
+        """Return the topic of the bridge's own availability, which is its last will, too."""
+        return f"{BASE}/{self._fleet}/@mqtt/availability"
+
+    @property
+    def availabilities(self) -> str:
+        """Return the topic filter of the availability of all cars."""
+        return f"{BASE}/{self._fleet}/+/availability"
+
+    @property
+    def birth(self) -> str:
+        """Return the topic under which Home Assistant says that it has started."""
+        return f"{self._prefix}/status"
+
+    def adopt(self, topic: str, payload: bytes) -> Iterator[Publication]:
+        """Take in what the broker has kept of an earlier bridge. Yield what takes back an `online` of a car."""
+        parts = topic.split("/")
+        if len(parts) != _AVAILABILITY_PARTS or topic == self.bridge_availability or not payload:
+            return
+        car = parts[2]
+        if not keys.is_name(car) or self._said.get(car):
+            return
+        if car not in self._said and len(self._said) < MAX_ANNOUNCED_CARS:
+            self._said[car] = False
+        if payload != OFFLINE.encode():
+            yield Publication(self._topic(car, "availability"), OFFLINE, retain=True)
+
+    def begin(self) -> Iterator[Publication]:
+        """Yield what says again all that holds: to a broker that may have forgotten, or to a new Home Assistant."""
+        yield Publication(self.bridge_availability, ONLINE, retain=True)
+        self._states.clear()
+        for car, available in self._said.items():
+            yield from self._announcement(car, available=available)
+
+    def news(self, states: Mapping[str, CarState], now: float) -> Iterator[Publication]:
+        """Yield what has changed since the last call, of the cars that are known."""
+        for car, state in sorted(states.items()):
+            available = is_available(state, now)
+            if car not in self._said:
+                if not available:
+                    continue
+                yield from self._room()
+                if len(self._said) >= MAX_ANNOUNCED_CARS:
+                    continue
+                self._said[car] = True
+                yield from self._announcement(car, available=True)
+            elif self._said[car] != available:
+                yield self._availability(car, available=available)
+            yield from self._state(car, state, now, available=available)
+        for car in [each for each, available in self._said.items() if available and each not in states]:
+            yield self._availability(car, available=False)
+
+    def end(self) -> Iterator[Publication]:
+        """Yield what takes back all announcements, so that Home Assistant forgets the cars."""
+        for car in list(self._said):
+            yield from self._removal(car)
+        yield Publication(self.bridge_availability, "", retain=True)
+
+    # ------------------------------------------------------------------ messages
+
+    def _topic(self, car: str, name: str) -> str:
+        return f"{BASE}/{self._fleet}/{car}/{name}"
+
+    def _id(self, car: str) -> str:
+        return f"{BASE}_{self._fleet}_{car}"
+
+    def _config_topic(self, car: str) -> str:
+        return f"{self._prefix}/device/{self._id(car)}/config"
+
+    def _availability(self, car: str, *, available: bool) -> Publication:
+        self._said.pop(car, None)
+        self._said[car] = available  # behind those that changed before
+        return Publication(self._topic(car, "availability"), ONLINE if available else OFFLINE, retain=True)
+
+    def _announcement(self, car: str, *, available: bool) -> Iterator[Publication]:
+        yield Publication(self._topic(car, "availability"), ONLINE if available else OFFLINE, retain=True)
+        yield Publication(self._config_topic(car), json.dumps(self._config(car)), retain=True)
+
+    def _config(self, car: str) -> dict[str, Any]:
+        """Return the announcement of a car."""
+        title = car if self._fleet == keys.DEFAULT_FLEET else f"{self._fleet} {car}"
+        bridge = {"topic": self.bridge_availability}
+        both = [bridge, {"topic": self._topic(car, "availability")}]
+        components = {
+            each.name: {
+                **each.component(self._id(car)),
+                "availability": [bridge] if each.of_absent else both,
+                "availability_mode": "all",
+            }
+            for each in ENTITIES
+        }
+        return {
+            "device": {"identifiers": [self._id(car)], "name": title, "model": "robot car"},
+            "origin": {"name": "zenoh-car-fleet", "sw_version": self._version},
+            "components": components,
+            "state_topic": self._topic(car, "state"),
+            "qos": 1,
+        }
+
+    def _state(self, car: str, state: CarState, now: float, *, available: bool) -> Iterator[Publication]:
+        values = {each.name: each.value(state, now) if available or each.of_absent else None for each in ENTITIES}
+        text = json.dumps(values)
+        before, at = self._states.get(car, ("", -REPEAT_S))
+        if now - at >= (STATE_INTERVAL_S if text != before else REPEAT_S):
+            self._states[car] = text, now
+            yield Publication(self._topic(car, "state"), text)
+
+    def _removal(self, car: str) -> Iterator[Publication]:
+        self._said.pop(car, None)
+        self._states.pop(car, None)
+        yield Publication(self._config_topic(car), "", retain=True)
+        yield Publication(self._topic(car, "availability"), "", retain=True)
+
+    def _room(self) -> Iterator[Publication]:
+        """Make room for another car: forget the one that has been away the longest."""
+        if len(self._said) >= MAX_ANNOUNCED_CARS:
+            away = next((car for car, available in self._said.items() if not available), None)
+            if away is not None:
+                yield from self._removal(away)

@@ -1,0 +1,213 @@
+"""Publishes the cars of a fleet to an MQTT broker, for Home Assistant. Nothing that comes from there is a command.
+
+One loop hears the bus, and always does, so that the bus never waits for a broker. Another keeps a connection to the
+broker, and sends what has changed since it sent last. Nothing is queued for a broker that is slow or away: the cars go
+on, and when it is back it gets what is so then.
+"""
+
+import asyncio
+import logging
+import ssl
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+import aiomqtt
+
+from fleet.bridges.home_assistant import OFFLINE, HomeAssistant, Publication
+from fleet.client.car_state import CarState
+from fleet.client.client import Fleet
+from fleet.coordinator.inbox import Inbox, QueriedSample
+from fleet.coordinator.observer import FleetObserver
+from schemas import keys
+from schemas.backoff import backoff_s
+from schemas.bus import Sample
+from schemas.process import signals
+
+PLAIN_PORT: Final = 1883
+TLS_PORT: Final = 8883
+_WAIT_S: Final = 0.25
+"""Maximum time until a change, or the end, is noticed."""
+_TOPICS: Final = ("state/*", "sensor/battery", "sensor/range")
+_BROKER_TIMEOUT_S: Final = 5.0
+"""Timeout of each exchange with the broker. Beyond it the connection is opened again."""
+_KEEPALIVE_S: Final = 10
+"""Silence after which broker and bridge ask each other. The broker sends the last will after one and a half of it."""
+_FAREWELL_TIMEOUT_S: Final = 1.0
+"""Timeout for the first answer of the broker at the end."""
+_END_TIMEOUT_S: Final = 5.0
+"""Timeout for all that is taken back at the end, of 256 cars at most."""
+_FIRST_RETRY_S: Final = 0.5
+_LONGEST_RETRY_S: Final = 10.0
+_MAX_INCOMING: Final = 1024
+"""Maximum messages of the broker in the queue: the availability of earlier cars, and Home Assistant's births."""
+_REFUSED: Final = frozenset({4, 5, 134, 135})
+"""Codes of a broker that knows the user or the password not, MQTT 3.1.1 and 5."""
+
+_SILENT: Final = logging.getLogger(f"{__name__}.paho")
+"""What paho would say is said by `notify`."""
+_SILENT.setLevel(logging.CRITICAL + 1)
+
+
+class BrokerRefused(Exception):
+    """The broker takes nobody with this user and password. The message says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Broker:
+    """Where the broker is, and who we are there."""
+
+    host: str
+    port: int
+    user: str | None = None
+    password: str | None = None
+    tls: ssl.SSLContext | None = None
+
+    @property
+    def words(self) -> str:
+        """Return its address for a person."""
+        return f"{self.host}:{self.port}"
+
+
+class MqttBridge:
+    """Publishes one fleet to one broker. `notify` is called with news for a person: the broker is there, or is away."""
+
+    def __init__(self, client: Fleet, broker: Broker, plan: HomeAssistant, notify: Callable[[str], object]) -> None:
+        self._inbox = Inbox(client, lambda: {*_TOPICS})
+        self._observer = FleetObserver()
+        self._broker = broker
+        self._plan = plan
+        self._notify = notify
+        for topic in _TOPICS:
+            self._inbox.subscribe(keys.topic_key(client.name, "*", topic))
+        self._inbox.watch_gateways()
+
+    async def run(self) -> None:
+        """Publish until a signal ends the process. Raises BrokerRefused, but only for the first connection."""
+        ended = asyncio.Event()
+        signals.calls_in(asyncio.get_running_loop(), lambda _: ended.set())
+        with ThreadPoolExecutor(max_workers=4) as pool:
+            hearing = asyncio.create_task(self._hear(pool))
+            publishing = asyncio.create_task(self._connect(ended))
+            waiting = asyncio.create_task(ended.wait())
+            try:
+                await asyncio.wait({hearing, publishing, waiting}, return_when=asyncio.FIRST_COMPLETED)
+                if waiting.done() and not publishing.done():
+                    await asyncio.wait({publishing}, timeout=_END_TIMEOUT_S)
+            finally:
+                for task in (hearing, publishing, waiting):
+                    task.cancel()
+                found = await asyncio.gather(hearing, publishing, waiting, return_exceptions=True)
+        for each in found:
+            if isinstance(each, Exception):
+                raise each
+
+    # ------------------------------------------------------------------ the bus
+
+    async def _hear(self, pool: ThreadPoolExecutor) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            heard = await loop.run_in_executor(pool, lambda: list(self._inbox.items(_WAIT_S)))
+            now, wall_s = time.monotonic(), time.time()
+            changes = self._inbox.gateways()
+            for car, alive in changes.items():
+                self._observer.on_token(car, now, alive=alive)
+            for item in heard:
+                if isinstance(item, QueriedSample):
+                    self._observer.on_sample(item.sample, now, wall_s)
+                elif isinstance(item, Sample):
+                    self._observer.on_sample(item, now, None)
+            self._observer.forget(now, ())
+            self._inbox.query_arrived(changes, pool, began=True)
+
+    # ------------------------------------------------------------------ the broker
+
+    async def _connect(self, ended: asyncio.Event) -> None:
+        """Keep a connection until the end."""
+        failures, was_there = 0, None
+        while not ended.is_set():
+            try:
+                async with self._client() as client:
+                    if was_there is not True:
+                        self._notify(f"Publishing to {self._broker.words} (Ctrl-C ends it)")
+                    was_there, failures = True, 0
+                    await self._publish(client, ended)
+            except aiomqtt.MqttError as error:
+                refused = isinstance(error, aiomqtt.MqttCodeError) and _code(error) in _REFUSED
+                if refused and was_there is None:
+                    raise BrokerRefused(f"{self._broker.words} refuses the user or the password") from None
+                if was_there is not False:
+                    self._notify(f"The broker at {self._broker.words} is away ({error}); it is tried again.")
+                was_there, failures = False, failures + 1
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(ended.wait(), backoff_s(failures, _FIRST_RETRY_S, _LONGEST_RETRY_S))
+
+    def _client(self) -> aiomqtt.Client:
+        return aiomqtt.Client(
+            self._broker.host,
+            self._broker.port,
+            username=self._broker.user,
+            password=self._broker.password,
+            tls_context=self._broker.tls,
+            timeout=_BROKER_TIMEOUT_S,
+            keepalive=_KEEPALIVE_S,
+            max_queued_incoming_messages=_MAX_INCOMING,
+            logger=_SILENT,
+            will=aiomqtt.Will(self._plan.bridge_availability, OFFLINE, qos=1, retain=True),
+        )
+
+    async def _publish(self, client: aiomqtt.Client, ended: asyncio.Event) -> None:
+        """Publish news over one connection until it breaks, or until the end."""
+        tasks = [asyncio.create_task(each) for each in (self._tell(client), self._listen(client), ended.wait())]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for each in done:
+                each.result()  # raises what has ended the connection
+        finally:
+            for each in tasks:
+                each.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        # What we have not read when we close resets the connection, and the broker takes that for a crash. So hear no
+        # more. A broker that hangs answers nothing. Later it reads all of this, or sends our will.
+        qos = 1
+        try:
+            await client.unsubscribe([self._plan.availabilities, self._plan.birth], timeout=_FAREWELL_TIMEOUT_S)
+        except aiomqtt.MqttError:
+            qos = 0
+        await _send(client, self._plan.end(), qos)
+
+    async def _tell(self, client: aiomqtt.Client) -> None:
+        await client.subscribe([(self._plan.availabilities, 1), (self._plan.birth, 1)])
+        await _send(client, self._plan.begin())
+        while True:
+            await _send(client, self._plan.news(self._cars(), time.monotonic()))
+            await asyncio.sleep(_WAIT_S)
+
+    async def _listen(self, client: aiomqtt.Client) -> None:
+        async for message in client.messages:
+            topic, payload = str(message.topic), message.payload
+            if topic == self._plan.birth:
+                if payload == b"online" and not message.retain:
+                    await _send(client, self._plan.begin())
+            elif isinstance(payload, bytes):
+                await _send(client, self._plan.adopt(topic, payload))
+
+    def _cars(self) -> dict[str, CarState]:
+        """Return the cars that are confirmed, with what was heard of them."""
+        return {
+            car: state
+            for car in self._observer.snapshot(()).cars
+            if (state := self._observer.states.get(car)) is not None
+        }
+
+
+async def _send(client: aiomqtt.Client, publications: Iterable[Publication], qos: int = 1) -> None:
+    for each in list(publications):  # all at once: while one is sent, the plan goes on
+        await client.publish(each.topic, each.payload, qos=qos, retain=each.retain)
+
+
+def _code(error: aiomqtt.MqttCodeError) -> int | None:
+    return error.rc if isinstance(error.rc, int) or error.rc is None else error.rc.value

@@ -1,0 +1,60 @@
+"""`fleet foxglove`: the fleet live in Foxglove."""
+
+import threading
+from contextlib import closing
+from typing import Final
+
+import click
+
+from fleet.bridges.foxglove_server import DEFAULT_FOXGLOVE_PORT, FoxgloveServer, PortInUse, layout_now
+from fleet.commands.fleets import open_observer
+from fleet.commands.options import bus_options
+from fleet.commands.output import echo_safely
+from fleet.commands.params import Number
+from schemas.process import signals
+
+_FOXGLOVE_INTERVAL_S: Final = 0.02
+"""Interval at which the bus is read."""
+LOOPBACK: Final = "127.0.0.1"
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet foxglove
+  fleet foxglove --layout > layout.json
+  fleet foxglove --address 192.168.1.2 --port 8766
+
+In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. Everyone who reaches the address may look, and
+nobody can command a car there."""
+)
+@click.option(
+    "--port",
+    type=Number(int, 0, 65535),
+    default=DEFAULT_FOXGLOVE_PORT,
+    show_default=True,
+    help="Port, 0 for any.",
+)
+@click.option("--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Address to serve at.")
+@click.option("--layout", "prints_layout", is_flag=True, help="Print a layout for the cars of now, and exit.")
+@bus_options
+def foxglove(*, port: int, address: str, prints_layout: bool, connect: str | None, fleet: str) -> None:
+    """Serve everything that the fleet publishes to Foxglove, until Ctrl-C."""
+    stop = threading.Event()
+    signals.calls(stop.set)
+    with open_observer(connect, fleet) as client:
+        if prints_layout:
+            click.echo(layout_now(client), nl=False)
+            return
+        try:
+            server = FoxgloveServer(client, address, port)
+        except PortInUse as error:
+            hint = "`fleet foxglove --port 0` takes any port."
+            raise click.ClickException(f"{address}:{port} cannot be used: {error}. {hint}") from None
+        with closing(server):
+            click.echo(f"Foxglove: ws://{address}:{server.port} (Ctrl-C ends it)")
+            while not stop.is_set():
+                if not server.step():
+                    stop.wait(_FOXGLOVE_INTERVAL_S)
+        for line in server.left_out.words():
+            echo_safely(f"not shown: {line}", err=True)
