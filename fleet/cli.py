@@ -4,6 +4,7 @@ Subcommands are imported when they are called, so that `fleet --help` is fast.
 """
 
 import importlib
+import os
 import re
 import sys
 from typing import Final
@@ -201,6 +202,10 @@ def cli(connect: str | None, fleet: str) -> None:
 def main() -> None:
     """Entry point."""
     stdio.complete()
+    if os.environ.get("FLEET_LOG"):
+        from schemas.process import json_log
+
+        json_log.begin(" ".join(["fleet", *[word for word in sys.argv[1:] if word in _FUNCTIONS][:1]]))
     try:
         code = cli.main(prog_name="fleet", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:

@@ -9,6 +9,7 @@ import asyncio
 import gc
 import logging
 import random
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -36,7 +37,7 @@ from schemas import bus
 from schemas.authority import People
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
-from schemas.process import signals
+from schemas.process import json_log, signals
 from schemas.process.parent import has_ended
 from schemas.process.service_notifier import ServiceNotifier
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
@@ -380,6 +381,17 @@ class CarGateway:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
             except bus.BusError as error:
                 self._commands.log(Level.ERROR, "no_hub", str(error))
+
+
+def begin_logging() -> None:
+    """Let this process log: lines for a person, or JSON."""
+    if not json_log.begin("gateway"):
+        logging.basicConfig(
+            format="%(asctime)s %(levelname)s %(message)s",
+            datefmt="%H:%M:%S %Z",
+            level=logging.INFO,
+            stream=sys.stderr,
+        )
 
 
 async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> bool:

@@ -219,17 +219,11 @@ def _run(arguments: argparse.Namespace) -> int:
             service = CarService(opened, fleet, car)
             # The car is on the bus now. The following imports take as long again.
             import asyncio
-            import logging
 
-            from gateway.car import Settings, serve
+            from gateway.car import Settings, begin_logging, serve
             from gateway.control.battery import BatteryPolicy
 
-            logging.basicConfig(
-                format="%(asctime)s %(levelname)s %(message)s",
-                datefmt="%H:%M:%S %Z",
-                level=logging.INFO,
-                stream=sys.stderr,
-            )
+            begin_logging()
             settings = Settings(
                 car,
                 url,

@@ -54,8 +54,9 @@ from schemas.bus import Bus, BusError, Failure, NoFleet, Publisher, Sample, cano
 from schemas.commands import COMMANDS, Verb
 from schemas.identity import IdentityRole, may_locate
 from schemas.identity import parse as parse_identity
+from schemas.process import json_log
 from schemas.topics import Qos
-from schemas.words import ProcessKind, Rank, RunState, Scope
+from schemas.words import Phase, ProcessKind, Rank, RunState, Scope
 
 _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
@@ -66,6 +67,7 @@ _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout for the query of the current values, however short a wait is."""
 
 log = logging.getLogger("fleet")
+command_log = logging.getLogger(json_log.COMMANDS)
 
 
 def default_sender(person: str | None = None) -> str:
@@ -360,6 +362,10 @@ class Fleet:
 
         command = PendingCommand(command_id, request, self.cars(), named, lambda: self.bus.hubs, send_again)
         self._pending[command_id] = command
+        extra = json_log.fields(
+            command_id=command_id, verb=request.verb, phase=Phase.ASKED, sender=message.sender, cars=command.targets
+        )
+        command_log.info("%s to %s", request.verb, ", ".join(command.targets) or "no car", extra=extra)
         try:
             command.queries = [pool.submit(self._query, target, command, payload) for target in command.targets]
             if command.is_stop:
@@ -379,7 +385,18 @@ class Fleet:
                     query.result()
         finally:
             self._pending.pop(command.id, None)
-        return command.outcomes()
+        found = command.outcomes()
+        for each in found:
+            extra = json_log.fields(
+                command_id=command.id,
+                car=each.car,
+                verb=command.request.verb,
+                phase=each.phase,
+                reason=each.reason,
+                words=each.words,
+            )
+            command_log.info("%s: %s %s", each.car, command.request.verb, each.phase, extra=extra)
+        return found
 
     def _filled(self, request: CommandRequest) -> tuple[Any, str]:
         message = type(request.message)()

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.atomic_file import write_atomically
+from schemas.process import json_log
 from schemas.process.ending import kill
 from schemas.state_dir import directory_of
 
@@ -167,11 +168,12 @@ class Child:
         on_exit(code)
 
     def _on_stderr_line(self, line: str) -> None:
-        logged = _LOGGED.fullmatch(line)
+        as_text = _LOGGED.fullmatch(line)
+        logged = json_log.message_in(line) if as_text is None else (as_text["level"], as_text["words"])
         if logged is None:
             self.last = line
-        elif logged["level"] in ("ERROR", "CRITICAL"):
-            self.last = logged["words"]
+        elif logged[0] in ("ERROR", "CRITICAL"):
+            self.last = logged[1]
 
     async def _pump(self, stream: asyncio.StreamReader, take: Callable[[str], bool | None]) -> None:
         rest = b""

@@ -16,10 +16,11 @@ from gateway.bus.service import Request
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
-from gateway.control.events import LogRecord
+from gateway.control.events import CommandRecord, LogRecord
 from gateway.control.safety import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.process import json_log
 from schemas.words import Level, Phase, Reason
 
 _LOGGING_LEVELS: Final = {
@@ -30,6 +31,7 @@ _LOGGING_LEVELS: Final = {
 }
 
 log = logging.getLogger("gateway")
+command_log = logging.getLogger(json_log.COMMANDS)
 
 
 class CommandHandler:
@@ -65,6 +67,7 @@ class CommandHandler:
         self._on_gap = on_gap
         self._unanswered: list[tuple[Request, str, Answer]] = []
         """Queries with the id of their command and the answer to send."""
+        self._logs_commands = json_log.is_wanted()
         self._sent: set[str] = set()
         """Ids of commands whose first frame was written since the last answers."""
 
@@ -151,11 +154,28 @@ class CommandHandler:
                 self._print(record)
                 self._publisher.publish_log(record)
                 continue
+            self._log_command(record)
             first = request if request is not None and record.command.id == command_id else None
             self._publisher.publish_command(record, None if first is None else (first.payload or b"", first.encoding))
             request = None if first is not None else request
             if record.phase is Phase.SENT:
                 self._sent.add(record.command.id)
+
+    def _log_command(self, record: CommandRecord) -> None:
+        """Log a record of a command, if anybody reads such lines."""
+        if not self._logs_commands:
+            return
+        command = record.command
+        extra = json_log.fields(
+            command_id=command.id,
+            car=self._car,
+            verb=command.verb,
+            phase=record.phase,
+            sender=command.sender.name,
+            reason=record.reason,
+            words=record.words,
+        )
+        command_log.info("%s: %s %s", self._car, command.verb, record.phase, extra=extra)
 
     def log(self, level: Level, code: str, words: str) -> None:
         """Log an event of the gateway, and publish it."""
@@ -166,4 +186,5 @@ class CommandHandler:
     def _print(self, record: LogRecord) -> None:
         """Print a log line, with the code that the troubleshooting page explains."""
         car = "" if record.words.startswith(f"{self._car} ") else f"{self._car}: "
-        log.log(_LOGGING_LEVELS[record.level], "%s%s [%s]", car, record.words, record.code)
+        extra = json_log.fields(car=self._car, code=record.code)
+        log.log(_LOGGING_LEVELS[record.level], "%s%s [%s]", car, record.words, record.code, extra=extra)

@@ -1,1 +1,1 @@
-"""The common parts of all processes: startup, standard streams, signals and the guard of the parent."""
+"""The common parts of all processes: startup, standard streams, logs, signals and the guard of the parent."""

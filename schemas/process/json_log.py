@@ -1,0 +1,75 @@
+"""Log lines as JSON, for every process, if FLEET_LOG is `json`. One id follows a command through all of them.
+
+Without the variable each process logs as it always did: lines for a person. With it each log line on stderr is one JSON
+object with `time`, `level`, `process`, `pid` and `message`. A line about a command also has its `command_id`, `verb`
+and `phase`. The id is made by the client (a command line, the console, the coordinator, a program) and is in the
+command's message, so the gateway logs the same. It is in the recording, too, in `event/command` and `frame/tx`.
+
+A line of a client says what was sent and how it ended. A gateway has one line for each record of `event/command`.
+"""
+
+import json
+import logging
+import os
+import sys
+from datetime import UTC, datetime
+from typing import Any, Final
+
+LOG_VARIABLE: Final = "FLEET_LOG"
+JSON_FORMAT: Final = "json"
+COMMANDS: Final = "fleet.commands"
+"""Name of the logger of lines about commands. Without JSON its lines go nowhere: texts say the same in better words."""
+_FIELDS: Final = "fleet_fields"
+
+
+def is_wanted() -> bool:
+    """Return True if this process logs as JSON. Any other value than `json` is none."""
+    return os.environ.get(LOG_VARIABLE, "").lower() == JSON_FORMAT
+
+
+def fields(**values: Any) -> dict[str, Any]:
+    """Return the `extra` of a log call: fields of its line in JSON. What is empty is left out."""
+    return {_FIELDS: {name: value for name, value in values.items() if value not in (None, "")}}
+
+
+class JsonFormatter(logging.Formatter):
+    """Formats a record as one line of JSON. A program of your own can use it, too."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line. It has no newline and no control character, whatever the texts hold."""
+        line = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "process": self._process,
+            "pid": record.process,
+            "message": record.getMessage(),
+            **getattr(record, _FIELDS, {}),
+        }
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def begin(process: str) -> bool:
+    """Let this process log as JSON if FLEET_LOG says so. Return whether it does."""
+    if not is_wanted():
+        return False
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter(process))
+    logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
+    return True
+
+
+def message_in(line: str) -> tuple[str, str] | None:
+    """Return level and message of a line that a process of ours has logged as JSON. None if it is none."""
+    if not line.startswith("{"):
+        return None
+    try:
+        found = json.loads(line)
+        return str(found["level"]).upper(), str(found["message"])
+    except (ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,29 @@
+"""Log lines as JSON: one line each, whatever is in them. tests/e2e/test_json_log.py follows a command by them."""
+
+import json
+import logging
+
+from schemas.process.json_log import JsonFormatter, fields, message_in
+
+
+def line_of(message: str, *arguments: object, level: int = logging.INFO, **values: object) -> str:
+    logger = logging.getLogger("test")
+    record = logger.makeRecord("test", level, __file__, 1, message, arguments, None, extra=fields(**values))
+    return JsonFormatter("gateway").format(record)
+
+
+def test_a_line_is_one_object_and_one_line_whatever_its_texts_hold() -> None:
+    line = line_of('%s "said"\n{"level": "error"}\x1b[31m', "\udcff\u2028", car="red", code="", words=None, odd={1})
+    assert line.isascii()
+    assert line.isprintable()
+    found = json.loads(line)
+    assert found["message"] == '\udcff\u2028 "said"\n{"level": "error"}\x1b[31m'
+    assert (found["car"], found["odd"], found["process"], found["level"]) == ("red", "{1}", "gateway", "info")
+    assert not {"code", "words"} & set(found)
+    assert found["time"].endswith("+00:00")
+
+
+def test_the_supervisor_reads_the_words_of_such_a_line() -> None:
+    assert message_in(line_of("no link", level=logging.ERROR)) == ("ERROR", "no link")
+    for other in ("", "{", "[1]", "{}", "12:00:00 UTC ERROR no link", '{"level": "error"}', "null"):
+        assert message_in(other) is None
