@@ -1,19 +1,25 @@
 """Collects from the bus what `diagnosis` judges: states, recent commands, processes, recorder and plan."""
 
+import threading
 import time
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from math import inf
-from typing import Any
+from typing import Any, Final
 
 from fleet.client.car_state import CarState
 from fleet.client.client import Fleet
 from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
+from fleet.client.gateway_clock import MAX_CLOCK_OFF_S, GatewayClock
 from fleet.client.reading import Reading, age_of_answer_s
 from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
+from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import ProcessKind, RecorderState, RunState
 
+_CLOCK_LISTEN_S: Final = 3.0
+"""Maximum time to listen for the clocks of gateways: states come once a second."""
 _EVENT = topics.TOPICS["event/command"]
 
 
@@ -32,6 +38,8 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
         for reading in client.get(expression):
             if (key := keys.parse(reading.key)) is not None:
                 answers.setdefault(key.car, []).append((key.topic, reading))
+    newest_s = newest_states(each for found in answers.values() for _, each in found)
+    clocks = clocks_off(client, {car: at_s for car, at_s in newest_s.items() if car in present})
     now = time.time()
     commands = _commands(client)
     recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
@@ -41,8 +49,10 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {
         car: CarEvidence(
-            CarState.of_answers(car, answers.get(car, []), now, present=car in present),
-            now,
+            # Its times are of its clock.
+            CarState.of_answers(car, answers.get(car, []), now + clocks.get(car, 0.0), present=car in present),
+            now + clocks.get(car, 0.0),
+            clock_off_s=clocks.get(car),
             commands=commands.get(car, []),
             process=processes.get(car),
             recording=recording,
@@ -52,6 +62,50 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
         )
         for car in sorted({*present, *processes})
     }
+
+
+def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
+    """Return the newest time of the states of each car, s since the epoch by its gateway's clock."""
+    found: dict[str, float] = {}
+    for reading in readings:
+        key = keys.parse(reading.key)
+        if key is not None and key.topic.startswith("state/"):
+            found[key.car] = max(found.get(key.car, 0.0), reading.time.timestamp())
+    return found
+
+
+def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
+    """Return how far the clocks of gateways are off, by car, of those that are.
+
+    newest_s: the newest time of the states that each car has answered. It listens, at most for _CLOCK_LISTEN_S, only to
+    cars whose time is odd.
+    """
+    now_s = time.time()
+    odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}
+    if not odd or client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
+        return {}
+    clocks = {car: GatewayClock() for car in odd}
+    complete, lock = threading.Event(), threading.Lock()
+
+    def on_state(sample: Sample) -> None:
+        key, came_ns = keys.parse(sample.key), time.time_ns()
+        if key is None or (gateway := clocks.get(key.car)) is None:
+            return
+        try:
+            message: Any = sample.message()
+        except (messages.BadPayload, KeyError):
+            return
+        with lock:
+            gateway.take(message.boot_id, messages.stamp_ns(message.stamp), came_ns)
+            if all(each.off_s is not None for each in clocks.values()):
+                complete.set()
+
+    subscriber = client.bus.subscribe(keys.topic_key(client.name, "*", "state/*"), on_state)
+    complete.wait(_CLOCK_LISTEN_S)
+    subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+    with lock:
+        found = {car: each.off_s for car, each in clocks.items()}
+    return {car: off_s for car, off_s in found.items() if off_s is not None and abs(off_s) > MAX_CLOCK_OFF_S}
 
 
 def _commands(client: Fleet) -> dict[str, list[tuple[float, Any]]]:

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from fleet.client.car_state import CarState
 from fleet.client.claims import describe_end_of_doubt
+from fleet.client.gateway_clock import describe_clock
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
 from schemas.authority import binding_pause
@@ -60,6 +61,8 @@ class CarEvidence:
     """The roles of the plan (fleet.v1.Assignment)."""
     coordinated: bool = False
     """True if a coordinator is on the bus."""
+    clock_off_s: float | None = None
+    """Time by which the clock of its gateway's computer is ahead of ours; negative: behind. None: not known."""
     asked: bool = False
     """True if the states are answers. Then a gateway answers, also one that says old things, such as a replay."""
 
@@ -122,6 +125,12 @@ def _hung(e: CarEvidence) -> str:
     if said or not e.state.present:
         return ""
     return "Its gateway is on the bus and does not answer. It may hang."
+
+
+def _wrong_clock(e: CarEvidence) -> str:
+    if not (words := describe_clock(e.state.car, e.clock_off_s)):
+        return ""
+    return f"{words} Commands are refused as stale until both are set; stops, e-stops and pauses count."
 
 
 def _adapter_full(e: CarEvidence) -> str:
@@ -300,6 +309,7 @@ CHECKS: Final = (
     DoctorCheck("gateway_ended", _ended, "fleet logs {car}"),
     DoctorCheck("no_gateway", _absent, "fleet up"),
     DoctorCheck("gateway_hung", _hung, "fleet logs {car}"),
+    DoctorCheck("clock_off", _wrong_clock, "date -u"),
     DoctorCheck("adapter_full", _adapter_full, "fleet check"),
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),

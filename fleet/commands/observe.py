@@ -9,10 +9,12 @@ from typing import Any, Final
 import click
 
 from fleet.client import history
+from fleet.client.car_evidence import clocks_off, newest_states
 from fleet.client.car_state import CarState
 from fleet.client.claims import describe_end_of_doubt
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
+from fleet.client.gateway_clock import describe_clock
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
 from fleet.client.reading import Reading, Watch
 from fleet.client.supervision import ask_colors
@@ -95,8 +97,10 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
     colors = {car: colors.get(car) or car_color(car, index) for index, car in enumerate(sorted(latest))}
     if only:
         latest = {car: latest[car] for car in only}
+    newest_s = newest_states(each for car in latest.keys() & cars for each in latest[car].values())
+    clocks = clocks_off(client, newest_s)
     rows = [
-        {**row_of(car, values, present=car in cars), "color": hex_color(colors[car])}
+        {**row_of(car, values, present=car in cars, clock_off_s=clocks.get(car)), "color": hex_color(colors[car])}
         for car, values in sorted(latest.items())
     ]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
@@ -110,18 +114,23 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
     table = [{name: shown(name, row) for name in CAR_COLUMNS} for row in rows]
     show_table(CAR_COLUMNS, table, optional=OPTIONAL_CAR_COLUMNS, colors=[row["color"] for row in rows])
     for row in rows:
+        if words := describe_clock(row["car"], row["clock_off_s"]):
+            click.echo(f"fleet: {words}", err=True)
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
         if row["doubted"]:
             say(f"fleet: {row['shows_stops_words']}. {describe_end_of_doubt(row['car'])}", err=True)
 
 
-def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -> dict[str, Any]:
+def row_of(
+    car: str, readings: Mapping[str, Reading], *, present: bool = True, clock_off_s: float | None = None
+) -> dict[str, Any]:
     """Return the row of a car in `fleet list`, for the table and for JSON.
 
-    readings: its latest ones, by topic. present: True if its gateway is on the bus.
+    readings: its latest ones, by topic. present: True if its gateway is on the bus. clock_off_s: how far the clock of
+    its gateway's computer is ahead of ours, if it is off.
     """
-    now = datetime.now(UTC).timestamp()
+    now = datetime.now(UTC).timestamp() + (clock_off_s or 0.0)
     state = CarState.of_answers(car, readings.items(), now, present=present)
     claimed, why_not_ready = state.claims(now), state.why_not_ready(now)
     link, safety, health = (state.last_word(f"state/{name}") for name in ("link", "safety", "health"))
@@ -155,7 +164,10 @@ def row_of(car: str, readings: Mapping[str, Reading], *, present: bool = True) -
         "out_of_range": list(health.out_of_range),
         "battery_v": None if battery is None else battery.voltage_v,
         "battery_level": None if battery is None else battery.level,
-        "battery_age_s": None if battery is None else round(readings["sensor/battery"].age_s(), 3),
+        "battery_age_s": None
+        if battery is None
+        else round(readings["sensor/battery"].age_s(datetime.fromtimestamp(now, UTC)), 3),
+        "clock_off_s": None if clock_off_s is None else round(clock_off_s, 1),
         "stale": state.stale_topics(now),
     }
 

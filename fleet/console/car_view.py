@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from fleet.client.car_state import CarState
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
+from fleet.client.gateway_clock import GatewayClock
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
@@ -83,6 +84,7 @@ class CarView:
         self._events: deque[tuple[float, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Time and event of the newest commands."""
         self.state = CarState(name)
+        self._clock = GatewayClock()
         self._trend = BatteryTrend()
         self._heard_at: float | None = None
         """When the newest message came."""
@@ -94,8 +96,10 @@ class CarView:
         """When the newest message came; before the first one, since when the car is in view."""
         return self._since if self._heard_at is None else self._heard_at
 
-    def on_message(self, topic: str, value: Any, now: float) -> None:
-        """Handle a message of this car. topic: such as `sensor/range`."""
+    def on_message(self, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
+        """Handle a message of this car. topic: such as `sensor/range`. wall_ns: our wall clock, if it came just now."""
+        if wall_ns is not None and topic.startswith("state/"):
+            self._clock.take(value.boot_id, messages.stamp_ns(value.stamp), wall_ns)
         if topic not in topics.FROM_OUTSIDE:
             self._heard_at = now
         match topic:
@@ -138,7 +142,9 @@ class CarView:
     def diagnose(self, now: float) -> dict[str, Any]:
         """Return what `fleet doctor` says of the car, as far as its messages tell."""
         state = self.state if self._changed_at is not None else CarState(self.name, present=False)
-        evidence = CarEvidence(state, now, [(now - at, event) for at, event in self._events])
+        evidence = CarEvidence(
+            state, now, [(now - at, event) for at, event in self._events], clock_off_s=self._clock.off_s
+        )
         # Recorder and plan have pages of their own.
         facts = [(name, words) for name, words in describe(evidence) if name != "services"]
         return {"findings": [str(finding) for finding in diagnose(evidence)], "facts": facts}
@@ -282,10 +288,10 @@ class FleetView:
         """Set the cars that the running fleet lists. Those over the maximum are as any other."""
         self._listed = frozenset(islice(filter(keys.is_name, names), MAX_LISTED_CARS))
 
-    def on_message(self, name: str, topic: str, value: Any, now: float) -> None:
-        """Handle a message of a car. topic: such as `sensor/range`. Without a place for the car, nothing is kept."""
+    def on_message(self, name: str, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
+        """Handle a message of a car, as `CarView` does. Without a place for the car, nothing is kept."""
         if (car := self._placed(name, now)) is not None:
-            car.on_message(topic, value, now)
+            car.on_message(topic, value, now, wall_ns)
 
     def _placed(self, name: str, now: float) -> CarView | None:
         """Return the view of a car. A new one is added, if there is a place."""

@@ -43,7 +43,7 @@ from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
-from schemas.keys import SIMULATOR, person_of, topic_key
+from schemas.keys import REPLAY, SIMULATOR, person_of, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.topics import TOPICS
@@ -98,6 +98,8 @@ class Console:
         """The cars of each group, as the running fleet says."""
         self._unrecorded = ""
         """Why not everything is recorded, as the running fleet says."""
+        self._replays: set[str] = set()
+        """The tokens of replays in this fleet."""
         self._said_left_out = False
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
@@ -156,10 +158,15 @@ class Console:
         for place in ("*/sim/truth", f"{SIMULATOR}/world"):
             bus.subscribe(f"{name}/{place}", self._map.on_sample)
         bus.subscribe(f"{name}/{SUPERVISOR_STATUS.name}", self._statuses)
+        await self._fleet.call(bus.watch_tokens, f"{name}/{REPLAY}/*", self._on_replay)
         await self.plan.begin()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
             tasks.create_task(self._renew_leases())
+
+    def _on_replay(self, token: str, alive: bool) -> None:  # noqa: FBT001 - as `Bus.watch_tokens` calls it
+        """Note a replay that began or ended. Runs on a Zenoh thread."""
+        (self._replays.add if alive else self._replays.discard)(token)
 
     def _color_of(self, car: str, index: int) -> str:
         return hex_color(self._colors.get(car) or car_color(car, index))
@@ -252,10 +259,11 @@ class Console:
             page.show(kind, text)
 
     def _take_readings(self, now: float) -> None:
+        wall_ns = None if self._replays else time.time_ns()  # a replay says nothing of a clock
         for sample in self._readings.take().values():
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
-                self._view.on_message(key.car, key.topic, message, now)
+                self._view.on_message(key.car, key.topic, message, now, wall_ns)
                 if self._view.has_place(key.car):
                     self._lanes.on_message(key, message)
                     self._map.on_message(key, message)

@@ -1,0 +1,58 @@
+"""How far the clock of a gateway's computer is from ours. Two computers that differ by minutes look odd everywhere.
+
+Answers of such a gateway look old, or from the future; commands to it are `stale`. Stops, e-stops and pauses look at no
+clock. What tells is a state that was published just now: its stamp is of the gateway's clock, and it came now. On its
+way it can only have become older, so of several messages the one with the newest stamp tells best. One message is not
+enough: it may be the last one before a pause of a network or a process.
+
+A gateway that hangs publishes nothing, so nothing is said of its clock. A replay publishes old stamps at the usual
+rate, and is no gateway: whoever asks leaves it out. Pure.
+"""
+
+from collections import deque
+from typing import Final
+
+MAX_CLOCK_OFF_S: Final = 5.0
+"""Maximum difference of two clocks that nobody is told of. A gateway refuses a command from further in the future."""
+_KEPT: Final = 8
+"""Messages that are remembered: two seconds of four states."""
+_MIN_STAMPS: Final = 2
+_NS: Final = 1e9
+
+
+class GatewayClock:
+    """Compares the clock of one gateway with ours, by states that were published just now."""
+
+    def __init__(self) -> None:
+        self._boot_id = ""
+        self._leads: deque[tuple[int, float]] = deque(maxlen=_KEPT)
+        """Stamp (ns), and how far it was ahead of our clock when it came (s)."""
+
+    def take(self, boot_id: str, stamp_ns: int, now_ns: int) -> None:
+        """Take in a state. now_ns: our wall clock when it came."""
+        if boot_id != self._boot_id:  # another process, perhaps elsewhere
+            self._boot_id = boot_id
+            self._leads.clear()
+        self._leads.append((stamp_ns, (stamp_ns - now_ns) / _NS))
+
+    @property
+    def off_s(self) -> float | None:
+        """Return how far it is ahead of ours, s; negative: behind. None: not known yet."""
+        if len({stamp for stamp, _ in self._leads}) < _MIN_STAMPS:
+            return None
+        return max(lead for _, lead in self._leads)
+
+
+def describe_clock(car: str, off_s: float | None) -> str:
+    """Return words about a clock that is wrong by more than MAX_CLOCK_OFF_S; empty for any other."""
+    if off_s is None or abs(off_s) <= MAX_CLOCK_OFF_S:
+        return ""
+    side = "ahead of" if off_s > 0 else "behind"
+    return f"The clock of the computer of {car}'s gateway is {_words(abs(off_s))} {side} this computer's."
+
+
+def _words(off_s: float) -> str:
+    minutes, seconds = divmod(round(off_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = ((hours, "h"), (minutes, "min"), (seconds, "s"))
+    return " ".join(f"{count} {unit}" for count, unit in parts if count)
