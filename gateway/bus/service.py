@@ -7,12 +7,14 @@ Commands go before queries of values. A command waits for one turn of the loop. 
 queries of the history in another one.
 """
 
+import time
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
+from gateway.bus.identity_budgets import IdentityBudgets
 from schemas import bus, keys
 from schemas.commands import STOPS, Verb
 
@@ -78,6 +80,7 @@ class CarService:
         self._commands: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_QUERIES)
         self._large: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
         self._stream: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
+        self._budgets = IdentityBudgets()
         self.values: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_VALUE_QUERIES)
         """Queries of the latest values, each with its family."""
         self.histories: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_HISTORY_QUERIES)
@@ -92,7 +95,7 @@ class CarService:
         for expression in keys.command_keys(fleet, car):
             opened.queryable(expression, self._on_command, too_large=self._on_command)
         for expression in keys.command_keys(fleet, car, Verb.DRIVE):
-            opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD)
+            opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD, admits=self._admits)
         # A program outside of the car may publish its pose. The gateway answers queries with it.
         pose = keys.topic_key(fleet, car, "sensor/pose")
         opened.subscribe(pose, lambda sample: self._poses(pose, sample), largest=bus.LARGEST_PAYLOAD)
@@ -129,7 +132,7 @@ class CarService:
     def dropped(self) -> int:
         """Return the number of dropped items."""
         handovers = (self._commands, self._large, self._stream, self.values, self.histories, self._senders, self._cars)
-        return sum(handover.dropped for handover in handovers)
+        return sum(handover.dropped for handover in handovers) + self._budgets.dropped
 
     def _already_served(self, other: Any) -> AlreadyServed:
         return AlreadyServed(
@@ -161,6 +164,10 @@ class CarService:
         if verb in STOPS:
             return self._commands(request, reserve=MAX_QUEUED_STOPS)
         return (self._large if unread else self._commands)(request)
+
+    def _admits(self, key: str) -> bool:
+        """Return True if a drive of a stream is within the budget of its sender. Runs on a Zenoh thread."""
+        return self._budgets.take(key, time.monotonic())
 
     def _on_sample(self, sample: bus.Sample) -> None:
         """Queue a drive of a stream. Runs on a Zenoh thread."""

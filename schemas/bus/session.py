@@ -155,15 +155,24 @@ class Bus:
         return Publisher(self._session, key, topic, source, self.boot_id)
 
     def subscribe(
-        self, expression: str, callback: Callable[[Sample], object], *, largest: int | None = None
+        self,
+        expression: str,
+        callback: Callable[[Sample], object],
+        *,
+        largest: int | None = None,
+        admits: Callable[[str], bool] | None = None,
     ) -> zenoh.Subscriber[None]:
         """Subscribe. The callback runs on a Zenoh thread: it must hand over and return.
 
-        largest: maximum size of a payload in bytes (see `Sample.unread`).
+        largest: maximum size of a payload in bytes (see `Sample.unread`). admits: asked with the key of each message
+        before anything else of it is read. What it refuses is dropped.
         """
-        return self._declare(
-            lambda: self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample, largest)))
-        )
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            if admits is None or admits(str(sample.key_expr)):
+                callback(sample_of(sample, largest))
+
+        return self._declare(lambda: self._session.declare_subscriber(expression, on_sample))
 
     def subscribe_channel(self, expression: str, capacity: int) -> zenoh.Subscriber[Any]:
         """Subscribe with a channel for `try_recv`. Read it often: a full channel stalls the whole session."""

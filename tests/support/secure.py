@@ -49,15 +49,19 @@ def secure_fleet(
 @contextlib.contextmanager
 def stranger(credentials: Credentials, **tls: Any) -> Iterator[zenoh.Session]:
     """Open a plain Zenoh client, as anybody could write it, with these settings of TLS. Raises zenoh.ZError."""
-    settings = {
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(plain_settings(credentials.endpoint, tls)))) as session:
+        yield session
+
+
+def plain_settings(endpoint: str, tls: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a plain Zenoh client."""
+    return {
         "mode": "client",
-        "connect": {"endpoints": [credentials.endpoint], "timeout_ms": 2000, "exit_on_failure": True},
+        "connect": {"endpoints": [endpoint], "timeout_ms": 2000, "exit_on_failure": True},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
         "timestamping": {"enabled": True},
         "transport": {"shared_memory": {"enabled": False}, "link": {"protocols": ["tls"], "tls": tls}},
     }
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))) as session:
-        yield session
 
 
 @contextlib.contextmanager

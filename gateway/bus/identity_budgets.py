@@ -1,0 +1,45 @@
+"""How many messages of each identity a gateway reads. One person's flood must not cost the others the gateway's time.
+
+On a bus with certificates a drive of a stream has its sender's identity in its key. The key is all that is looked at
+here: a message over the budget costs one callback, and neither a copy nor a turn of the loop. The budget is ten times
+what a joystick sends. Without certificates nobody knows whose a message is before it is read, and names are free, so
+there a flood is bounded only by the queue behind this.
+"""
+
+from typing import Final
+
+from schemas import keys
+from schemas.token_bucket import TokenBucket
+
+DRIVES_PER_S: Final = 200.0
+"""Maximum drives of one identity in the long run. A page or a joystick sends ten to twenty a second."""
+DRIVES_AT_ONCE: Final = 64
+"""Maximum drives of one identity at once: what a network has held up for some seconds."""
+MAX_IDENTITIES: Final = 256
+"""Maximum remembered identities. The hub lets nobody in whom it does not know."""
+
+
+class IdentityBudgets:
+    """The budgets of all identities. Times: s, monotonic."""
+
+    def __init__(self, per_s: float = DRIVES_PER_S, at_once: float = DRIVES_AT_ONCE) -> None:
+        self._per_s = per_s
+        self._at_once = at_once
+        self._buckets: dict[str, TokenBucket] = {}
+        self.dropped = 0
+        """Number of messages over a budget."""
+
+    def take(self, key: str, now: float) -> bool:
+        """Return True if a message under this key is within the budget of its identity, and count it."""
+        identity = keys.identity_of(key)
+        if not identity:
+            return True
+        bucket = self._buckets.get(identity)
+        if bucket is None:
+            if len(self._buckets) >= MAX_IDENTITIES:
+                del self._buckets[next(iter(self._buckets))]
+            bucket = self._buckets[identity] = TokenBucket(self._per_s, self._at_once)
+        if bucket.take_one(now):
+            return True
+        self.dropped += 1
+        return False
