@@ -14,6 +14,7 @@ from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
 from fleet.client.lost_hub import describe_running, explained
 from fleet.client.outcome import NO_ANSWER, Outcome
+from fleet.client.refused import why_refused
 from fleet.commands.fleets import open_client
 from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
@@ -113,8 +114,10 @@ def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Ne
         raise no_cars(client)
     print_outcomes(outcomes, as_json=as_json)
     failed = [outcome for outcome in outcomes if not outcome.ok]
-    if all(outcome.phase == NO_ANSWER for outcome in outcomes) and (words := describe_other_fleets(client)):
-        click.echo(words, err=True)  # --fleet may be wrong
+    unanswered = all(outcome.phase == NO_ANSWER for outcome in outcomes)
+    # --fleet may be wrong, or our certificate.
+    if unanswered and (words := describe_other_fleets(client) or (not client.cars() and why_refused(client))):
+        say(words, err=True)
     wrong = bool(failed) and all(outcome.reason == Reason.BAD_VALUE for outcome in failed)
     raise SystemExit(2 if wrong else 1 if failed else 0)
 

@@ -14,6 +14,7 @@ from click.shell_completion import CompletionItem
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.lost_hub import describe_running
+from fleet.client.refused import why_refused
 from fleet.client.supervision import ask_status, fleets_on, groups_of
 from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
 from fleet.recording.time_spec import ago_s
@@ -333,7 +334,7 @@ def written_out(keyexpr: str, fleet: str) -> str:
 
 def no_cars(client: Fleet) -> click.ClickException:
     """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
-    words = describe_other_fleets(client) or "No car is connected."
+    words = describe_other_fleets(client) or why_refused(client) or "No car is connected."
     if running := describe_running(client.bus.endpoint):  # on their way back to a hub that was restarted
         words = f"No car is connected, but {running}. Repeat this in some seconds. Else go to the cars."
     return click.ClickException(words)

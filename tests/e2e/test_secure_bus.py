@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from fleet.client.client import Fleet as Client
+from fleet.client.refused import why_refused
 from fleet.hub import authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME
@@ -292,8 +293,14 @@ def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
 
 def test_whoever_is_revoked_gets_nothing_and_all_others_are_back(stage: SecureStage) -> None:
     """Last in this file: eve is gone after it."""
+
+    def refused() -> str:
+        with Client(stage.store.credentials.endpoint, kind="person", identity=EVE) as client:
+            return why_refused(client)
+
     with stage.client(EVE) as eve, stage.client(MIA) as mia:
         assert stage.command(eve, EVE, "red", Verb.STOP)
+        assert refused() == ""
         key, pem = ((stage.store.directory / f"{EVE}{ending}").read_bytes() for ending in (".key", ".pem"))
         began = time.monotonic()
         assert HubStore.load(stage.store.credentials).revoke(EVE)
@@ -306,3 +313,4 @@ def test_whoever_is_revoked_gets_nothing_and_all_others_are_back(stage: SecureSt
         (stage.store.directory / f"{EVE}{ending}").write_bytes(data)
     with stage.client(EVE) as eve:
         assert stage.command(eve, EVE, "*", Verb.STOP) == [], "nor over a new link"
+        assert EVE in refused(), "and our own programs say why"

@@ -63,6 +63,10 @@ def test_one_computer_and_another_that_joins(tmp_path: Path) -> None:
 
         assert home("hub", "revoke", "person.mia").returncode == 0
         wait_for(lambda: away("stop").returncode == 1, "mia gets nothing")
+        for refused in (away("list"), away("drive", "red", "forward", "--for", "100ms")):
+            assert refused.returncode == 1
+            assert "person.mia" in refused.stderr
+            assert "fleet hub invite" in refused.stderr
         assert away("leave").returncode == 0
         assert not [*there.glob("**/*.key")]
         assert away("list").returncode == 1
