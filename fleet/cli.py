@@ -132,8 +132,8 @@ _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (whe
 _EXTRAS: Final = {
     **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
     **dict.fromkeys(("duckdb", "pyarrow", "pandas", "matplotlib", "rosbags"), "analysis"),
-    **dict.fromkeys(("starlette", "uvicorn", "segno"), "console"),
-    **dict.fromkeys(("cryptography", "ifaddr"), "secure"),
+    **dict.fromkeys(("starlette", "uvicorn"), "console"),
+    **dict.fromkeys(("cryptography", "ifaddr", "segno", "zeroconf"), "secure"),
     "bleak": "ble",
     "prometheus_client": "metrics",
     "foxglove": "foxglove",

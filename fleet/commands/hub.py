@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import click
+import segno
 
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import cli_errors, json_option
@@ -16,8 +18,9 @@ from fleet.commands.output import show_table
 from fleet.commands.params import Number
 from fleet.hub import local_hub
 from fleet.hub.addresses import own_addresses, own_names
+from fleet.hub.discovery import announced, hubs_found
 from fleet.hub.hub_store import HubStore, KnownIdentity
-from fleet.hub.invitation import JOIN_PORT, Invitation, join
+from fleet.hub.invitation import JOIN_PORT, Invitation, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
 from schemas.bus import Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
@@ -26,6 +29,8 @@ from schemas.identity import Service
 from schemas.printable import printable
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
+MAX_JOIN_LINE: Final = 500
+"""Maximum characters of the line that `fleet join -` reads."""
 HUB_RESTART_S: Final = 2.0
 """Time in which gateways are back after a restart of the hub: half a second for it to look, and 0.5 s for a retry."""
 
@@ -80,6 +85,7 @@ def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> No
 examples:
   fleet hub invite mia
   fleet hub invite --car red
+  fleet hub invite --car red --qr
   fleet hub invite --site north"""
 )
 @click.argument("person", required=False)
@@ -90,6 +96,7 @@ examples:
 @click.option("--site", metavar="SITE", help="Invite the computer that is the hub of another site.")
 @click.option("--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen here (default: {JOIN_PORT}).")
 @click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
+@click.option("--qr", is_flag=True, help="Also draw the line to type as a QR code, for a camera and `fleet join -`.")
 @json_option
 def invite(
     person: str | None,
@@ -99,6 +106,7 @@ def invite(
     port: int,
     host: str | None,
     *,
+    qr: bool,
     as_json: bool,
 ) -> None:
     """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
@@ -132,8 +140,13 @@ def invite(
         if as_json:
             click.echo(json.dumps({"identity": invited, "host": here, "code": str(invitation.code)}))
         else:
-            click.echo(f"On the other computer, within ten minutes:\n  fleet join {here} {invitation.code}")
-        why = invitation.wait(JOIN_CODE_LIFETIME_S)
+            line = f"fleet join {here} {invitation.code}"
+            click.echo(f"On the other computer, within ten minutes:\n  {line}")
+            click.echo(f"In this network `fleet join {invitation.code}` finds this hub, too.")
+            if qr:
+                segno.make(line).terminal(sys.stdout, compact=True, border=2)
+        with announced(invitation.port, invitation.code, own_addresses() or [local_hub.LOOPBACK]):
+            why = invitation.wait(JOIN_CODE_LIFETIME_S)
     finally:
         invitation.close()
     if why:
@@ -186,33 +199,42 @@ def revoke(who: str) -> None:
     "join",
     epilog="""\b
 examples:
+  fleet join ABCD-EFGH-JKLM-NPQR-STUV-WXYZ
   fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ
-  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ --at 192.168.7.2""",
+  fleet join 192.168.1.2 ABCD-EFGH-JKLM-NPQR-STUV-WXYZ --at 192.168.7.2
+  zbarcam --raw --oneshot | fleet join -""",
 )
-@click.argument("host")
-@click.argument("code")
+@click.argument("words", nargs=-1, required=True, metavar="[HOST] CODE")
 @click.option(
     "--at",
     "site",
     metavar="HOST[:PORT]",
     help="Use the hub of a site at this address. On its own computer: 127.0.0.1.",
 )
-def join_hub(host: str, code: str, site: str | None) -> None:
+def join_hub(words: tuple[str, ...], site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.
+
+    Without HOST the hub is looked for in this network; the code tells the right one from others. With - in the place of
+    both, they are read from stdin: the line that `fleet hub invite --qr` draws for a camera.
 
     From then on every program of yours uses that hub, until `fleet leave`. With the code of `fleet hub invite --site`,
     this computer becomes the hub of another site, which is linked to the first one.
     """
     with cli_errors(), _disk_errors():
+        host, code = _host_and_code(words)
         parsed = JoinCode.parse(code)
-        name, port = _address(host, JOIN_PORT)
         at, at_port = _address(site, 0) if site else ("", 0)
-        joined = join(name, parsed, port, addresses=(*own_addresses(), *own_names()))
+        own = (*own_addresses(), *own_names())
+        if host:
+            name, port = _address(host, JOIN_PORT)
+            joined = join(name, parsed, port, addresses=own)
+        else:
+            name, joined = join_one_of(hubs_found(own_addresses() or [local_hub.LOOPBACK]), parsed, own)
         endpoint = local_hub.store_joined(name, joined, at, at_port)
         if joined.rules:
             click.echo(
                 f"This computer is the hub of {joined.identity} now, linked to {name}. `fleet up` starts it. Who uses "
-                f"it is invited on {name}, and joins with --at: on this computer, `fleet join {host} CODE --at "
+                f"it is invited on {name}, and joins with --at: on this computer, `fleet join {name} CODE --at "
                 "127.0.0.1`."
             )
             return
@@ -232,6 +254,16 @@ def leave() -> None:
         raise click.ClickException("this computer has joined no hub")
     words = f"; its authority stays in {kept}, for the next `fleet up --secure`" if kept else ""
     click.echo(f"{endpoint} is no longer used{words}")
+
+
+def _host_and_code(words: tuple[str, ...]) -> tuple[str, str]:
+    """Return host, empty if none was given, and code. Raises click.UsageError."""
+    if words == ("-",):
+        words = tuple(sys.stdin.readline(MAX_JOIN_LINE).split())
+    words = words[2:] if words[:2] == ("fleet", "join") else words
+    if not 1 <= len(words) <= 2:
+        raise click.UsageError("write the code, or host and code: fleet join [HOST] CODE")
+    return words[0] if len(words) == 2 else "", words[-1]
 
 
 def _address(written: str, default: int) -> tuple[str, int]:

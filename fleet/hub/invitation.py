@@ -11,6 +11,7 @@ import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -36,6 +37,10 @@ SOCKET_TIMEOUT_S: Final = 10.0
 
 class NotJoined(BusError):
     """The hub did not let this computer join. The text says why."""
+
+
+class NotThisHub(NotJoined):
+    """Nobody answers there, or another hub than the one that made the code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +194,7 @@ def join(
     except ValueError:
         pass
     if not fits:
-        raise NotJoined(
+        raise NotThisHub(
             f"{where} is not the hub that made this code, or the code is mistyped. Nothing was sent. If the code is "
             "right, somebody in this network pretends to be the hub."
         )
@@ -210,6 +215,24 @@ def join(
         raise NotJoined(f"{where} gave no certificate") from None
 
 
+def join_one_of(found: Iterable[str], code: JoinCode, addresses: Iterable[str] = ()) -> tuple[str, Joined]:
+    """Join the hub that made a code. found: addresses, host:port, of any hubs. Return its host, too. Raises NotJoined.
+
+    Those that did not make the code learn nothing of it (see `join`).
+    """
+    own, tried = list(addresses), 0
+    for each in found:
+        host, _, port = each.rpartition(":")
+        with suppress(NotThisHub):
+            return host, join(host, code, int(port), addresses=own)
+        tried += 1
+    others = f" {tried} other{'s' * (tried != 1)} did not make this code." if tried else ""
+    raise NotJoined(
+        f"no hub in this network waits for you.{others} `fleet hub invite NAME` must run on its computer now. If "
+        "this network passes no multicast, write its address: fleet join HOST CODE"
+    )
+
+
 def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -> dict[str, Any]:
     """Send a request and return the fields of the answer. Raises NotJoined."""
     connection = http.client.HTTPSConnection(where, timeout=SOCKET_TIMEOUT_S, context=context)
@@ -226,7 +249,7 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
             "and is this the address that `fleet hub invite` shows?"
         ) from None
     except (OSError, http.client.HTTPException) as error:
-        raise NotJoined(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
+        raise NotThisHub(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
     except (ValueError, KeyError, TypeError):
         raise NotJoined(f"{where} is no hub: its answer is not understood") from None
     finally:

@@ -1,0 +1,77 @@
+"""Finds the hub that waits for somebody to join, by multicast DNS (zeroconf), so that its address need not be typed.
+
+The hub is announced for as long as its invitation waits. Anybody in the network may announce anything, and who joins
+believes none of it: the code tells the right hub from another (join_code.py). So whoever lies here can at most send
+somebody to a hub that the code refuses, and there is a limit to how many are tried.
+"""
+
+import socket
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Final
+
+from zeroconf import IPVersion, ServiceBrowser, ServiceInfo, Zeroconf
+
+from fleet.hub.join_code import JoinCode
+
+JOIN_SERVICE: Final = "_car-fleet-hub._tcp.local."
+SEARCH_S: Final = 3.0
+"""Maximum time to look for a hub: the questions go out after 0, 1 and 3 s."""
+MAX_FOUND_HUBS: Final = 16
+"""Maximum hubs that are tried."""
+_RESOLVE_MS: Final = 1000
+_SEARCH_POLL_S: Final = 0.05
+
+
+@contextmanager
+def announced(port: int, code: JoinCode, addresses: Sequence[str]) -> Iterator[bool]:
+    """Announce an invitation at this port while the block runs. Yield False where the network has no multicast."""
+    info = ServiceInfo(
+        JOIN_SERVICE,
+        f"{_instance(code)}.{JOIN_SERVICE}",
+        addresses=[socket.inet_aton(each) for each in addresses],
+        port=port,
+    )
+    try:
+        server = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
+    except OSError:
+        yield False
+        return
+    try:
+        server.register_service(info, allow_name_change=True)
+        yield True
+    finally:
+        server.close()
+
+
+def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterator[str]:
+    """Yield host:port of hubs that wait for somebody, as they are found. addresses: of this computer."""
+    try:
+        browser = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
+    except OSError:
+        return
+    heard: deque[str] = deque(maxlen=MAX_FOUND_HUBS)
+    seen: set[str] = set()
+    try:
+        ServiceBrowser(browser, JOIN_SERVICE, handlers=[lambda **found: heard.append(str(found["name"]))])
+        until = time.monotonic() + timeout_s
+        while time.monotonic() < until and len(seen) < MAX_FOUND_HUBS:
+            if not heard:
+                time.sleep(_SEARCH_POLL_S)
+                continue
+            info = browser.get_service_info(JOIN_SERVICE, heard.popleft(), _RESOLVE_MS)
+            places = [] if info is None else [f"{each}:{info.port}" for each in info.parsed_addresses(IPVersion.V4Only)]
+            for where in places:
+                if where not in seen and len(seen) < MAX_FOUND_HUBS:
+                    seen.add(where)
+                    yield where
+    finally:
+        with suppress(OSError):
+            browser.close()
+
+
+def _instance(code: JoinCode) -> str:
+    """Return the name of an announcement. The begin of the authority's fingerprint is no secret."""
+    return f"hub-{code.pin[:8].lower()}"
