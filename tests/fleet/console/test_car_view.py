@@ -256,3 +256,19 @@ def test_of_pauses_of_one_rank_the_newest_is_shown() -> None:
         safety.pauses.add(id=by, by=by, rank="person")
     view.on_message("red", "state/safety", safety, 1.0)
     assert view.as_list(1.0)[0]["pause"]["by"] == "bob"
+
+
+@pytest.mark.parametrize(("off_s", "named"), [(-240, True), (240, True), (2, False)])
+def test_a_wrong_clock_of_a_gateway_is_named_but_not_that_of_a_recording(off_s: int, named: bool) -> None:
+    def findings(*, live: bool) -> str:
+        view = FleetView(lambda *_: "#ff0000")
+        view.on_presence(["red"], 9.0)
+        for second in (10, 11):
+            link = pb.Link(state="online", boot_id="a")
+            link.stamp.seconds = 1_000 + second + off_s
+            wall_ns = (1_000 + second) * 10**9 if live else None
+            view.on_message("red", "state/link", link, float(second), wall_ns)
+        return " ".join(view.look_up("red").diagnose(11.0)["findings"])
+
+    assert ("clock" in findings(live=True)) is named
+    assert "clock" not in findings(live=False)
