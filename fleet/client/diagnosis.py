@@ -309,7 +309,7 @@ CHECKS: Final = (
     DoctorCheck("gateway_ended", _ended, "fleet logs {car}"),
     DoctorCheck("no_gateway", _absent, "fleet up"),
     DoctorCheck("gateway_hung", _hung, "fleet logs {car}"),
-    DoctorCheck("clock_off", _wrong_clock, "date -u"),
+    DoctorCheck("clock_off", _wrong_clock, "fleet list {car}"),
     DoctorCheck("adapter_full", _adapter_full, "fleet check"),
     DoctorCheck("link_down", _lost, "fleet scan"),
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),

@@ -8,6 +8,7 @@ command's message, so the gateway logs the same. It is in the recording, too, in
 A line of a client says what was sent and how it ended. A gateway has one line for each record of `event/command`.
 """
 
+import io
 import json
 import logging
 import os
@@ -20,6 +21,7 @@ JSON_FORMAT: Final = "json"
 COMMANDS: Final = "fleet.commands"
 """Name of the logger of lines about commands. Without JSON its lines go nowhere: texts say the same in better words."""
 _FIELDS: Final = "fleet_fields"
+_STDERR: Final = "stderr"
 
 
 def is_wanted() -> bool:
@@ -54,6 +56,27 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, default=str)
 
 
+class _JsonLines(io.TextIOBase):
+    """Takes the place of stderr: what is written there for a person becomes log lines, too."""
+
+    encoding = "utf-8"
+    errors = "replace"
+
+    def __init__(self) -> None:
+        self._rest = ""
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Log each whole line."""
+        *whole, self._rest = (self._rest + text).split("\n")
+        for line in filter(str.strip, whole):
+            logging.getLogger(__name__).warning("%s", line, extra=fields(stream=_STDERR))
+        return len(text)
+
+
 def begin(process: str) -> bool:
     """Let this process log as JSON if FLEET_LOG says so. Return whether it does."""
     if not is_wanted():
@@ -61,15 +84,20 @@ def begin(process: str) -> bool:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
+    sys.stderr = _JsonLines()
     return True
 
 
 def message_in(line: str) -> tuple[str, str] | None:
-    """Return level and message of a line that a process of ours has logged as JSON. None if it is none."""
+    """Return level and message of a line that a process of ours has logged as JSON. None if it is none.
+
+    What it said to a person on stderr counts as an error: it may have been its last words.
+    """
     if not line.startswith("{"):
         return None
     try:
         found = json.loads(line)
-        return str(found["level"]).upper(), str(found["message"])
-    except (ValueError, KeyError, TypeError):
+        said = found.get("stream") == _STDERR
+        return "ERROR" if said else str(found["level"]).upper(), str(found["message"])
+    except (ValueError, KeyError, TypeError, AttributeError):
         return None

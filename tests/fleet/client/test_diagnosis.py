@@ -71,6 +71,7 @@ ODD: dict[str, CarEvidence] = {
     ),
     "link_breaks": with_states(link=pb.Link(state="online", rx_frames=90, reconnects=3)),
     "gateway_restarted": evidence(process=process(restarts=2, words="killed by signal 9")),
+    "clock_off": evidence(process=process(), coordinated=True, clock_off_s=-240.0),
     "overloaded": with_states(health=pb.Health(platform="arduino", loop_lag_s=0.8)),
     "flooded": with_states(link=pb.Link(state="online", rx_frames=90, tx_airtime=0.95)),
     "held": with_states(safety=pb.Safety(motors="off", trust="stopped", hold=pb.Hold(by="mia"))),

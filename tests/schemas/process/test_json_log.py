@@ -25,5 +25,7 @@ def test_a_line_is_one_object_and_one_line_whatever_its_texts_hold() -> None:
 
 def test_the_supervisor_reads_the_words_of_such_a_line() -> None:
     assert message_in(line_of("no link", level=logging.ERROR)) == ("ERROR", "no link")
+    assert message_in(line_of("no link", level=logging.WARNING)) == ("WARNING", "no link")
+    assert message_in(line_of("bye", level=logging.WARNING, stream="stderr")) == ("ERROR", "bye")
     for other in ("", "{", "[1]", "{}", "12:00:00 UTC ERROR no link", '{"level": "error"}', "null"):
         assert message_in(other) is None
