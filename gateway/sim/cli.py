@@ -66,6 +66,7 @@ faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may b
   --fault red:firehose@5+10,rate=1e6    random bytes/s besides its readings; ,of=frame: a frame that never ends
   --fault red:garbage@5+200             200 random bytes to the host; ,to=car: the other way
   --fault brownout@10                   every car resets; only red with red: before it
+  --fault red:empty@5+20                its battery runs empty within 20 s; then it is off, and its link is gone
 faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends a fault (rename and
 cut_write end as link_drop does); without "for_s" a fault lasts until then:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}

@@ -35,6 +35,7 @@ class FaultKind(StrEnum):
     FIREHOSE = "firehose"
     GARBAGE = "garbage"
     BROWNOUT = "brownout"
+    EMPTY = "empty"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,10 @@ class Fault:
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
-    """Duration in seconds. 0 ends the fault now. None: until the same kind comes with 0 (a lost link: link_drop)."""
+    """Duration in seconds. 0 ends the fault now. None: until the same kind comes with 0 (a lost link: link_drop).
+
+    Of `empty`: the time until the battery is.
+    """
     bytes: int = 0
     """Number of bytes of garbage, or of the next frame before the cut."""
     ways: tuple[Direction, ...] = tuple(Direction)
@@ -82,7 +86,7 @@ def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[st
     if act.car is not None and act.car not in names:
         raise BadSpec(f"car {act.car!r} is not simulated here: use {', '.join(names)}")
     chosen = [car for car in cars if act.car in (None, car.name)]
-    if isinstance(act, Press) or act.kind is FaultKind.BROWNOUT:
+    if isinstance(act, Press) or act.kind in (FaultKind.BROWNOUT, FaultKind.EMPTY):
         what = "ir" if isinstance(act, Press) else act.kind.value
         simulated = [car.name for car in chosen if isinstance(car, CarSpec)]
         if not simulated:
@@ -115,6 +119,7 @@ _FIELDS: Final[Mapping[FaultKind, Mapping[str, object]]] = {
     FaultKind.FIREHOSE: {"for_s": None, "rate": 1e6, "of": "noise"},
     FaultKind.GARBAGE: {"bytes": 100, "to": "host"},
     FaultKind.BROWNOUT: {},
+    FaultKind.EMPTY: {"for_s": 20.0},
 }
 """The fields of each kind with their defaults."""
 _RANGES: Final = {

@@ -254,7 +254,18 @@ class SimCar:
                     self._link.send(self._rng.randbytes(fault.bytes))
             case FaultKind.BROWNOUT:
                 await self._brown_out()
+            case FaultKind.EMPTY:
+                for_s = fault.for_s or 0.0
+                if isinstance(self.firmware, Firmware | UgvCar):
+                    self.firmware.drain(now, for_s)
+                self._loop.call_later(for_s, lambda: self._later(self._go_out()))
         self._pump()
+
+    async def _go_out(self) -> None:
+        """Switch the car off: its battery is empty. Its link is gone until somebody ends `link_drop`."""
+        if isinstance(self.firmware, Firmware | UgvCar):
+            self.firmware.brown_out(self._loop.time())
+        await self._drop(None)
 
     async def _brown_out(self) -> None:
         if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpEndpoint):

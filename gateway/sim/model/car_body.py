@@ -27,6 +27,8 @@ LINE_SENSORS: Final = ((0.08, 0.040), (0.08, 0.010), (0.08, -0.010), (0.08, -0.0
 LAMP_SIDE: Final = radians(30)
 LAMP_CONE: Final = radians(50)
 
+CUT_OFF_V: Final = 6.4
+"""Voltage at which the electronics cut off."""
 FLOOR_GRAY: Final = 214
 TAPE_GRAY: Final = 740
 
@@ -42,6 +44,8 @@ class CarBody:
         self._left = self._right = 0
         self._battery = 7.6 + 0.7 * rng.random()
         self._started = now
+        self._drain: tuple[float, float] | None = None
+        """From when to when the battery runs empty."""
         world.join(self, now)
 
     @property
@@ -207,10 +211,18 @@ class CarBody:
         return TAPE_GRAY if self._world.line and self._world.on_line(self._x, self._y) else FLOOR_GRAY
 
     def battery_v(self, now: float) -> float:
-        """Return the battery voltage, at least 6.4 V, where the electronics cut off."""
+        """Return the battery voltage, at least CUT_OFF_V."""
         # It falls by 0.3 V per hour, and by up to 0.25 V under load.
         load = 0.25 * (abs(self._left) + abs(self._right)) / 510
-        return max(6.4, self._battery - 0.3 * (now - self._started) / 3600 - load)
+        volts = self._battery - 0.3 * (now - self._started) / 3600 - load
+        if self._drain is not None:
+            begin, end = self._drain
+            volts -= (volts - CUT_OFF_V) * min(1.0, (now - begin) / max(end - begin, 1e-9))
+        return max(CUT_OFF_V, volts)
+
+    def drain(self, now: float, in_s: float) -> None:
+        """Let the battery run empty within a time."""
+        self._drain = now, now + in_s
 
     def yaw_rate_deg_s(self, now: float) -> float:
         """Return the yaw rate."""

@@ -73,6 +73,9 @@ class CarBodyState(Protocol):
     def grayscale(self, now: float) -> int:
         """Return the raw ADC value of the floor, 0..1023."""
 
+    def drain(self, now: float, in_s: float) -> None:
+        """Let the battery run empty within a time."""
+
     def battery_v(self, now: float) -> float:
         """Return the battery voltage."""
 
@@ -237,6 +240,10 @@ class Firmware:
         """Cut the link: bytes on the wire are lost. The car notices nothing and keeps a truncated frame."""
         self._run(now)
         self._arrivals.clear()
+
+    def drain(self, now: float, in_s: float) -> None:
+        """Let the battery run empty within a time."""
+        self._body.drain(now, in_s)
 
     def brown_out(self, now: float) -> None:
         """Let the battery sag. The motors stop, the frame being sent is truncated, and the program reboots."""

@@ -178,6 +178,10 @@ class UgvCar:
         self._arrivals.clear()
         self._out.clear()
 
+    def drain(self, now: float, in_s: float) -> None:
+        """Let the battery run empty within a time."""
+        self._body.drain(now, in_s)
+
     def brown_out(self, now: float) -> None:
         """Reset the car."""
         self._run(now)

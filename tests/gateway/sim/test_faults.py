@@ -35,6 +35,7 @@ GOOD_FAULTS = [
     ("echo@1+9", Scheduled(1.0, Fault(FaultKind.ECHO, for_s=9.0))),
     ("firehose@1", Scheduled(1.0, Fault(FaultKind.FIREHOSE, rate=1e6))),
     ("firehose@1,of=frame,rate=960", Scheduled(1.0, Fault(FaultKind.FIREHOSE, rate=960.0, flood=Flood.FRAME))),
+    ("red:empty@5", Scheduled(5.0, Fault(FaultKind.EMPTY, "red", for_s=20.0))),
     ("brownout@10", Scheduled(10.0, Fault(FaultKind.BROWNOUT))),
 ]
 

@@ -22,7 +22,9 @@ from fleet.examples import EXAMPLES
 from gateway.sim.car_spec import parse_cars
 from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, FaultKind
+from gateway.sim.model.car_body import CUT_OFF_V
 from gateway.sim.model.faulty_link import Direction
+from gateway.sim.model.firmware import Firmware
 from gateway.sim.simulation import Simulation
 from gateway.sim.truth_publisher import HUB_RETRY_DELAY_S, TruthPublisher
 from schemas.bus import Bus, Sample
@@ -589,3 +591,18 @@ async def test_the_options_of_a_car_reach_its_program() -> None:
     assert simulation.cars["blue"].truth.driving
     writer.close()
     await simulation.stop()
+
+
+async def test_empty_battery_falls_then_car_and_link_are_off(pair: Simulation) -> None:
+    host, port = where(pair, "blue")
+    _, writer = await asyncio.open_connection(host, port)
+    writer.write(RUN)
+    await until(lambda: pair.cars["blue"].truth.driving, "drives")
+    await pair.inflict(Fault(FaultKind.EMPTY, "blue", for_s=0.3))
+    await until(lambda: not pair.cars["blue"].truth.driving, "is off")
+    firmware = pair.cars["blue"].firmware
+    assert isinstance(firmware, Firmware)
+    assert firmware._body.battery_v(asyncio.get_running_loop().time()) == CUT_OFF_V
+    with pytest.raises(ConnectionError):
+        await asyncio.open_connection(host, port)
+    writer.close()
