@@ -60,5 +60,5 @@ class LaneFeed(PageFeed):
         now = time.time_ns()
         if page.has_unsent("lanes"):
             back_ns = LIVE_LANES_NS  # a whole one may be what waits
-        spans = [span.as_list() for span in self._lanes.since(now - back_ns)]
+        spans = [span.as_list() for span in (*self._lanes.since(now - back_ns), *self._lanes.silences(now))]
         page.show("lanes", json.dumps({"t": "lanes", "spans": spans}, separators=(",", ":")))

@@ -124,10 +124,11 @@ def samples_of(
     }
 
 
-def lanes_as_dict(lanes: Lanes) -> dict[str, Any]:
-    """Return lanes and marks as JSON values."""
+def lanes_as_dict(lanes: Lanes, end_ns: int) -> dict[str, Any]:
+    """Return lanes and marks as JSON values. end_ns: the end of the recording."""
     marks = sorted(lanes.marks, key=lambda each: each.at_ns)
+    spans = (*lanes.since(0), *lanes.silences(end_ns))
     return {
-        "spans": [span.as_list() for span in lanes.since(0) if is_shown(span.car)],
+        "spans": [span.as_list() for span in spans if is_shown(span.car)],
         "marks": [[each.at_ns // _MS, each.words, each.by] for each in marks],
     }

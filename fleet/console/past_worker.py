@@ -46,7 +46,7 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
 
 def _lanes(session: Session) -> dict[str, Any]:
     about = of_session(session)
-    found = lanes_as_dict(lanes_of(session))
+    found = lanes_as_dict(lanes_of(session), about.end_ns)
     return found | {"begin_ms": about.start_ns // _MS, "end_ms": about.end_ns // _MS, "cars": list(about.cars)}
 
 

@@ -31,9 +31,10 @@ MAX_SPANS: Final = 4096
 hour with them."""
 MAX_OPEN_STOPS: Final = 64
 """Maximum number of stops of a car without an end. Their records may be lost."""
+NOT_HEARD: Final = "not heard"
+"""Words of a loss: the gateway of the car says nothing."""
 _MOVING: Final = frozenset(Motion) - {Motion.STOP}
 _BAD_ENDS: Final = frozenset({Phase.FAILED, Phase.EXPIRED, Phase.REJECTED})
-_SILENT: Final = "not heard"
 _LAST_PHASES: Final = _BAD_ENDS | {Phase.COMPLETE, Phase.SUPERSEDED}
 
 
@@ -119,6 +120,12 @@ class Lanes:
         for _, spans in sorted(self.spans.items()):
             yield from (span for span in spans if span.end_ns >= at_ns)
 
+    def silences(self, now_ns: int) -> Iterator[LaneSpan]:
+        """Yield a loss for each car that has not been heard for too long by now, and may never be again."""
+        for car, heard_ns in sorted(self._heard_ns.items()):
+            if now_ns - heard_ns > HELD_NS:
+                yield LaneSpan(car, Lane.LOSS, heard_ns, now_ns, NOT_HEARD, bad=True)
+
     def at(self, at_ns: int) -> dict[tuple[str, Lane], LaneSpan]:
         """Return what was so at a time, by car and lane."""
         found = {}
@@ -149,7 +156,7 @@ class Lanes:
         if before is not None and at_ns - before > HELD_NS:
             spans = self._spans(car, Lane.LOSS)
             current = spans.pop() if spans and self._open.get((car, Lane.LOSS)) is spans[-1] else None
-            spans.append(LaneSpan(car, Lane.LOSS, before, at_ns, _SILENT, bad=True))
+            spans.append(LaneSpan(car, Lane.LOSS, before, at_ns, NOT_HEARD, bad=True))
             if current is not None:
                 spans.append(current)
 
@@ -174,7 +181,11 @@ class Lanes:
 def _kept_by(safety: Any) -> str:
     """Return what keeps a car from moving: an e-stop, the pause of the fleet, or a hold. Empty: nothing."""
     if safety.estops:
-        return f"e-stop by {keys.person_of(safety.estops[0].by)}"
+        return f"e-stop by {keys.person_of(safety.estops[0].by)}{_because(safety.estops[0].why)}"
     if (pause := binding_pause(safety.pauses)) is not None:
-        return f"pause by {keys.person_of(pause.by)}"
+        return f"pause by {keys.person_of(pause.by)}{_because(pause.why)}"
     return f"hold by {keys.person_of(safety.hold.by)}" if safety.HasField("hold") else ""
+
+
+def _because(why: str) -> str:
+    return f": {why}" if why else ""

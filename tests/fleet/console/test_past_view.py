@@ -136,7 +136,7 @@ def test_names_and_numbers_that_are_none_reach_no_page() -> None:
     lanes = Lanes()
     for each in odd:
         lanes.add(each.key.car, each.key.topic, each.message, each.log_ns)
-    assert {span[0] for span in lanes_as_dict(lanes)["spans"]} == {"red"}
+    assert {span[0] for span in lanes_as_dict(lanes, 2 * S)["spans"]} == {"red"}
 
 
 def test_the_lanes_of_a_session_come_with_its_times_and_marks(session: Path) -> None:

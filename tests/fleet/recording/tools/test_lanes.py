@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from fleet.recording.tools.lanes import MAX_SPANS, Lane, Lanes
+from fleet.recording.tools.lanes import MAX_SPANS, NOT_HEARD, Lane, Lanes
 from schemas.gen import fleet_v1_pb2 as pb
 
 S = 1_000_000_000
@@ -90,6 +90,20 @@ def test_what_a_lane_shows(
     found = [(each.begin_ns / S, each.end_ns / S, each.words, each.bad) for each in lanes.since(0)]
     assert found == spans
     assert {each.lane for each in lanes.since(0)} <= {lane}
+
+
+def test_a_car_that_is_not_heard_any_more_is_lost_until_now() -> None:
+    lanes = Lanes()
+    for car, last_s in (("red", 4), ("blue", 9)):
+        lanes.add(car, LINK, pb.Link(state="online"), 0)
+        lanes.add(car, LINK, pb.Link(state="online"), 2 * S)
+        lanes.add(car, LINK, pb.Link(state="online"), last_s * S)
+    assert [each.as_list() for each in lanes.silences(10 * S)] == [["red", "loss", 4000, 10_000, NOT_HEARD, True]]
+    lanes.add("red", LINK, pb.Link(state="online"), 11 * S)
+    assert list(lanes.silences(11 * S)) == []
+    assert [each.as_list() for each in lanes.since(0) if each.car == "red"] == [
+        ["red", "loss", 4000, 11_000, NOT_HEARD, True]
+    ]
 
 
 def test_what_is_so_at_a_time_is_the_later_of_two_that_touch() -> None:
