@@ -16,7 +16,19 @@ from schemas.authority import binding_pause
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import name_of
 from schemas.local_time import clock
-from schemas.words import BatteryLevel, CarTrust, LinkState, Mode, Phase, Platform, Reason, Shows, Verdict
+from schemas.words import (
+    Basis,
+    BatteryLevel,
+    CarTrust,
+    LinkState,
+    Mode,
+    Motors,
+    Phase,
+    Platform,
+    Reason,
+    Shows,
+    Verdict,
+)
 
 RECENT_COMMAND_S: Final = 600.0
 """Maximum age of a command that `fleet doctor` looks at."""
@@ -386,6 +398,25 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
         yield "reports", describe_reports(health)
     yield "refused", _describe_refused(evidence)
     yield "services", ", ".join(_services(evidence, health))
+
+
+def doubtful(evidence: CarEvidence) -> set[str]:
+    """Return the names of what `describe` says and the car has not shown: it may be otherwise."""
+    state = evidence.state
+    if not state.present:
+        return set(state.claims(evidence.now).by_name)
+    found = set()
+    if state.mode.asked and state.mode.verdict != Verdict.CONFIRMED:
+        found.add("mode")
+    if state.safety.motors == Motors.UNKNOWN or (
+        state.safety.motors == Motors.OFF and state.safety.motors_basis != Basis.SHOWN
+    ):
+        found.add("motors")
+    if state.link.state not in ("", LinkState.ONLINE, LinkState.QUIET):
+        found.add("link")
+    if state.health.platform and (state.health.doubted or state.health.shows_stops != Shows.YES):
+        found.add("reports")
+    return found
 
 
 def describe_reports(health: Any) -> str:

@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Any, Final
 
 from fleet.client.car_state import CarState
-from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
+from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose, doubtful
 from fleet.client.gateway_clock import GatewayClock
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
@@ -140,13 +140,14 @@ class CarView:
         return describe_gateway(*(self.state.of(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def diagnose(self, now: float) -> dict[str, Any]:
-        """Return what `fleet doctor` says of the car, as far as its messages tell."""
+        """Return what `fleet doctor` says of the car, as far as its messages tell. A fact: name, words, in doubt."""
         state = self.state if self._changed_at is not None else CarState(self.name, present=False)
         evidence = CarEvidence(
             state, now, [(now - at, event) for at, event in self._events], clock_off_s=self._clock.off_s
         )
         # Recorder and plan have pages of their own.
-        facts = [(name, words) for name, words in describe(evidence) if name != "services"]
+        doubts = doubtful(evidence)
+        facts = [(name, words, name in doubts) for name, words in describe(evidence) if name != "services"]
         return {"findings": [str(finding) for finding in diagnose(evidence)], "facts": facts}
 
     def as_dict(self, now: float) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any, Final
 
+from fleet.policy.decision import LEFT_ALONE
 from fleet.policy.plan.plan import version_of
 from schemas import keys, messages
 from schemas.words import Level
@@ -63,7 +64,7 @@ class PlanView:
         shown: dict[str, Any] = {"running": self._running, "plan": None, "log": self._log}
         if plan is None:
             return shown
-        roles = [] if assignment is None else [role.name for role in assignment.roles]
+        roles = [] if assignment is None else [role.name for role in assignment.roles if role.name != LEFT_ALONE]
         shown["plan"] = {"text": plan.text, "name": plan_name(plan.text, roles), "set_by": plan.set_by}
         if assignment is not None:
             shown["roles"] = [{"name": role.name, "cars": list(role.cars)} for role in assignment.roles]
