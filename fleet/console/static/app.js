@@ -119,10 +119,24 @@ const onStopClick = () => {
 const stopDetail = (car) =>
   car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s, clock(car.moved_at_ms ?? car.at_ms));
 
-const Stopped = ({ car }) => html`<li class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
-  <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${stopDetail(car)} />
-  ${car.state === "failed" ? ` ${car.words}` : ""}
+const SAID_TWICE = /^NOT CONFIRMED: /;
+// Folded, a failed car is its name beside the line that says how many failed.
+const Stopped = ({ car, isShort }) => html`<li class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
+  ${isShort
+    ? html`<span class="bad"><span aria-hidden="true">${stopStates.failed[0]}</span> ${car.name}<span class="unseen"> ${stopStates.failed[1]}</span></span>`
+    : html`<strong>${car.name}</strong> <${Verdict} table=${stopStates} name=${car.state} detail=${stopDetail(car)} />
+        ${car.state === "failed" ? ` ${car.words.replace(SAID_TWICE, "")}` : ""}`}
 </li>`;
+
+// The content ends above the report that lies over it: whatever its height, the last button can be scrolled into view.
+// Only the content gets the height: on the root it would make a slow phone style the whole page anew.
+const cover = (height) => document.getElementById("content")?.style.setProperty("--covered", height);
+const covered = new ResizeObserver(([{ target }]) => cover(`${target.offsetHeight}px`));
+function noteReport(report) {
+  covered.disconnect();
+  cover("");
+  if (report !== null) covered.observe(report);
+}
 
 // One line, so that it covers no pad. Which cars failed is never folded away.
 let reportSeen = [0, 0];
@@ -134,13 +148,14 @@ function Report({ report }) {
   if (report.over && failed.length === 0 && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
   const words = t.stopSummary(report.cars, report.closed);
   const isUnfolded = unfolded === report.number;
+  const line = failed.length > 0 && !isUnfolded ? t.stopFailed(failed.length) : words;
   const others = isUnfolded ? report.cars.filter((car) => car.state !== "failed") : [];
-  return html`<div class="report" data-report=${report.number}>
+  return html`<div class="report" data-report=${report.number} ref=${noteReport}>
     <p class="unseen" role="status">${t.stopVerbs[report.verb]}: ${words}</p>
     <button class="report-line" aria-expanded=${isUnfolded} onClick=${() => setUnfolded(isUnfolded ? 0 : report.number)}>
-      <span><strong>${t.stopVerbs[report.verb]}</strong>: ${words}</span> <span aria-hidden="true">${isUnfolded ? "▴" : "▾"}</span>
+      <span><strong>${t.stopVerbs[report.verb]}</strong>: ${line}</span> <span aria-hidden="true">${isUnfolded ? "▴" : "▾"}</span>
     </button>
-    <ul class="plain chips">${[...failed, ...others].map((car) => html`<${Stopped} key=${car.name} car=${car} />`)}</ul>
+    <ul class="plain chips">${[...failed, ...others].map((car) => html`<${Stopped} key=${car.name} car=${car} isShort=${!isUnfolded} />`)}</ul>
   </div>`;
 }
 
@@ -160,6 +175,7 @@ function StopBar() {
   return html`<section class="stopbar" aria-label="STOP">
     ${asking && (mayPause || asking === "estop") &&
     html`<div class="estop" data-asking=${asking}>
+      <p>${asking === "estop" ? t.estopEffect : t.pauseEffect}</p>
       <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} onKeyDown=${onWhyKey} /></label>
       <button class="danger" onClick=${act}>
         ${asking === "estop" ? t.estopNow : t.pauseNow}</button>
@@ -167,12 +183,12 @@ function StopBar() {
     </div>`}
     <div class="stop-row">
       <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
-        <${Icon} path=${DRAWINGS.stop} /><span>${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small>${t.stopKeys}</small>`}</span>
+        <${Icon} path=${DRAWINGS.stop} /><span>${store.unpaired === "revoked" ? t.stopDead : html`${t.stop} <small class="keys">${t.stopKeys}</small><small>${t.stopMeans}</small>`}</span>
       </button>
       ${mayPause &&
       html`<button id="pause" class=${store.rights === null ? "later" : ""} aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>
-        <${Icon} path=${DRAWINGS.pause} />${t.pause}</button>`}
-      ${!isGuest() && html`<button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><${Icon} path=${DRAWINGS.estop} />${t.estop}</button>`}
+        <span><${Icon} path=${DRAWINGS.pause} /> ${t.pause}</span><small>${t.pauseMeans}</small></button>`}
+      ${!isGuest() && html`<button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}><span><${Icon} path=${DRAWINGS.estop} /> ${t.estop}</span><small>${t.estopMeans}</small></button>`}
     </div>
   </section>`;
 }
@@ -232,10 +248,10 @@ function PastBar() {
   if (past === null) return null;
   const isComing = past.shown === null || past.shown.at_ms !== past.at_ms;
   return html`<div class="past-bar" role="status" data-past-at=${past.at_ms} data-coming=${isComing}>
-    <strong>${t.pastOf(past.at_ms > 0 ? when({ at_ms: past.at_ms, zone_s: store.state.zone_s }, 10) : "")}</strong>
+    <strong><span class="dim">${t.pastIs}</span> ${t.pastOf(past.at_ms > 0 ? when({ at_ms: past.at_ms, zone_s: store.state.zone_s }, 10) : "")}</strong>
     <button onClick=${() => jump(past.session, past.at_ms - 10_000)} aria-label=${t.timeBack(10)}>−10 s</button>
     <button onClick=${() => jump(past.session, past.at_ms + 10_000)} aria-label=${t.timeOn(10)}>+10 s</button>
-    <button class="main" data-live-now onClick=${goLive}>${t.backToNow}</button>
+    <button class="main" data-live-now onClick=${goLive}>${t.backToLive}<span class="to-now">${t.backToNow}</span></button>
     <span class="dim">${t.pastStops}</span>
     ${past.words && html`<span class="bad">⚠ ${past.words}</span>`}
   </div>`;

@@ -1,29 +1,21 @@
 // The board: what a whole room reads from the wall. Who leads lets a class join here, and gives each device a person and a car.
 
-import { command, isRefused, store, who } from "./console.js";
-import { troublesOf } from "./fleet-page.js";
+import { directionOf, holderOf, modeWords, motionWords, troublesOf } from "./car-words.js";
+import { command, isRefused, store } from "./console.js";
 import { post, useCode, useLan } from "./people-page.js";
-import { arrows, modes, t } from "./texts.js";
+import { arrows, t } from "./texts.js";
 import { html, Results, useState } from "./ui.js";
 
 const LESSON_MINUTES = [10, 45, 90];
 
-// Who has a car, and how: a drive that runs, a loan, a lease.
-function holderOf(car) {
-  const { owner, motion } = car.motion;
-  if (motion in arrows && owner) return t.boardDrives(who(owner));
-  if (car.loan) return t.lentMark(car.loan.to);
-  if (car.lease) return t.boardHolds(who(car.lease.holder));
-  return t.boardFree;
-}
-
 function Tile({ car }) {
-  const [arrow, words] = arrows[car.motion.motion] ?? ["", ""];
+  const direction = directionOf(car);
   const troubles = troublesOf(car);
-  return html`<li class=${`car board-tile ${words ? "moving" : ""} ${troubles.length > 0 ? "bad-tile" : ""}`} style=${{ "--car": car.color }} data-board=${car.name}>
-    <h2>${car.name}${arrow && html` <span aria-hidden="true">${arrow}</span>`}</h2>
-    <p><strong>${holderOf(car)}</strong></p>
-    <p class="dim">${[words, modes[car.mode.asked]?.[0] ?? car.mode.asked, car.hold && t.boardHeld(who(car.hold))].filter(Boolean).join(" · ")}</p>
+  const holder = holderOf(car);
+  return html`<li class=${`car board-tile ${direction === "none" ? "" : "moving"} ${troubles.length > 0 ? "bad-tile" : ""}`} style=${{ "--car": car.color }} data-board=${car.name}>
+    <h2>${car.name}${direction !== "none" && html` <span aria-hidden="true">${arrows[direction]?.[0] ?? "»"}</span>`}</h2>
+    <p><strong>${holder}</strong></p>
+    <p class="dim">${[motionWords(car), modeWords(car.mode.asked)].filter((words) => words !== holder).join(" · ")}</p>
     ${troubles.length > 0 && html`<p class="bad">⚠ ${troubles.map((each) => each.words).join(", ")}</p>`}
   </li>`;
 }

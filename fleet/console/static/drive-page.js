@@ -3,8 +3,9 @@
 import {
   askBySocket, changed, command, isHeld, isMine, isRefused, isShared, lease, on, onTick, press, refusals, release, select, shownCars, store, who,
 } from "./console.js";
+import { driverOf, modeWords, motionWords, troublesOf } from "./car-words.js";
 import { modes, motions, pad, t } from "./texts.js";
-import { Battery, html, Refused, Results, SetChips, useEffect, useRef, useState } from "./ui.js";
+import { Battery, html, Rail, Refused, Results, SetChips, useEffect, useRef, useState } from "./ui.js";
 
 const KEYS = {
   ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
@@ -159,15 +160,11 @@ function Selection({ cars }) {
   const isOn = (set) => set.cars.length === chosen.length && chosen.every((name) => set.cars.includes(name));
   return html`<div class="chooser" ref=${chooser}>
     <${SetChips} cars=${own} label=${t.selectSet} isOn=${isOn} onPress=${(set) => choose(isOn(set) ? [] : set.cars)} />
-    <fieldset class="car-chips">
-      <legend class="unseen">${t.select}</legend>
-      ${own.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}
-    </fieldset>
+    <${Rail} name="car-chips" label=${t.select}>${own.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}<//>
     ${others.length > 0 &&
     html`<details class="others" open=${others.some((car) => store.selected.has(car.name))}>
       <summary>${t.otherCars(others.length)}</summary>
-      <fieldset class="car-chips"><legend class="unseen">${t.otherCars(others.length)}</legend>
-        ${others.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}</fieldset>
+      <${Rail} name="car-chips" label=${t.otherCars(others.length)}>${others.map((car) => html`<${Chip} key=${car.name} car=${car} />`)}<//>
     </details>`}
   </div>`;
 }
@@ -184,6 +181,10 @@ const Sides = ({ name, values, words, isAlarm, unseen }) => html`<span class=${i
   ><span class="dim">${name}</span> ${values ? html`<${Lights} values=${values} /> <strong class=${unseen ? "unseen" : ""}>${words(values)}</strong>` : html`<strong>${t.noReading}</strong>`}</span>`;
 const named = (names, values) => names.filter((_, at) => values[at]);
 
+const stateOf = (car) => {
+  const driver = driverOf(car);
+  return [driver && t.drivenMark(who(driver)), motionWords(car), modeWords(car.mode.asked), !driver && car.hold !== null && t.boardHeld(who(car.hold))].filter(Boolean).join(" · ");
+};
 const Live = ({ cars }) => html`<section class="live" aria-label=${t.live}>
   <p class="gauge delay"><span class="dim">${t.delay}</span>${" "}
     <strong data-delay=${delay_ms} class=${delay_ms !== null && delay_ms > LONG_DELAY_MS ? "bad" : ""}>${delay_ms === null ? t.noReading : t.delayOf(delay_ms)}</strong></p>
@@ -191,6 +192,7 @@ const Live = ({ cars }) => html`<section class="live" aria-label=${t.live}>
     ${cars.map(
       (car) => html`<li key=${car.name} class="car" data-live=${car.name} style=${{ "--car": car.color }}>
         <strong>${car.name}</strong>
+        <span class="live-state"><span class="bad" data-wrong>${troublesOf(car).map((each) => `⚠ ${each.words} `)}</span><span class="dim">${stateOf(car)}</span></span>
         <${Distance} range_m=${car.range_m} />
         <${Sides} name=${t.obstacle} values=${car.obstacle} words=${(values) => t.seesObstacle(named(t.sideNames, values))} isAlarm />
         <${Sides} name=${t.line} values=${car.line} words=${(values) => t.seesLine(named(t.lineNames, values))} unseen />

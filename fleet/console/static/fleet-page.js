@@ -3,14 +3,10 @@
 // No tile ever moves: a press must not meet another car than the one that the eye has chosen. So each tile has one
 // size whatever is in it, and what comes and goes (trouble, all about a car) has a place of its own.
 
+import { directionOf, driverOf, isLost, isMoving, isUnconfirmed, modeWords, motorName, silence, troublesOf } from "./car-words.js";
 import { carSets, changed, clock, command, isRefused, refusals, select, store, unheard_s, who } from "./console.js";
-import { arrows, links, modes, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
-import { Battery, html, Memo, Refused, Results, SetChips, useState, Verdict } from "./ui.js";
-
-export const motorName = (car) => {
-  const { state, basis } = car.motors;
-  return state === "off" && basis ? `off ${basis}` : state;
-};
+import { arrows, links, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
+import { Battery, html, Memo, Rail, Refused, Results, SetChips, useState, Verdict } from "./ui.js";
 
 const Lamps = ({ values, words }) => html`<span class="lamps">
   <span aria-hidden="true">${values.map((on) => html`<span class=${on ? "lamp on" : "lamp"}>${on ? "◉" : "○"}</span>`)}</span>
@@ -30,8 +26,8 @@ function Trouble({ car }) {
     const words = (motors[motorName(car)] ?? motors.unknown)[1];
     return html`<${Alarm} words=${t.lost(car.name, ago, words)} todo=${`${car.link.reason} ${t.lostDo}`} />`;
   }
-  if (car.link.state === "stale") return html`<${Alarm} words=${t.stale(car.name, ago)} todo=${t.staleDo} />`;
-  return null;
+  return html`${isUnconfirmed(car) && html`<${Alarm} words=${t.unconfirmed(car.name)} todo=${t.unconfirmedDo} />`}
+    ${car.link.state === "stale" && html`<${Alarm} words=${t.stale(car.name, ago)} todo=${t.staleDo} />`}`;
 }
 
 function Estops({ car }) {
@@ -71,13 +67,6 @@ const Loan = ({ car }) =>
           aria-label=${`${t.endLoan} ${car.name}`}>${t.endLoan}</button>
       </div>`;
 
-// How long nothing new has come of a car, s. 0 while news come.
-const silence = (car) => (car.silent_s ?? 0) + unheard_s();
-
-const isMoving = (car) => car.motors.state === "on";
-
-// The direction for the eye, which moves as the car does; the word beside it is for all.
-const directionOf = (car) => (isMoving(car) ? (car.motion.motion in arrows ? car.motion.motion : "some") : "none");
 const Motion = ({ car }) =>
   isMoving(car)
     ? html`<strong>${car.motion.motion in arrows ? arrows[car.motion.motion][1] : t.isMoving}</strong>`
@@ -85,24 +74,9 @@ const Motion = ({ car }) =>
 
 // What keeps a car, or who has it.
 function markOf(car) {
-  const driver = (isMoving(car) && car.motion.owner) || car.lease?.holder;
+  const driver = driverOf(car);
   const kept = car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : "";
   return [driver ? t.drivenMark(who(driver)) : "", kept].filter(Boolean).join(", ");
-}
-
-// What is wrong with a car, the worst first, each with its class and short words.
-export function troublesOf(car) {
-  const silent_s = silence(car);
-  return [
-    car.estops.length > 0 && ["bad", "estopped"],
-    !car.gateway && ["bad", "gone"],
-    car.gateway && car.link.state === "lost" && ["bad", "lost"],
-    silent_s > 0 && ["warn", "old", t.ago(silent_s)],
-    car.gateway && car.link.state === "stale" && ["warn", "stale"],
-    car.battery?.level === "critical" && ["bad", "battery"],
-  ]
-    .filter(Boolean)
-    .map(([level, name, words]) => ({ level, name, words: t.troubles[name](words) }));
 }
 
 let chosen = null; // the car that the page shows all about
@@ -110,6 +84,10 @@ function choose(name) {
   chosen = name;
   changed();
 }
+
+// A few cars have large tiles on a large screen. Once drawn, tiles keep their size: no tile moves when cars come.
+const FEW = 8;
+let isFew = null;
 
 let filter = "all"; // the key of the set of cars that the page shows
 function filterBy(key) {
@@ -125,10 +103,10 @@ function Tile({ car }) {
     <span class="tile-name">${car.name}</span>
     <span class="tile-arrow" aria-hidden="true">${direction === "none" ? "" : (arrows[direction]?.[0] ?? "»")}</span>
     <span class="tile-motion"><${Motion} car=${car} /></span>
-    <span class="tile-mode">${(modes[car.mode.asked] ?? modes.unknown)[0]}</span><${Battery} battery=${car.battery} />
+    <span class="tile-mode">${modeWords(car.mode.asked)}</span><${Battery} battery=${car.battery} />
     <span class="tile-trouble">
       ${troubles.length > 0
-        ? html`<span class="bad" data-old=${troubles.some((each) => each.name === "old") ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>${" "}`
+        ? html`<span class="bad" data-old=${silence(car) > 0 ? "" : undefined}>⚠ ${troubles.map((each) => each.words).join(", ")}</span>${" "}`
         : ""}${markOf(car)}
     </span>
   </button>`;
@@ -141,14 +119,14 @@ const TroubleStrip = ({ cars }) => {
     choose(name);
     document.querySelector(`[data-car="${CSS.escape(name)}"]`)?.scrollIntoView({ block: "nearest" });
   };
-  return html`<div class="strip" role="group" aria-label=${t.trouble}>
+  return html`<${Rail} name="strip" label=${t.trouble}>
     ${troubled.length === 0
       ? html`<p class="hint">${t.noTrouble}</p>`
       : troubled.map(
           (car) => html`<button key=${car.name} data-trouble=${car.name} onClick=${() => show(car.name)}>
-            ⚠ <strong>${car.name}</strong> ${troublesOf(car)[0].words}</button>`,
+            ⚠ <strong>${car.name}</strong> ${troublesOf(car)[0].short}</button>`,
         )}
-  </div>`;
+  <//>`;
 };
 
 function Details({ car }) {
@@ -175,11 +153,11 @@ function Details({ car }) {
     <${Hold} car=${car} />
     <${Loan} car=${car} />
     <dl>
-      <${Row} name=${t.link}><${Verdict} table=${links} name=${car.gateway ? car.link.state : "unknown"} /><//>
+      <${Row} name=${t.link}><${Verdict} table=${links} name=${car.gateway ? car.link.state : "lost"} /><//>
       <${Row} name=${t.mode}>
-        ${(modes[mode.asked] ?? modes.unknown)[0]}${" "}
+        ${modeWords(mode.asked)}${" "}
         <${Verdict} table=${verdicts} name=${mode.verdict}
-          detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
+          detail=${mode.verdict === "contradicted" ? modeWords(mode.inferred) : ""} />
       <//>
       <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} />${car.motors.past ? ` ${t.wasThen(car.motors.past, t.ago(car.motors.past_s + unheard_s()))}` : ""}<//>
       ${car.shows && car.shows !== "yes" && html`<${Row} name=${t.showsStops}>${t.shows[car.shows] ?? ""} ${car.shows_words}<//>`}
@@ -218,6 +196,7 @@ function Details({ car }) {
 const drawn = (car, ...more) => JSON.stringify([car, store.rights.cars[car.name], unheard_s(), store.past === null, ...more]);
 
 export function FleetPage({ cars }) {
+  if (cars.length > 0) isFew ??= cars.length <= FEW;
   const shown = cars.find((car) => car.name === chosen);
   const count = (is) => cars.filter(is).length;
   const troubled = count((car) => troublesOf(car).length > 0);
@@ -232,7 +211,7 @@ export function FleetPage({ cars }) {
       <${SetChips} cars=${cars} label=${t.filter} isOn=${(each) => each.key === (set?.key ?? "all")} onPress=${(each) => filterBy(each.key)} />
     </div>
     <${TroubleStrip} cars=${cars} />
-    <div class="tiles">
+    <div class=${isFew ? "tiles few" : "tiles"}>
       ${cars.length === 0 && html`<p>${store.past === null ? t.noCars : t.noCarsThen}</p>`}
       ${places.map((name) => {
         const car = byName.get(name);

@@ -1,5 +1,6 @@
 // The inspect page: raw frames beside what they became, the ledger of commands, and what the gateway knows.
 
+import { motionWords, troublesOf } from "./car-words.js";
 import { clock, on, store, unwish, wish } from "./console.js";
 import { need } from "./past.js";
 import { t } from "./texts.js";
@@ -57,11 +58,22 @@ const Commands = ({ commands }) => html`<section>
 
 const Doctor = ({ doctor }) => html`<section data-doctor>
   <h2>${t.doctor}</h2>
-  <ul class="plain">
-    ${doctor.findings.length === 0 ? html`<li>✓ ${t.nothingOdd}</li>` : doctor.findings.map((words) => html`<li key=${words}>⚠ ${words}</li>`)}
+  <ul class="plain findings">
+    ${doctor.findings.length === 0
+      ? html`<li>${doctor.facts.some(([, , isDoubtful]) => isDoubtful) ? `? ${t.onlyDoubts}` : `✓ ${t.nothingOdd}`}</li>`
+      : doctor.findings.map((words) => html`<li key=${words}>⚠ ${words}</li>`)}
   </ul>
-  <dl class="wide">${doctor.facts.map(([name, words]) => html`<div class="row" key=${name}><dt>${name}</dt><dd>${words}</dd></div>`)}</dl>
+  <h3>${t.facts}</h3>
+  <dl class="wide">${doctor.facts.map(([name, words, isDoubtful]) => html`<div class="row" key=${name}><dt>${name}</dt>
+    <dd class=${isDoubtful ? "doubt" : ""}>${isDoubtful ? html`<strong>? ${t.notShown}:</strong> ` : ""}${words}</dd></div>`)}</dl>
 </section>`;
+
+// The same words as on all other pages.
+const State = ({ car }) => {
+  const troubles = troublesOf(car);
+  return html`<p data-state class=${troubles.length > 0 ? "bad" : ""}><strong>${car.name}</strong>: ${
+    troubles.length > 0 ? `⚠ ${troubles.map((each) => each.words).join(", ")} · ` : ""}${motionWords(car)}</p>`;
+};
 
 const Gateway = ({ rows }) => html`<section>
   <h2>${t.gateway}</h2>
@@ -90,6 +102,7 @@ export function InspectPage({ cars }) {
       </select></label>
       <button aria-pressed=${frozen !== null} onClick=${() => setFrozen(frozen === null ? shown : null)}>${t.freeze}</button>
     </div>
+    ${cars.filter((each) => each.name === car).map((each) => html`<${State} key=${each.name} car=${each} />`)}
     ${shown !== null &&
     html`<${Doctor} doctor=${shown.doctor} />
       <${Frames} frames=${shown.frames} />

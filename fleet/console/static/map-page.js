@@ -1,10 +1,11 @@
 // The map: the floor from above with the cars, and a list of their places. Of now, or of the moment that is looked at.
 
+import { driverOf, isLost, modeWords, motionWords, troublesOf } from "./car-words.js";
 import { carsInPlace, clock, consoleNow, on, store, unwish, who, wish } from "./console.js";
 import { boxOf, degrees, floorsOf, grown, placeOf, pointsOf } from "./map-shapes.js";
 import { useMoments } from "./moments.js";
 import { need } from "./past.js";
-import { arrows, t } from "./texts.js";
+import { t } from "./texts.js";
 import { Component, html, useEffect, useRef, useState } from "./ui.js";
 
 const CAR_M = 0.22; // the length of a car
@@ -45,12 +46,15 @@ const Ground = ({ world }) => html`<g class="ground">
   ${world.lamps.map(([name, x, y, isOn]) => html`<circle class=${`lamp-light ${isOn ? "is-on" : ""}`} key=${name} cx=${x} cy=${-y} r="0.06" />`)}
 </g>`;
 
+const isBad = (car) => troublesOf(car).length > 0;
+
 // A car seen from above: its front is pointed.
 const SHAPE = "M-0.5 -0.34L0.2 -0.34L0.5 0L0.2 0.34L-0.5 0.34Z";
 const CarMark = ({ car, place, size, letter, isChosen }) => html`<g data-mark=${car.name}>
-  <path class=${`mark-car ${place.age_s === null ? "" : "is-old"} ${isChosen ? "is-chosen" : ""}`} d=${SHAPE} style=${{ fill: car.color }}
+  <path class=${`mark-car ${place.age_s === null && !isLost(car) ? "" : "is-old"} ${isBad(car) ? "is-bad" : ""} ${isChosen ? "is-chosen" : ""}`} d=${SHAPE} style=${{ fill: car.color }}
     transform=${`translate(${place.x} ${-place.y}) rotate(${-degrees(place.yaw)}) scale(${size})`} />
   <text x=${place.x} y=${-place.y + size * 0.6 + letter} font-size=${letter}>${car.name}</text>
+  ${isBad(car) && html`<text class="mark-trouble" x=${place.x} y=${-place.y + size * 0.6 + 2.1 * letter} font-size=${letter}>⚠ ${t.mapTroubles[troublesOf(car)[0].name] ?? troublesOf(car)[0].short}</text>`}
 </g>`;
 
 // Drawn when the console has told something new, or something else is chosen.
@@ -62,6 +66,7 @@ class Floor extends Component {
     const [left, bottom, right, top] = box;
     const per_px = Math.max((right - left) / width, (top - bottom) / height);
     const size = Math.max(CAR_M, LEAST_CAR_PX * per_px);
+    const rank = (car) => (car.name === chosen ? 2 : isBad(car) ? 1 : 0); // what matters lies on top
     const here = cars.filter((car) => view.places[car.name]?.frame === frame);
     return html`<svg viewBox=${`${left} ${-top} ${right - left} ${top - bottom}`} role="img" aria-label=${t.mapPicture(here.map((car) => car.name))}>
       ${frame === "" && view.world && html`<${Ground} world=${view.world} />`}
@@ -70,7 +75,7 @@ class Floor extends Component {
         const trail = view.trails[car.name];
         return trail && html`<path class="trail" key=${car.name} d=${path([...trail.map(([, ...point]) => point), [x, y]])} style=${{ stroke: car.color }} />`;
       })}
-      ${[...here.filter((car) => car.name !== chosen), ...here.filter((car) => car.name === chosen)].map(
+      ${[...here].sort((one, other) => rank(one) - rank(other)).map(
         (car) => html`<${CarMark} key=${car.name} car=${car} place=${view.places[car.name]} size=${size} letter=${LETTER_PX * per_px} isChosen=${car.name === chosen} />`,
       )}
     </svg>`;
@@ -78,8 +83,8 @@ class Floor extends Component {
 }
 
 const doing = (car) => {
-  const [arrow, words] = arrows[car.motion.motion] ?? [];
-  return words === undefined ? "" : `${arrow} ${words}${car.motion.owner ? `, ${t.drivenMark(who(car.motion.owner))}` : ""}`;
+  const driver = driverOf(car);
+  return [driver && t.drivenMark(who(driver)), motionWords(car), modeWords(car.mode.asked)].filter(Boolean).join(" · ");
 };
 
 function Row({ car, place, frame, isChosen, onChoose }) {
@@ -87,7 +92,8 @@ function Row({ car, place, frame, isChosen, onChoose }) {
   const how = place === undefined ? "" : place.isTrue ? t.mapSimulated : t.mapMeasured(place.frame, place.std);
   const notes = place === undefined ? [] : [place.age_s !== null && t.mapOld(t.ago(place.age_s)), place.frame !== frame && t.mapElsewhere(t.mapFloors(place.frame))].filter(Boolean);
   return html`<li><button class="car map-row" style=${{ "--car": car.color }} data-place=${car.name} aria-pressed=${isChosen} onClick=${onChoose}>
-    <strong>${car.name}</strong> <span>${doing(car)}</span>
+    <strong>${car.name}</strong>${isBad(car) && html` <span class="bad" data-wrong>⚠ ${troublesOf(car).map((each) => each.words).join(", ")}</span>`}
+    <span>${doing(car)}</span>
     <span class="dim">${where}</span>
     ${how && html`<span class="dim">${how}${notes.length > 0 && html` <strong class="bad">${notes.join(", ")}</strong>`}</span>`}
   </button></li>`;
@@ -150,7 +156,7 @@ export function MapPage() {
       <button data-fit onClick=${fit}>${t.mapFit}</button>
     </div>
     <div class="map-area" ref=${area}><${Floor} cars=${cars} view=${view} version=${view.version} frame=${frame} box=${box} width=${width} height=${height} chosen=${chosen}
-      looks=${cars.map((car) => car.name + car.color).join(" ")} /></div>
+      looks=${cars.map((car) => [car.name, car.color, ...troublesOf(car).map((each) => each.short)]).join(" ")} /></div>
     <section class="map-list" aria-label=${t.mapCars}>
       ${isComing && html`<p role="status">${t.loading}</p>`}
       <ul class="plain">${placed.map(row)}${others.map(row)}</ul>

@@ -3,24 +3,32 @@
 import { ask, consoleNow, store } from "./console.js";
 import { liveSpans, showLanes } from "./lanes.js";
 import { jump, lanesOf, openSession } from "./past.js";
-import { useEffect, useState } from "./ui.js";
+import { useEffect, useRef, useState } from "./ui.js";
 
 export const LIVE_MS = 900_000;
 const SHORTEST_MS = 60_000; // of a console that has just begun
 const REFRESH_MS = 10_000; // the lanes of a recording that grows
 const LIVE_GAP_MS = 1500; // nearer to the end than this is now
 
+async function readSessions() {
+  const [listed, recorder] = await Promise.all([ask("/sessions"), ask("/recording/status", "")]);
+  return { sessions: listed.sessions ?? [], running: recorder.ok && recorder.state === "recording" ? recorder.session : "" };
+}
+
+// The recordings, and a function that reads and returns them again.
 function useSessions() {
   const [found, setFound] = useState({ sessions: [], running: null });
+  const isOver = useRef(false);
+  const read = async () => {
+    const answer = await readSessions();
+    if (!isOver.current) setFound(answer);
+    return answer;
+  };
   useEffect(() => {
-    let over = false;
-    Promise.all([ask("/sessions"), ask("/recording/status", "")]).then(([listed, recorder]) => {
-      const running = recorder.ok && recorder.state === "recording" ? recorder.session : "";
-      if (!over) setFound({ sessions: listed.sessions ?? [], running });
-    });
-    return () => (over = true);
+    read();
+    return () => (isOver.current = true);
   }, []);
-  return found;
+  return [found, read];
 }
 
 // The live spans change with each message: one array for each second is enough to look at.
@@ -37,7 +45,7 @@ const liveNow = () => {
 
 // What is shown, from when to when one can go, and `go`. `running`: the session that is being recorded; null: not known yet.
 export function useMoments() {
-  const { sessions, running } = useSessions();
+  const [{ sessions, running }, readAgain] = useSessions();
   useEffect(showLanes, []);
   const { past } = store;
   const name = past?.session ?? "";
@@ -61,5 +69,5 @@ export function useMoments() {
     if (past === null && asked > whole.to - LIVE_GAP_MS) return;
     if (canScrub) jump(name || running, asked);
   };
-  return { sessions, running, name, shown, at, whole, canScrub, go };
+  return { sessions, running, readAgain, name, shown, at, whole, canScrub, go };
 }

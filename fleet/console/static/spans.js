@@ -26,9 +26,43 @@ export const previousTime = (times, at) => times.findLast((each) => each < at - 
 export const saidAt = (spans, car, at, late_ms = 0) =>
   LANES.map((lane) => spans.findLast((each) => each.car === car && each.lane === lane && each.begin <= at && at <= each.end + late_ms)).filter(Boolean);
 
-// What began or ended around a moment, the oldest first: [at, car, words, bad].
+// What began around a moment, the oldest first: [at, car, lane, words, bad]. Who presses a pad again and again drives on.
+const DRIVES_ON_MS = 15_000;
 export function around(spans, marks, at, near_ms) {
-  const begun = spans.map((each) => [each.begin, each.car, each.lane, each.words, each.bad]);
-  const marked = marks.map(([when, words, by]) => [when, "", "mark", by ? `${words} (${by})` : words, false]);
-  return [...begun, ...marked].filter(([when]) => Math.abs(when - at) <= near_ms).sort((one, other) => one[0] - other[0]);
+  const isNear = ([when]) => Math.abs(when - at) <= near_ms;
+  const drives = spans.filter((each) => each.lane === "driver");
+  const goesOn = (span) =>
+    span.lane === "driver" &&
+    drives.some((each) => each.car === span.car && each.words === span.words && each.begin < span.begin && each.end > span.begin - DRIVES_ON_MS && Math.abs(each.begin - at) <= near_ms);
+  const begun = spans.filter((each) => isNear([each.begin]) && !goesOn(each)).map((each) => [each.begin, each.car, each.lane, each.words, each.bad]);
+  const marked = marks.map(([when, words, by]) => [when, "", "mark", by ? `${words} (${by})` : words, false]).filter(isNear);
+  return [...begun, ...marked].sort((one, other) => one[0] - other[0]);
+}
+
+// The nearest of them, in the order of their times.
+export const nearest = (events, at, count) =>
+  [...events].sort((one, other) => Math.abs(one[0] - at) - Math.abs(other[0] - at)).slice(0, count).sort((one, other) => one[0] - other[0]);
+
+// The lanes that a car has anything in.
+export const usedLanes = (spans, car) => {
+  const used = new Set(spans.filter((each) => each.car === car).map((each) => each.lane));
+  return LANES.filter((lane) => used.has(lane));
+};
+
+// The recording that covers a moment; and if none does, the nearest one with the moment of it that is nearest.
+export function recordingAt(sessions, running, now, at) {
+  const known = sessions
+    .filter((each) => each.at_ms !== null)
+    .map((each) => ({ name: each.name, begin: each.at_ms, end: each.name === running ? now : each.at_ms + 1000 * (each.length_s ?? 0), session: each }))
+    .map((each) => ({ ...each, at: Math.min(each.end, Math.max(each.begin, at)) }));
+  return known.sort((one, other) => Math.abs(one.at - at) - Math.abs(other.at - at))[0];
+}
+
+// Round times of the clock on the wall in a window, few enough for a phone.
+const STEPS_S = [5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14_400, 43_200, 86_400];
+const MOST_TICKS = 5;
+export function ticks(from, to, zone_s) {
+  const step = 1000 * (STEPS_S.find((each) => (to - from) / (1000 * each) <= MOST_TICKS) ?? STEPS_S.at(-1));
+  const first = Math.ceil((from + 1000 * zone_s) / step) * step - 1000 * zone_s;
+  return Array.from({ length: Math.max(0, Math.floor((to - first) / step) + 1) }, (_, index) => first + index * step).slice(0, 100);
 }

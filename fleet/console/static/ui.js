@@ -16,16 +16,39 @@ export const Icon = ({ path }) => {
   return icons.get(path);
 };
 
+// A row that scrolls sideways. Its ends tell when there is more: half a button may look whole.
+export function Rail({ name, label, children }) {
+  const row = useRef(null);
+  const [more, setMore] = useState("");
+  useEffect(() => {
+    const { current } = row;
+    const look = () => {
+      const after = current.scrollWidth - current.clientWidth - current.scrollLeft;
+      setMore([current.scrollLeft > 1 && "before", after > 1 && "after"].filter(Boolean).join(" "));
+    };
+    const sizes = new ResizeObserver(look);
+    sizes.observe(current);
+    const contents = new MutationObserver(look);
+    contents.observe(current, { childList: true, characterData: true, subtree: true });
+    current.addEventListener("scroll", look, { passive: true });
+    return () => {
+      sizes.disconnect();
+      contents.disconnect();
+    };
+  }, []);
+  return html`<div class=${`rail ${name}-rail`} data-more=${more}><div class=${name} role="group" aria-label=${label} ref=${row}>${children}</div></div>`;
+}
+
 // Chips for all cars, the person's own ones, and each group. `isOn` tells which of these sets are chosen.
 export const SetChips = ({ cars, label, isOn, onPress }) => {
   const sets = carSets(cars);
   if (sets.length === 1) return null;
-  return html`<div class="sets" role="group" aria-label=${label}>
+  return html`<${Rail} name="sets" label=${label}>
     ${sets.map(
       (set) => html`<button key=${set.key} class="set" data-set=${set.key} aria-pressed=${isOn(set)} onClick=${() => onPress(set)}>
         <bdi>${set.name}</bdi> <small>${set.cars.length}</small></button>`,
     )}
-  </div>`;
+  <//>`;
 };
 
 // A symbol for the eye and a word for all: never color alone.

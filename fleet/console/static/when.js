@@ -25,3 +25,15 @@ export function lengthWords(s) {
   if (min < 60) return `${min} min`;
   return min % 60 === 0 ? `${min / 60} h` : `${Math.floor(min / 60)} h ${min % 60} min`;
 }
+
+// The newest moment, not after now, with this time of day on the clock of the wall; `at_ms`: a moment of the day that is
+// meant. "14:05", "14:05:30", "1405". null: this is no time of day.
+const TIME_OF_DAY = /^\s*(\d{1,2})[:.h ]?(\d{2})(?:[:. ]?(\d{2}))?\s*$/;
+export function momentOf(text, at_ms, zone_s, now_ms) {
+  const found = TIME_OF_DAY.exec(text);
+  if (found === null) return null;
+  const [h, min, s] = found.slice(1).map((each) => Number(each ?? 0));
+  if (h > 23 || min > 59 || s > 59) return null;
+  const on_day = dayOf(at_ms, zone_s) * DAY_MS - 1000 * zone_s + 1000 * (3600 * h + 60 * min + s);
+  return on_day > now_ms ? on_day - DAY_MS : on_day;
+}
