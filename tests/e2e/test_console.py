@@ -421,6 +421,15 @@ def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: Co
     assert stage.person.car("red").drive("forward", 0.2).ok
 
 
+LOST_ON = {
+    "drive": "[data-live=red]",
+    "map": "[data-place=red]",
+    "time": "[data-lanes=red]",
+    "inspect": "[data-state]",
+    "board": "[data-board=red]",
+}
+
+
 def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> None:
     page = stage.page()
     stage.gateways["red"].kill()
@@ -431,6 +440,19 @@ def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> No
     card.get_by_text("Look at the car.").wait_for()
     card.locator(".row", has_text="Motors").get_by_text("unknown").wait_for()
     card.locator(".row", has_text="Battery").get_by_text("not known").wait_for()
+    # Each page says so in the same word.
+    page.locator("[data-car=red]", has_text="LOST for").wait_for()
+    for path, place in LOST_ON.items():
+        page.goto(f"{stage.console.address}/#/{path}")
+        if path == "drive":
+            page.locator("input[name=select-red]").check()
+        if path == "inspect":
+            page.locator("main select").select_option("red")
+        page.locator(place, has_text="LOST").first.wait_for()
+    page.goto(f"{stage.console.address}/#/board")
+    assert "free" not in page.locator("[data-board=red]").inner_text()
+    page.goto(f"{stage.console.address}/#/")
+    page.locator("[data-car=red]").click()
     stage.gateways["red"] = stage.fleet.gateway(stage.links["red"], car="red", platform=CARS["red"])
     stage.fleet.ready("red")
     card.get_by_text("online").wait_for()

@@ -109,7 +109,8 @@ def test_the_board_fits_each_screen(size: str, scheme: str, stage: ConsoleStage)
     assert serious(page) == []
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     name = page.locator("[data-board=red] h2")
-    assert float(name.evaluate("(name) => parseFloat(getComputedStyle(name).fontSize)")) >= 40
+    least_px = 40 if size != "phone" else 20  # a phone hangs on no wall: six cars shall be seen at once
+    assert float(name.evaluate("(name) => parseFloat(getComputedStyle(name).fontSize)")) >= least_px
     page.keyboard.press("Escape")
     expect(page.locator("[data-report]")).to_be_visible()
 

@@ -126,7 +126,7 @@ def test_a_group_has_its_own_cars_first_and_those_of_others_one_press_away(room:
         cars = page.locator("[data-car]").evaluate_all("(all) => all.map((each) => each.dataset.car)")
         assert cars == (["red", "blue"] if page is ours else own)
         page.locator("nav a", has_text="Drive").click()
-        own_chips = page.locator(".chooser > .car-chips input")
+        own_chips = page.locator(".chooser > .rail .car-chips input")
         expect(own_chips).to_have_count(len(own))
         assert own_chips.evaluate_all(chips) == own
     expect(teacher.locator(".others")).to_have_count(0)

@@ -294,7 +294,7 @@ def test_cards_without_news_say_their_age_and_claim_nothing(stage: ConsoleStage)
     expect(page.locator("[data-old]")).to_have_count(0)
     freeze(stage.gateways["red"].pid)
     try:
-        expect(red.locator("[data-old]")).to_contain_text(re.compile(r"Nothing new for \d+ s"))
+        expect(red.locator("[data-old]")).to_contain_text(re.compile(r"(Nothing new|LOST) for \d+ s"))
         expect(details.get_by_text(re.compile(r"Nothing new for \d+ s: what this card shows"))).to_be_visible()
         expect(details.get_by_text("online")).to_have_count(0)
         expect(blue.locator("[data-old]")).to_have_count(0)
@@ -355,6 +355,68 @@ def test_a_browser_with_a_wrong_clock_drives_and_stops(stage: ConsoleStage) -> N
     page.keyboard.press("Escape")
     stage.stands(since_ns=stopped_ns)
     page.keyboard.up("w")
+
+
+SEEN_ON = {"map": "[data-place=red]", "board": "[data-board=red]", "time": "[data-lanes=red]"}
+"""Where the pages that are looked at say what a car does."""
+
+
+@pytest.mark.parametrize("how", ["wifi", "frozen"])
+@pytest.mark.parametrize("view", SEEN_ON)
+def test_a_page_that_was_cut_off_or_frozen_says_so_and_is_live_again(how: str, view: str, stage: ConsoleStage) -> None:
+    page = stage.page(f"#/{view}", wired=True)
+    page.add_init_script(WRONG_CLOCK)
+    page.reload()
+    red, connection = page.locator(SEEN_ON[view]), page.locator("[data-connection]")
+    expect(red).to_be_visible()
+    frozen = stage.renderers() if how == "frozen" else []
+    for each in frozen:
+        each.suspend()
+    if how == "wifi":
+        stage.wire.cut()
+    try:
+        if how == "wifi":
+            expect(page.locator(".banner")).to_contain_text("The console does not answer")
+            expect(connection).to_have_attribute("data-connection", "old")
+            expect(red).to_contain_text("nothing known" if view == "time" else re.compile(r"Nothing new for \d+ s"))
+        else:
+            time.sleep(3.0)  # longer than a page is silent before it says so
+    finally:
+        for each in frozen:
+            each.resume()
+        stage.wire.mend()
+    expect(connection).to_have_attribute("data-connection", "live")
+    stage.person.car("red").drive("spin_left", 10.0, wait=False).check()
+    expect(red).to_contain_text("mia drives")
+    if view == "time":
+        shown = page.locator("[data-moment]").inner_text()
+        times = [time.strftime("%H:%M:%S", time.localtime(time.time() - late_s)) for late_s in range(4)]
+        assert shown.partition(".")[0] in times, "by the clock of the console"
+    page.keyboard.press("Escape")
+    stage.stands()
+
+
+def test_a_car_that_does_not_stop_is_said_to_be_so_on_each_page(stage: ConsoleStage) -> None:
+    page = stage.page()
+    stage.person.car("red").mode("tracking").check()
+    wait_for(lambda: stage.judges["red"].driving, "red drives")
+    stage.sim.say({"car": "red", "fault": "deaf", "for_s": 120})
+    try:
+        page.keyboard.press("Escape")
+        expect(page.locator("[data-car=red]")).to_contain_text("STOP NOT CONFIRMED")
+        expect(page.locator("[data-stop=red].stop-failed")).to_be_visible()
+        assert stage.judges["red"].driving
+        expect(page.locator("[data-trouble=red]")).to_contain_text("STOP NOT CONFIRMED")
+        for path in ("board", "map"):
+            page.goto(f"{stage.console.address}/#/{path}")
+            expect(page.locator(SEEN_ON[path])).to_contain_text("STOP NOT CONFIRMED")
+            assert "free" not in page.locator(SEEN_ON[path]).inner_text()
+    finally:
+        stage.sim.say({"car": "red", "fault": "deaf", "for_s": 0})
+    expect(page.locator(SEEN_ON["map"])).not_to_contain_text("NOT CONFIRMED")
+    stage.stands()
+    page.goto(f"{stage.console.address}/#/board")
+    expect(page.locator(SEEN_ON["board"])).to_contain_text("stopped by")
 
 
 MARKUP = "<img src=x onerror=alert(1)><b>bold</b>"

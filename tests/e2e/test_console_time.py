@@ -178,6 +178,7 @@ def test_the_time_line_of_now_leads_back_and_to_the_running_session(stage: Conso
     assert serious(page) == []
     wait_for(lambda: page.locator("[data-go=back10]").is_enabled(), "the running session is known")
     page.wait_for_timeout(FLUSHED_MS)
+    page.locator("[data-all-near]").click()
     page.locator(".event", has_text="mia drives").last.click()
     bar = page.locator("[data-past-at]")
     at_ms = int(bar.get_attribute("data-past-at") or 0)
@@ -209,7 +210,7 @@ def test_a_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, s
     shown_at(page, first + 200)
     box = page.locator(".time-lanes").bounding_box()
     assert box is not None
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 30)
+    page.locator(".time-lanes").click(position={"x": box["width"] / 2, "y": 30})
     middle = page.locator("[data-past-at]").get_attribute("data-past-at")
     assert middle is not None
     assert abs(int(middle) - START_MS - HOUR_S * 500) < 30_000
@@ -220,6 +221,89 @@ def test_a_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, s
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     page.locator("select[name=session]").select_option("")
     expect(page.locator("[data-past-at]")).to_have_count(0)
+
+
+def test_a_time_of_day_is_what_the_clock_of_the_console_says(stage: ConsoleStage) -> None:
+    page = stage.page()
+    noon_ms, zone_s = 1_790_000_000_000 // 86_400_000 * 86_400_000 + 43_200_000, 3600  # 13:00 on that clock
+    for text, reference_ms, s in (
+        ("12:05", noon_ms, -3300),
+        ("1205", noon_ms, -3300),
+        ("12:05:30", noon_ms, -3270),
+        ("14:05", noon_ms, 3900 - 86_400),  # not come yet: that of yesterday
+        ("14:05", noon_ms - 172_800_000, 3900 - 172_800),  # of the day that is looked at
+    ):
+        assert call(page, "when", "momentOf", text, reference_ms, zone_s, noon_ms) == noon_ms + 1000 * s, text
+    for text in ("", "noon", "25:00", "12:60", "12:05:61", "12:5"):
+        assert call(page, "when", "momentOf", text, noon_ms, zone_s, noon_ms) is None, text
+
+
+def test_which_recording_covers_a_moment(stage: ConsoleStage) -> None:
+    page = stage.page()
+    listed = [
+        {"name": "old", "at_ms": 1000, "length_s": 2},
+        {"name": "odd", "at_ms": None, "length_s": 9},
+        {"name": "now", "at_ms": 9000, "length_s": 1},
+    ]
+    for at, name, nearest in (
+        (2000, "old", 2000),
+        (5000, "old", 3000),
+        (8000, "now", 9000),
+        (20_000, "now", 20_000),
+        (31_000, "now", 30_000),
+    ):
+        found = call(page, "spans", "recordingAt", listed, "now", 30_000, at)
+        assert (found["name"], found["at"]) == (name, nearest), at
+    assert call(page, "spans", "recordingAt", [], "", 30_000, 5) is None
+
+
+def test_an_earlier_time_of_day_is_typed_and_what_nothing_covers_says_so(stage: ConsoleStage) -> None:
+    page = stage.page("#/time")
+    expect(page.locator("[data-since]")).to_contain_text("when the console started")
+    wait_for(lambda: page.locator("[data-go=back10]").is_enabled(), "the running session is known")
+    page.wait_for_timeout(FLUSHED_MS)
+    now_ms = time.time_ns() // 1_000_000
+    page.locator("input[name=clock]").fill(time.strftime("%H:%M:%S", time.localtime(now_ms / 1000 - 2)))
+    page.locator("[data-go=clock]").click()
+    at_ms = int(page.locator("[data-past-at]").get_attribute("data-past-at") or 0)
+    assert at_ms == (now_ms // 1000 - 2) * 1000
+    page.locator("[data-live-now]").click()
+    before = time.localtime(now_ms / 1000 - 7200)
+    page.locator("input[name=clock]").fill(time.strftime("%H:%M", before))
+    page.keyboard.press("Enter")
+    missing = page.locator("[data-missing]")
+    expect(missing).to_contain_text(f"No recording covers {time.strftime('%H:%M', before)}:00.")
+    expect(page.locator("[data-past-at]")).to_have_count(0)
+    missing.get_by_role("button").click()
+    expect(page.locator("[data-past-at]")).to_have_count(1)
+    expect(missing).to_have_count(0)
+    page.locator("[data-live-now]").click()
+    page.locator("input[name=clock]").fill("soon")
+    page.locator("[data-go=clock]").click()
+    assert page.locator("input[name=clock]:invalid").count() == 1
+
+
+def test_round_times_stand_above_the_lanes(stage: ConsoleStage) -> None:
+    page = stage.page()
+    minute = 60_000
+    assert call(page, "spans", "ticks", 30_000, 4 * minute, 0) == [minute, 2 * minute, 3 * minute, 4 * minute]
+    assert call(page, "spans", "ticks", 0, 50 * minute, 19_800) == [each * minute for each in range(0, 51, 10)]
+    assert call(page, "spans", "ticks", 100, 200, 0) == []
+
+
+PRESSES = [
+    {"car": "red", "lane": "driver", "begin": begin, "end": begin + 900, "words": "mia", "bad": False}
+    for begin in (1000, 3000, 5000)
+]
+
+
+def test_who_presses_again_and_again_drives_once(stage: ConsoleStage) -> None:
+    page = stage.page()
+    assert [each[0] for each in call(page, "spans", "around", PRESSES, [], 4000, 30_000)] == [1000]
+    late = [*PRESSES, PRESSES[0] | {"begin": 25_000, "end": 26_000}]
+    assert [each[0] for each in call(page, "spans", "around", late, [], 4000, 30_000)] == [1000, 25_000]
+    assert call(page, "spans", "nearest", [[1], [5], [9], [20]], 8, 2) == [[5], [9]]
+    assert call(page, "spans", "usedLanes", SPANS, "red") == ["mode", "stop"]
 
 
 @pytest.mark.parametrize("view", ["", "map"])
