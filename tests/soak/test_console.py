@@ -37,7 +37,7 @@ PLOT_S = float(os.environ.get("CONSOLE_PLOT_S", "600"))
 WIRE_P95_S = 0.1
 PHONE_P99_S = 0.5
 """As long as a drive outlives a console that dies. On two cores that also run twenty gateways, the simulator and the
-throttled browser, p50 was 100 to 137 ms and p99 246 to 355; the page's own thread let a press wait for at most 96 ms."""
+throttled browser, p50 was 100 to 137 ms and p99 246 to 355. The page's own thread made a press wait for at most 96."""
 THROTTLE = 4
 PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 SCROLLS = 5
