@@ -145,7 +145,7 @@ def test_the_lanes_of_a_session_come_with_its_times_and_marks(session: Path) -> 
     assert found["cars"] == ["blue", "green", "red"]
     assert (found["begin_ms"] - START_NS // 1_000_000, found["marks"][0][1]) == (1, "here it gets interesting")
     said = {(car, lane, words) for car, lane, _, _, words, _ in found["spans"]}
-    assert {("red", "mode", "tracking"), ("green", "loss", "lost"), ("red", "hold", "e-stop by ann")} <= said
+    assert {("red", "mode", "tracking"), ("green", "loss", "lost"), ("red", "hold", "e-stop by ann: too close")} <= said
     assert ("red", "stop", "stop by ann complete") in said
     assert answer({"path": str(session.parent / "none.mcap")})["ok"] is False
 
