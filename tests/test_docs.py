@@ -167,12 +167,12 @@ def test_the_readme_is_short_and_its_links_work_anywhere() -> None:
         assert text.index(target) < text.index("## Drive your own car")
 
 
-def test_the_readme_has_no_word_of_the_inside_above_how_it_works() -> None:
+def test_readme_has_no_internals_above_how_it_works() -> None:
     above = README.read_text(encoding="utf-8").partition("## How it works")[0]
     assert re.findall(rf"(?i)\b(?:{'|'.join(INTERNAL)})s?\b", above) == []
 
 
-def test_a_page_or_a_heading_that_is_not_there_is_found() -> None:
+def test_broken_page_or_heading_link_is_found() -> None:
     gone = "docs/reference/nothing" + ".md"
     assert faults_of(f"# see {gone}", "x") == [f"x: {gone}: no file {gone}"]
     assert faults_of("(docs/reference/protocol.md" + "#nothing)", "x")[0].endswith("has no heading #nothing")

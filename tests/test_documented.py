@@ -78,7 +78,7 @@ LINES: Final = sorted(set(shell_lines()))
 
 
 @pytest.mark.parametrize(("page", "line"), LINES, ids=[line for _, line in LINES])
-def test_each_command_line_in_the_docs_is_one_that_is_understood(page: str, line: str) -> None:
+def test_each_documented_command_line_parses(page: str, line: str) -> None:
     program, *arguments = shlex.split(line.partition(" > ")[0])
     if program == "gateway" or arguments[0] == "sim":
         parser = gateway_parsers()[arguments[0]]

@@ -16,7 +16,7 @@ def costly() -> str:
 
 
 @pytest.mark.usefixtures("costly")
-def test_who_shares_a_fixture_of_the_module_is_in_its_group(request: pytest.FixtureRequest) -> None:
+def test_tests_sharing_module_fixture_are_grouped(request: pytest.FixtureRequest) -> None:
     (mark,) = request.node.iter_markers("xdist_group")
     assert mark.args == ("tests/test_groups.py",)
     if getattr(request.config.option, "loadgroup", False):

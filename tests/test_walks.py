@@ -69,7 +69,7 @@ async def test_a_stop_passes_no_more_rooms_and_forms_than_before(tmp_path: Path,
 
 
 @pytest.mark.soak
-async def test_no_more_rooms_are_asked_for_a_stop_or_a_report_than_before(tmp_path: Path, state: None) -> None:
+async def test_walks_do_not_grow(tmp_path: Path, state: None) -> None:
     idle, stop = await stop_walk(tmp_path, whole=True)
     asked, of_report = rooms(stop.called - idle.called), rooms(idle.of_reading)
     assert "gateway/drivers/yahboom/pacing.py" in asked

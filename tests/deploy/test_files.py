@@ -50,7 +50,7 @@ def test_the_schema_is_up_to_date(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)
-def test_every_example_names_its_schema_and_every_field_has_a_description(kind: str) -> None:
+def test_every_example_names_its_schema_and_describes_fields(kind: str) -> None:
     examples = sorted((EXAMPLES / f"{kind}s").glob("*.yaml"))
     assert examples
     for path in examples:

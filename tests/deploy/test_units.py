@@ -39,7 +39,7 @@ def test_there_is_one_for_each_service() -> None:
     assert [f"car-{kind}.service" for kind in kinds] == SERVICES
 
 
-def test_the_watchdog_waits_for_the_longest_turn_of_a_gateways_writer() -> None:
+def test_watchdog_timeout_exceeds_longest_writer_turn() -> None:
     watchdog_s = float(settings(GATEWAY)["WatchdogSec"][0])
     longest_s = max(SERIAL_WRITE_TIMEOUT_S, BLE_WRITE_TIMEOUT_S + DISCONNECT_TIMEOUT_S)
     assert watchdog_s * (1 - 1 / FEEDS_PER_WATCHDOG) > longest_s

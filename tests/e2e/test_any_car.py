@@ -89,7 +89,7 @@ def truth(cars: KindsUnderTest, kind: CarKind) -> dict[str, Any]:
 
 
 @pytest.mark.xdist_group("any_car")
-def test_a_drive_begins_at_once_and_is_said_as_it_is(cars: KindsUnderTest) -> None:
+def test_drive_starts_at_once_and_is_described(cars: KindsUnderTest) -> None:
     for kind in KINDS:
         asked_at = time.monotonic()
         answer = cars.fleet.ask("drive", kind.name, motion="forward", duration_s=2.0)

@@ -18,7 +18,7 @@ def pauses(fleet: FleetProcesses, car: str) -> list[str]:
     return [] if state is None else [pause.id for pause in state.pauses]
 
 
-def test_a_fleet_wide_e_stop_and_a_pause_asked_of_one_car_stop_all_and_outlive_every_gateway(
+def test_fleet_estop_and_pause_reach_all_and_outlive_gateways(
     fleet: FleetProcesses,
 ) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
@@ -61,7 +61,7 @@ def test_a_fleet_wide_e_stop_and_a_pause_asked_of_one_car_stop_all_and_outlive_e
     assert fleet.ask("drive", "blue", motion="forward")["status"] in TAKEN
 
 
-def test_an_e_stop_of_all_without_an_id_is_one_and_one_resume_ends_it(fleet: FleetProcesses) -> None:
+def test_estop_of_all_without_id_is_one_estop(fleet: FleetProcesses) -> None:
     _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp", "green:arduino:tcp")
     cars = ("red", "blue", "green")
     for car, link in zip(cars, links, strict=True):
@@ -90,7 +90,7 @@ def test_an_e_stop_of_one_car_is_its_own(fleet: FleetProcesses) -> None:
         assert client.car("red").drive("forward").ok
 
 
-def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: FleetProcesses) -> None:
+def test_next_command_line_does_not_wait_for_lease(fleet: FleetProcesses) -> None:
     _, (red,) = fleet.simulate("red:arduino:tcp")
     fleet.gateway(red)
     fleet.ready()
@@ -151,7 +151,7 @@ def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
 
 
 @pytest.mark.soak
-def test_a_gateway_without_people_learns_that_a_lead_ended_an_e_stop(fleet: FleetProcesses) -> None:
+def test_gateway_without_people_learns_that_lead_ended_estop(fleet: FleetProcesses) -> None:
     _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     fleet.gateway(red, "--person", "teacher:lead", "--person", "head:lead", "--person", "ann")
     fleet.gateway(blue, car="blue")

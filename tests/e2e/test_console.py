@@ -76,7 +76,7 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, ho
         details.get_by_role("button", name=f"Close {car}").click()
 
 
-def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: ConsoleStage) -> None:
+def test_car_is_shown_stopped_only_by_readings(stage: ConsoleStage) -> None:
     page = stage.page()
     drive_all(stage)
     stage.gateways["red"].popen.send_signal(signal.SIGSTOP)
@@ -91,7 +91,7 @@ def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: Console
     assert not stage.judges["red"].driving
 
 
-def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: ConsoleStage) -> None:
+def test_estop_is_latched_with_reason_until_released(stage: ConsoleStage) -> None:
     page = stage.page()
     page.locator("#estop").click()
     page.locator("input[name=why]").fill("smoke")
@@ -165,7 +165,7 @@ def test_several_cars_are_driven_together_by_keys(stage: ConsoleStage) -> None:
     stage.stands("green")
 
 
-def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: ConsoleStage) -> None:
+def test_page_without_focus_releases_press(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     hide = "Object.defineProperty(document, 'visibilityState', { value: 'hidden', configurable: true })"
     for lost in (
@@ -196,7 +196,7 @@ def test_a_browser_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
         assert stage.stands(since_ns=killed_ns) < STOPPED_WITHIN_S
 
 
-def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage: ConsoleStage) -> None:
+def test_frozen_browser_stops_car_and_does_not_resume(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         frozen = stage.renderers()
@@ -216,7 +216,7 @@ def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage:
         assert stage.judges["red"].on_after(thawed_ns) == []
 
 
-def test_a_wire_that_is_cut_stops_the_car_and_its_burst_starts_nothing(stage: ConsoleStage) -> None:
+def test_cut_websocket_stops_car_and_late_burst_starts_nothing(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", wired=True)
     with stage.held(page, "forward"):
         cut_ns = stage.wire.cut()
@@ -388,7 +388,7 @@ def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
     stage.details(page).get_by_text("online").wait_for()
 
 
-def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -> None:
+def test_unsupported_abilities_are_not_offered_with_reason(stage: ConsoleStage) -> None:
     page = stage.driving_page("green")
     modes = page.locator(".lacking [data-control=mode]")
     assert not modes.is_visible(), "one line"
@@ -402,7 +402,7 @@ def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -
     assert page.locator("[data-control=servo_vertical] button").count() == 0
 
 
-def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: ConsoleStage) -> None:
+def test_leased_car_is_refused_until_taken(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     page.get_by_text("mia (person)").wait_for()
@@ -430,7 +430,7 @@ LOST_ON = {
 }
 
 
-def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> None:
+def test_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> None:
     page = stage.page()
     stage.gateways["red"].kill()
     stage.gateways["red"].wait()
@@ -485,7 +485,7 @@ def test_axe_finds_no_serious_violation_on_any_page(stage: ConsoleStage, scheme:
     assert serious(page) == []
 
 
-def test_the_stop_is_in_view_and_nothing_is_in_the_way_on_a_phone(stage: ConsoleStage) -> None:
+def test_stop_button_is_visible_and_uncovered_on_phone(stage: ConsoleStage) -> None:
     for path in ("", "#/drive"):
         page = stage.phone(path)
         size = page.viewport_size
@@ -512,7 +512,7 @@ def test_the_page_breaks_no_rule_of_its_own_policy(stage: ConsoleStage) -> None:
     assert said == []
 
 
-def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: ConsoleStage) -> None:
+def test_ctrl_c_of_console_stops_driven_car(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         ended_ns = time.time_ns()
@@ -553,7 +553,7 @@ def test_foreign_sockets_and_paths_out_of_the_folder_are_refused(stage: ConsoleS
     connection.close()
 
 
-def test_bad_messages_and_reconnects_move_no_car_and_harm_no_page(stage: ConsoleStage) -> None:
+def test_bad_messages_and_reconnects_move_no_car(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     begun_ns = time.time_ns()
     with socket_of(stage) as socket_:

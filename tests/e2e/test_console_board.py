@@ -36,7 +36,7 @@ def join(stage: ConsoleStage, code: str, **options: Any) -> Page:
     return page
 
 
-def test_a_class_joins_from_the_board_and_a_pupil_gets_a_car(stage: ConsoleStage) -> None:
+def test_class_joins_from_board_and_pupil_gets_car(stage: ConsoleStage) -> None:
     board = stage.page("#/board")
     board.locator("[data-class=open]").click()
     code = board.locator(".class .code").inner_text()

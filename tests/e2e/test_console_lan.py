@@ -193,9 +193,7 @@ def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Pat
         fleet.close()
 
 
-def test_a_lead_takes_a_car_that_a_pupil_holds_and_no_pupil_takes_one_of_a_lead(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_lead_takes_car_of_pupil_but_not_reverse(browser: Browser, tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)

@@ -71,9 +71,7 @@ def boxes(tiles: Locator) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE], ids=["portrait", "landscape"])
-def test_nothing_covers_the_pad_or_stop_of_a_phone_while_a_report_is_shown(
-    many: ConsoleStage, held: dict[str, Any]
-) -> None:
+def test_report_never_covers_pad_or_stop_on_phone(many: ConsoleStage, held: dict[str, Any]) -> None:
     page = many.driving_page("red", **held)
     expect(page.locator("[data-live=red]")).to_contain_text(re.compile(r"Distance [\d.]+ m"))
     before = page.locator("[data-motion=forward]").bounding_box()
@@ -231,9 +229,7 @@ def test_each_page_is_two_presses_away_on_a_phone(stage: ConsoleStage) -> None:
 
 
 @pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE, TABLET, LAPTOP], ids=["phone", "across", "tablet", "laptop"])
-def test_nothing_is_wider_than_the_screen_and_all_that_is_pressed_is_large(
-    many: ConsoleStage, held: dict[str, Any]
-) -> None:
+def test_layout_fits_screen_and_touch_targets_are_large(many: ConsoleStage, held: dict[str, Any]) -> None:
     page = many.page(**held)
     controls = "main button, main select, main input:not([type=checkbox]), main summary, nav a, .stopbar button"
     small = "(all) => all.map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect().height])"
@@ -330,7 +326,7 @@ def test_a_person_is_named_without_host_and_process(stage: ConsoleStage) -> None
         assert re.findall(r".*\w@\w.*", page.locator("main").inner_text()) == [], link.inner_text()
 
 
-def test_the_first_load_is_small_and_plots_are_loaded_on_their_page(stage: ConsoleStage) -> None:
+def test_first_load_is_small_and_plots_load_lazily(stage: ConsoleStage) -> None:
     page = stage.page()
     entries = "performance.getEntries().filter((each) => 'transferSize' in each)"
     sent = f"{entries}.map((each) => [each.name, each.transferSize])"

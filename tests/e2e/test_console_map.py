@@ -86,7 +86,7 @@ def test_a_simulated_car_is_drawn_where_it_truly_is(stage: ConsoleStage) -> None
     assert page.locator(".map .trail").count() >= 1, "it has a trail"
 
 
-def test_measured_poses_have_a_floor_of_their_own_and_names_are_no_markup(stage: ConsoleStage) -> None:
+def test_map_poses_have_own_floor_and_names_are_no_markup(stage: ConsoleStage) -> None:
     page = stage.page("#/map")
     frame = "<b onclick=alert(1)>\u202egro\u200bund"
     pose = json.dumps({"frame": frame, "x_m": 900, "y_m": 2, "heading_rad": 1, "xy_std_m": 0.05}).encode()

@@ -115,7 +115,7 @@ def pixels(page: Page, plot: str) -> int:
     return int(page.locator(f"{plot} canvas").evaluate(script))
 
 
-def test_a_plot_says_what_it_is_and_is_paused_zoomed_and_pointed_at(stage: ConsoleStage) -> None:
+def test_plot_has_title_pause_zoom_and_pointer(stage: ConsoleStage) -> None:
     page = stage.page("#/plots")
     plot = page.locator("[data-plot='0']")
     plot.locator("canvas").wait_for()
@@ -148,7 +148,7 @@ def test_a_plot_says_what_it_is_and_is_paused_zoomed_and_pointed_at(stage: Conso
     wait_for(lambda: pixels(page, "[data-plot='0']") != before, "it goes on")
 
 
-def test_lanes_of_modes_and_stops_come_to_a_page_that_asks(stage: ConsoleStage) -> None:
+def test_lanes_of_modes_and_stops_reach_page_that_asks(stage: ConsoleStage) -> None:
     page = stage.page("#/plots")
     page.locator("[data-plot='0'] canvas").wait_for()
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
@@ -174,7 +174,7 @@ def test_lanes_of_modes_and_stops_come_to_a_page_that_asks(stage: ConsoleStage) 
     assert not any("@" in words for words in (*lanes["red stop"], *lanes["red hold"]))
 
 
-def test_the_page_says_how_old_it_is_and_why_it_is_refused(stage: ConsoleStage) -> None:
+def test_page_shows_age_and_reason_of_refusal(stage: ConsoleStage) -> None:
     page = stage.page(wired=True)
     expect(page.locator("[data-connection]")).to_have_attribute("data-connection", "live")
     stage.wire.cut()

@@ -110,7 +110,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     ours.mouse.up()
 
 
-def test_a_group_has_its_own_cars_first_and_those_of_others_one_press_away(room: Room) -> None:
+def test_group_sees_own_cars_first(room: Room) -> None:
     expect.set_options(timeout=PATIENCE_S * 1000)
     _, (link,) = room.fleet.simulate("blue:arduino:tcp")
     people = ("teacher:lead", "group_b", "group_a:other")

@@ -48,7 +48,7 @@ def wait_motion(stage: ConsoleStage, motion: Motion, since_ns: int, car: str = "
     wait_for(newest, f"{car} gets {motion}")
 
 
-def test_a_stop_report_is_of_the_past_and_changes_when_the_car_moves_again(stage: ConsoleStage) -> None:
+def test_stop_report_changes_when_car_moves_again(stage: ConsoleStage) -> None:
     page = stage.page(timezone_id="Pacific/Auckland", viewport={"width": 1280, "height": 900})
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")
@@ -91,7 +91,7 @@ def test_a_pause_is_named_a_pause(stage: ConsoleStage) -> None:
 
 
 @pytest.mark.parametrize("frozen_s", [0.3, 0.7, 1.2, 1.7])
-def test_no_press_outlives_a_hub_that_stands_still_for_a_moment(stage: ConsoleStage, frozen_s: float) -> None:
+def test_no_press_outlives_short_hub_hang(stage: ConsoleStage, frozen_s: float) -> None:
     """Shorter than the lease of the bus, which tells nobody. The drives of the gateway last for half a second."""
     page = stage.driving_page("red")
     hold_key(stage, page, "w")
@@ -145,7 +145,7 @@ def test_no_press_outlives_the_hub(stage: ConsoleStage, how: str) -> None:
     stage.stands()
 
 
-def test_what_is_held_longest_goes_on_and_forward_with_a_turn_is_an_arc(stage: ConsoleStage) -> None:
+def test_longest_held_key_wins_and_forward_with_turn_is_arc(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     hold_key(stage, page, "w")
     began_ns = time.time_ns()
@@ -167,7 +167,7 @@ def test_what_is_held_longest_goes_on_and_forward_with_a_turn_is_an_arc(stage: C
     stage.stands()
 
 
-def test_two_fingers_are_an_arc_and_the_one_that_stays_drives_on(stage: ConsoleStage) -> None:
+def test_two_fingers_drive_arc_and_remaining_one_drives_on(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", **stage.playwright.devices["Pixel 7"])
     fingers = page.context.new_cdp_session(page)
 
@@ -198,7 +198,7 @@ def test_two_fingers_are_an_arc_and_the_one_that_stays_drives_on(stage: ConsoleS
     stage.stands()
 
 
-def test_a_stick_that_was_stopped_drives_again_only_from_its_middle(stage: ConsoleStage) -> None:
+def test_stopped_stick_drives_again_only_from_center(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     page.evaluate("window.stick = [0, 0]; navigator.getGamepads = () => [null, { axes: window.stick }]")
 
@@ -225,7 +225,7 @@ def test_a_stick_that_was_stopped_drives_again_only_from_its_middle(stage: Conso
     stage.stands()
 
 
-def test_a_tab_that_freezes_while_keys_are_held_starts_nothing_again(stage: ConsoleStage) -> None:
+def test_frozen_tab_with_held_keys_starts_nothing(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     page.keyboard.down("d")
     hold_key(stage, page, "w")
@@ -267,7 +267,7 @@ def test_wifi_that_breaks_while_two_keys_are_held_ends_both(stage: ConsoleStage)
     page.keyboard.up("w")
 
 
-def test_a_phone_that_sleeps_stops_the_car_and_wakes_without_driving(stage: ConsoleStage) -> None:
+def test_sleeping_phone_stops_car_and_wakes_without_driving(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", wired=True)
     hide = "Object.defineProperty(document, 'visibilityState', { value: 'hidden', configurable: true })"
     hold_key(stage, page, "w")
@@ -321,7 +321,7 @@ window.Date = class extends Real {
 """
 
 
-def test_times_are_those_of_the_console_whatever_the_clock_of_the_browser(stage: ConsoleStage) -> None:
+def test_times_are_of_console_not_browser_clock(stage: ConsoleStage) -> None:
     page = stage.page(timezone_id="Asia/Kathmandu", viewport={"width": 1280, "height": 900})
     page.add_init_script(WRONG_CLOCK)
     page.reload()

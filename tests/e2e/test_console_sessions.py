@@ -80,7 +80,7 @@ def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, 
     wait_for(lambda: page.locator("[data-session]").count() == 2, "the new session is listed")
 
 
-def test_a_stop_arrives_while_a_session_is_verified_and_shown_in_rerun(stage: ConsoleStage) -> None:
+def test_stop_arrives_while_session_is_verified_and_opened_in_rerun(stage: ConsoleStage) -> None:
     page = sessions_page(stage)
     row = page.locator("[data-session]").last
     others(row).get_by_role("button", name="Open in Rerun").click()

@@ -28,7 +28,7 @@ def stage(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cons
     stage.close()
 
 
-def test_a_car_is_found_blinks_and_is_written_with_the_comments_kept(stage: ConsoleStage, file: Path) -> None:
+def test_setup_finds_car_blinks_and_keeps_comments(stage: ConsoleStage, file: Path) -> None:
     sim, (link,) = stage.fleet.simulate("new:arduino:pty")
     page = stage.page("#/setup")
     page.get_by_text("no link yet").wait_for()

@@ -139,7 +139,7 @@ def test_names_in_a_plan_are_text(stage: ConsoleStage, page: Page) -> None:
     is_text(page)
 
 
-def test_a_stranger_on_the_bus_with_such_a_name_is_no_car(stage: ConsoleStage, page: Page) -> None:
+def test_stranger_on_bus_with_odd_name_is_no_car(stage: ConsoleStage, page: Page) -> None:
     bus, kept = stage.fleet.bus, []
     for name in (NAME, "red\u200b", "stranger"):  # the last one is what a car may be called, and comes after the others
         kept.append(bus.token(keys.car_token("fleet", name)))

@@ -164,7 +164,7 @@ def test_nothing_but_stops_is_commanded_from_the_past(stage: ConsoleStage, place
     stage.stands()
 
 
-def test_the_time_line_of_now_leads_back_and_to_the_running_session(stage: ConsoleStage) -> None:
+def test_live_time_line_leads_back_and_to_running_session(stage: ConsoleStage) -> None:
     page = stage.page("#/time")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")

@@ -6,7 +6,5 @@ from tests.support.authority import want_for_ever
 from tests.support.processes import FleetProcesses
 
 
-def test_a_stopped_car_stays_stopped_over_restarts_of_gateway_and_coordinator(
-    fleet: FleetProcesses, tmp_path: Path
-) -> None:
+def test_stopped_car_stays_stopped_over_gateway_and_coordinator_restarts(fleet: FleetProcesses, tmp_path: Path) -> None:
     assert want_for_ever(fleet, tmp_path, ["gateway and coordinator"]) == []

@@ -47,9 +47,7 @@ def sim(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> GatewayProces
     return sim
 
 
-def test_without_a_hub_a_stop_says_that_it_stopped_nothing_until_the_hub_is_back(
-    fleet: FleetProcesses, sim: GatewayProcess
-) -> None:
+def test_each_docs_program_runs_or_compiles(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     with without_hub(fleet):
         for words in (["stop"], ["stop", "red"], ["stop", "--json"], ["estop"], ["estop", "red"]):
             done = fleet_command(*words, environment=fleet.environment)

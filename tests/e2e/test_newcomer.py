@@ -185,7 +185,7 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
     assert every - newcomer.typed == set(NOT_RUN), "neither run, nor in the list with a reason"
 
 
-def test_each_program_of_the_docs_is_run_or_at_least_python() -> None:
+def test_killed_hub_loses_and_duplicates_no_recorded_message() -> None:
     """Programs with a name run above. Programs without a name are fragments."""
     for page in (README, *(ROOT / "docs").rglob("*.md")):
         for language, title, body in blocks(page):

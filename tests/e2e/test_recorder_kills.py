@@ -18,7 +18,7 @@ RARELY_HZ = 5.0
 
 
 @pytest.mark.timeout(240)
-def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_path: Path) -> None:
+def test_killed_recorder_loses_last_second_which_next_one_recovers(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         for attempt in range(4):  # a kill between two publications tests nothing
@@ -31,7 +31,7 @@ def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_pat
 
 
 @pytest.mark.timeout(240)
-def test_of_a_recorder_that_is_killed_the_last_second_is_missing_and_the_next_one_has_it(tmp_path: Path) -> None:
+def test_gateway_reports_sleep_longer_than_bus_timeout(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         recorder_killed(fleet, tmp_path / "sessions", cars=10, times=5, chance=random.Random(7), slack_s=BUSY_S)

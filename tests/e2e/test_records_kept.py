@@ -40,7 +40,7 @@ class Records:
         return [log.name.removeprefix("red ") for log in self.logs]
 
 
-def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: FleetProcesses) -> None:
+def test_events_without_hub_are_published_when_it_returns(fleet: FleetProcesses) -> None:
     records, judge = Records(fleet), Judge.follow(fleet.bus)
     _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
     gateway = fleet.gateway(link)
@@ -55,7 +55,7 @@ def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet
     wait_for(lambda: not judge.driving, "it stands")  # the car's own answer does not need the bus
 
 
-def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(fleet: FleetProcesses) -> None:
+def test_hub_hang_at_end_of_recording_loses_no_message(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
     tap = Tap(link)
     try:
@@ -74,7 +74,7 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
         tap.close()
 
 
-def test_a_hub_that_stands_when_a_recording_ends_costs_no_message(
+def test_rover_drives_shows_stop_and_publishes_measurements(
     fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end waits for the hub, too

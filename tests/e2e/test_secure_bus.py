@@ -115,7 +115,7 @@ def test_what_the_people_table_says_is_what_happens(identity: str, stage: Secure
     assert wrong == []
 
 
-def test_another_ones_name_moves_nothing_and_a_stop_in_it_holds_for_ones_own(stage: SecureStage) -> None:
+def test_locator_publishes_poses_and_person_does_not(stage: SecureStage) -> None:
     stage.free()
     with stage.client(MIA) as mia:
         for kind, sender in (("person", sender_of(ANN)), ("coordinator", sender_of(MIA)), ("script", "anonymous")):
@@ -158,7 +158,7 @@ def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -
     assert not [token for token in tokens if "/ann@" in token]
 
 
-def test_a_locator_says_where_cars_are_and_a_person_does_not(stage: SecureStage) -> None:
+def test_stop_during_hub_hang_arrives_after_it(stage: SecureStage) -> None:
     locator = service(Service.LOCATOR)
     with Client(stage.fleet.endpoint, identity=locator) as outside, Client(stage.fleet.endpoint, identity=MIA) as mia:
 

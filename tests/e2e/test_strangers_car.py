@@ -37,7 +37,7 @@ def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: ForeignLot) ->
 
 
 @pytest.mark.timeout(240)
-def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_not(lot: ForeignLot) -> None:
+def test_unreachable_cars_are_named_at_end_and_stopped_until_second_ctrl_c(lot: ForeignLot) -> None:
     """One wire is broken for good, and the others have gaps."""
     wanted = gaps(MODES, 20) | {"light_seeking": ByteGap(GapDirection.BOTH, 3600.0)}
     lot.cars.enter_modes(lot.fleet)
@@ -65,9 +65,7 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
 
 @pytest.mark.soak
 @pytest.mark.timeout(240)
-def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_stand_or_a_second_ctrl_c(
-    tmp_path: Path, fleet: FleetProcesses
-) -> None:
+def test_killed_script_leaves_no_driving_car_and_no_lease(tmp_path: Path, fleet: FleetProcesses) -> None:
     """The wires pass the cars' readings and lose all frames to the cars: red's for some seconds, blue's for good.
 
     test_up.py tests that `fleet up` ends by itself when the last car stands.

@@ -152,7 +152,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     "arguments",
     ["check", "plan run", "plan set", "up", "up --sim 1 --plan", "up --sim 1 --world"],
 )
-def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
+def test_fifo_as_file_is_refused_without_waiting(
     arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.mkfifo(tmp_path / "fifo")
@@ -255,7 +255,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert all(f"{section}:\n" in done.stdout for section in cli.COMMANDS)
 
 
-def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:
+def test_no_running_fleet_is_failure_with_advice() -> None:
     endpoint = free_endpoint()
     done = run(endpoint, "list")
     assert done.returncode == 1
@@ -304,7 +304,7 @@ def test_list_says_how_each_car_is(cars: Cars, monkeypatch: pytest.MonkeyPatch) 
     assert table[3][-1].endswith(" V ok")
 
 
-def test_a_reading_of_an_hour_ago_is_not_shown_as_if_it_were_so_now(cars: Cars) -> None:
+def test_hour_old_reading_is_not_shown_as_current(cars: Cars) -> None:
     """In tracking, only the line is measured, so the battery's last reading ages."""
     assert run(cars.endpoint, "mode", "red", "tracking").returncode == 0
     try:
@@ -354,7 +354,7 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     assert done.stderr.endswith("a simulated car's truth is only published. Watch it: fleet watch red/sim/truth\n")
 
 
-def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
+def test_each_car_has_line_and_missing_car_exits_1(cars: Cars) -> None:
     done = run(cars.endpoint, "led", "red,purple,blue", "#0000ff")
     assert done.returncode == 1
     assert done.stdout.splitlines() == ["blue: LED color sent", "red: LED color sent"]
@@ -413,7 +413,7 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
     assert resumed.returncode == 0
 
 
-def test_a_wrong_name_beside_all_is_named_and_all_are_stopped(cars: Cars) -> None:
+def test_wrong_name_beside_all_is_named_and_all_are_stopped(cars: Cars) -> None:
     done = run(cars.endpoint, "stop", "all", "gren")
     assert done.returncode == 1
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["blue", "green", "red"]
@@ -445,7 +445,7 @@ def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
     assert "blue: resumed: the hold by " in run(cars.endpoint, "resume", "blue").stdout
 
 
-def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> None:
+def test_fleet_estop_release_has_one_line_per_car(cars: Cars) -> None:
     def invoke(*arguments: str) -> Result:
         return CliRunner().invoke(cli.cli, [*arguments, "--connect", cars.endpoint], catch_exceptions=False)
 
@@ -461,7 +461,7 @@ def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> 
     assert invoke("resume").exit_code == 0
 
 
-def test_a_lock_that_ctrl_c_left_unlocked_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_during_lock_is_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(**_: object) -> None:
         try:
             raise KeyboardInterrupt
@@ -499,7 +499,7 @@ def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
     assert err.strip() == ""
 
 
-def test_watch_says_that_a_car_is_not_there_and_a_broken_pipe_is_silent(cars: Cars) -> None:
+def test_watch_tells_absent_car_and_ignores_broken_pipe(cars: Cars) -> None:
     command = [*FLEET, "watch", "*/state/*", "--json", "--connect", cars.endpoint]
     with running(command) as watch:
         assert watch.stdout is not None

@@ -38,7 +38,7 @@ def test_every_check_of_the_demo_holds(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(PATIENCE_S + 60)
 @pytest.mark.soak
-def test_a_demo_that_is_terminated_stops_its_cars_and_leaves_nothing(tmp_path: Path) -> None:
+def test_terminated_demo_stops_cars_and_leaves_nothing(tmp_path: Path) -> None:
     demo = subprocess.Popen(
         [sys.executable, "-m", "fleet.cli", "demo", "--sessions", str(tmp_path)], stdout=subprocess.PIPE, text=True
     )

@@ -135,7 +135,7 @@ def test_a_line_without_end_is_not_read_to_its_end(tmp_path: Path) -> None:
         list(read(path))
 
 
-def test_a_capture_is_not_written_over_and_is_there_at_once(tmp_path: Path) -> None:
+def test_capture_is_not_overwritten_and_appears_at_once(tmp_path: Path) -> None:
     path = tmp_path / "kept"
     writer = CaptureWriter(path, "link", "now")
     writer.add(CapturedBytes(0.5, b"\x00\xff$#"))

@@ -76,9 +76,7 @@ async def test_a_line_of_text_is_no_reading_and_no_damage(fleet: FleetProcesses,
         assert links[-1].state != "online"
 
 
-async def test_readings_with_another_head_are_read_as_soon_as_it_is_known(
-    fleet: FleetProcesses, car: TcpCar, tmp_path: Path
-) -> None:
+async def test_readings_with_detected_head_are_read(fleet: FleetProcesses, car: TcpCar, tmp_path: Path) -> None:
     ranges: list[Any] = []
     fleet.bus.subscribe("fleet/red/sensor/range", lambda sample: ranges.append(sample.message()))
     async with served(fleet, car.link, tmp_path, platform="auto"):

@@ -47,7 +47,7 @@ async def standing(tmp_path: Path, computer: SleepingLaptop) -> AsyncIterator[tu
         fleet.close()
 
 
-async def test_a_car_that_drove_through_a_sleep_is_stopped_before_anything_else(tmp_path: Path) -> None:
+async def test_car_that_drove_through_sleep_is_stopped_first(tmp_path: Path) -> None:
     computer = SleepingLaptop()
     async with standing(tmp_path, computer) as (fleet, car, codes):
         driven = await asyncio.to_thread(fleet.ask, "drive", motion="forward", duration_s=10)

@@ -62,7 +62,7 @@ def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
     assert SafetyStateFile(tmp_path, "fleet", "red", OTHER).load(NOW) == PersistedSafety(Hold("bob", NOW))
 
 
-def test_the_links_of_a_car_are_bounded_and_nothing_is_said_of_those_without_a_hold(tmp_path: Path) -> None:
+def test_links_of_a_car_are_bounded(tmp_path: Path) -> None:
     for number in range(3 * MAX_OTHER_LINKS):
         store = SafetyStateFile(tmp_path, "fleet", "red", f"tcp://127.0.0.1:{number}")
         store.load(NOW)
@@ -76,7 +76,7 @@ def test_the_links_of_a_car_are_bounded_and_nothing_is_said_of_those_without_a_h
     assert (again.load(NOW), again.not_taken) == (PersistedSafety(), "")
 
 
-def test_what_does_not_tell_cars_apart_is_not_part_of_the_link() -> None:
+def test_irrelevant_link_options_do_not_tell_cars_apart() -> None:
     def links(*texts: str) -> set[str]:
         return {car_link(parse_link(text)) for text in texts}
 
@@ -119,7 +119,7 @@ def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
     assert earlier.left_s(NOW - 1) == 60.0, "a clock that was set back prolongs no loan"
 
 
-def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
+def test_failed_save_is_told_and_keeps_old_state(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
         SafetyStateFile(tmp_path / "file", "fleet", "red", LINK).save(PersistedSafety())
@@ -186,7 +186,7 @@ def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: by
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the car is on a pseudo terminal")
-def test_a_gateway_says_what_it_does_not_take_over_and_a_damaged_file_holds_the_car(tmp_path: Path) -> None:
+def test_gateway_tells_unclaimed_state_and_damaged_file_holds_car(tmp_path: Path) -> None:
     from tests.gateway.link.peers import PtyPeer
 
     peer, started = PtyPeer(tmp_path), FleetProcesses(free_endpoint(), tmp_path)

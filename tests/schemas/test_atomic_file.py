@@ -18,7 +18,7 @@ def test_a_file_is_replaced_and_keeps_its_mode(tmp_path: Path, sync: bool) -> No
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_after_an_error_the_old_file_is_there_and_nothing_else(tmp_path: Path) -> None:
+def test_failed_write_keeps_old_file_only(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     path.mkdir()
     with pytest.raises(OSError, match=r"state\.json"):

@@ -56,7 +56,7 @@ def test_a_publication_carries_header_number_encoding_and_time(endpoint: str) ->
         assert before <= sample.time_ns <= time.time_ns() + 1_000_000_000
 
 
-def test_a_query_reaches_everyone_and_commands_are_never_matched_by_wildcards(endpoint: str) -> None:
+def test_query_reaches_everyone_and_commands_match_no_wildcard(endpoint: str) -> None:
     with bus.Bus.open(endpoint) as one, bus.Bus.open(endpoint) as two, bus.Bus.open(endpoint) as asker:
         asked: list[str] = []
 
@@ -106,7 +106,7 @@ def test_ctrl_c_does_not_interrupt_a_declaration(endpoint: str) -> None:
         assert declared == [True]
 
 
-def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str) -> None:
+def test_token_watch_sees_all_present_tokens(endpoint: str) -> None:
     """Zenoh answers a watcher's query with the tokens that have arrived, so a coordinator once saw no car."""
     there = {"fleet/red", "fleet/green", "fleet/blue"}
     with bus.Bus.open(endpoint) as cars:
@@ -159,7 +159,7 @@ def test_a_hub_is_started_once_and_ends_by_itself() -> None:
     [("127.0.0.1", True), ("127.1.2.3", True), ("localhost", True), ("[::1]", True)]
     + [(host, False) for host in ("0.0.0.0", "192.168.1.5", "[::]", "127.0.0.1.example.org", "laptop.local")],
 )
-def test_a_hub_listens_on_a_network_only_if_a_user_says_so(host: str, loopback: bool) -> None:
+def test_hub_listens_on_network_only_on_request(host: str, loopback: bool) -> None:
     where = f"tcp/{host}:7447"
     assert bus.is_loopback(where) is loopback
     bus.check_listening(where, insecure_lan=True)
@@ -236,7 +236,7 @@ async def turns() -> None:
         await asyncio.sleep(0)
 
 
-async def test_a_handover_keeps_order_is_bounded_and_counts_what_it_drops() -> None:
+async def test_handover_keeps_order_bounded_and_counts_drops() -> None:
     taken: list[int] = []
     handover = bus.Handover(asyncio.get_running_loop(), taken.append, limit=10)
     thread = threading.Thread(target=lambda: [handover(number) for number in range(25)])
@@ -265,7 +265,7 @@ async def test_a_handover_lets_others_have_their_turn() -> None:
     assert taken.index("stop") < 50
 
 
-async def test_a_backlog_is_taken_one_at_a_time_and_refuses_what_it_has_no_room_for() -> None:
+async def test_backlog_takes_one_at_a_time_and_refuses_overflow() -> None:
     backlog: bus.Backlog[int] = bus.Backlog(3)
     assert [backlog(number) for number in range(2)] == [True, True], "before there is a loop"
     backlog.attach(asyncio.get_running_loop(), asyncio.Event())
@@ -312,7 +312,7 @@ def test_a_reply_in_json_is_protobufs_mapping() -> None:
     assert '"seq":"7"' in text
 
 
-def test_a_message_is_of_its_keys_type_and_answers_of_other_programs_are_skipped() -> None:
+def test_message_has_type_of_key_and_foreign_answers_are_skipped() -> None:
     def answer(
         message: pb.Safety | pb.Plan, payload: bytes | None = None, key: str = "fleet/red/state/safety"
     ) -> bus.Sample:

@@ -7,6 +7,6 @@ def test_a_color_is_read_as_it_is_written() -> None:
     assert [format_color(parse_color(text)) for text in ("red", "#ff8000", "ff8000")] == ["red", "#ff8000", "#ff8000"]
 
 
-def test_a_car_has_the_color_of_its_name_or_one_by_its_place() -> None:
+def test_car_color_is_by_name_or_place() -> None:
     assert [name for name in COLORS if car_color(name, 0) != car_color(name, 5)] == ["off"], "off is no color of a car"
     assert len({hex_color(car_color(f"car{index}", index)) for index in range(6)}) == 6

@@ -27,7 +27,7 @@ def test_the_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("endpoint", [DEFAULT_ENDPOINT, "tcp/localhost:7447"])
-def test_the_default_bus_has_the_directory_itself_as_all_had_before(tmp_path: Path, endpoint: str) -> None:
+def test_default_bus_uses_state_directory_itself(tmp_path: Path, endpoint: str) -> None:
     assert directory_of(endpoint, tmp_path) == tmp_path
 
 

@@ -24,5 +24,5 @@ from schemas.topics import likely_name
         ("sensor/the", None),
     ],
 )
-def test_a_wrong_name_is_answered_with_the_topic_that_is_about_it(wrong: str, meant: str | None) -> None:
+def test_unknown_topic_suggests_matching_one(wrong: str, meant: str | None) -> None:
     assert likely_name(wrong) == meant

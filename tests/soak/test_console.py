@@ -209,7 +209,7 @@ def open_page(playwright: Any, twenty: TwentyCars, path: str = "", **options: An
     return page
 
 
-def test_a_stop_is_at_twenty_cars_within_a_tenth_of_a_second(twenty: TwentyCars) -> None:
+def test_stop_reaches_twenty_cars_within_a_tenth_of_a_second(twenty: TwentyCars) -> None:
     with sync_playwright() as playwright:
         page = open_page(playwright, twenty)
         page.locator("[data-car]").nth(len(CARS) - 1).wait_for()

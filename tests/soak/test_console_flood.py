@@ -115,9 +115,7 @@ def pauses_of_a_drive(stage: ServerStage, teacher: NetworkDevice) -> int:
     return pauses
 
 
-def test_a_stop_a_drive_and_the_recorder_do_not_notice_three_pupils_that_flood(
-    stage: ServerStage, tmp_path: Path
-) -> None:
+def test_flood_of_three_pupils_delays_no_stop_drive_or_recording(stage: ServerStage, tmp_path: Path) -> None:
     recording = Recording(stage.fleet, tmp_path / "sessions")
     teacher = stage.device("teacher", "--rank", "lead")
     pupils = [stage.device(f"pupil{number}", source=f"127.0.0.{10 + number}") for number in range(PUPILS)]

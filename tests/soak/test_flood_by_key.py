@@ -37,7 +37,7 @@ def stop(ann: Fleet, judge: Judge) -> tuple[float, float]:
     return judge.wait_off(asked_ns, watched_s=0.5), time.monotonic() - asked_at
 
 
-def test_a_flood_under_one_persons_key_delays_no_stop_of_another(tmp_path: Path) -> None:
+def test_flood_under_one_key_delays_no_stop_of_another(tmp_path: Path) -> None:
     with secure_fleet(tmp_path, ANN, [BOB, car("red")]) as (fleet, store):
         _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
         fleet.gateway(link, "--longest-drive", "60s")

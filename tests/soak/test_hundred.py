@@ -107,13 +107,13 @@ def stand(pids: list[int]) -> None:
 
 
 @pytest.mark.soak
-def test_a_hundred_cars_come_to_rest_beside_a_process_that_takes_a_processor(tmp_path: Path) -> None:
+def test_hundred_cars_stop_beside_busy_process(tmp_path: Path) -> None:
     with burning(), hundred(tmp_path, BUSY_S):
         pass
 
 
 @pytest.mark.soak
-def test_a_hundred_cars_come_to_rest_and_none_is_restarted_when_the_hub_or_the_machine_stands(tmp_path: Path) -> None:
+def test_hundred_cars_stop_after_hub_or_machine_stalls(tmp_path: Path) -> None:
     with hundred(tmp_path, QUIET_S) as up:
         for what, pids in (("hub", [up.hub()]), ("machine", [up.process.pid, *up.left()])):
             stand(pids)

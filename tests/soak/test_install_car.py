@@ -32,7 +32,7 @@ def paths(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*") if not path.is_relative_to(root / "opt")}
 
 
-def test_installed_twice_it_joins_and_drives_and_removed_it_leaves_nothing(tmp_path: Path) -> None:
+def test_reinstall_joins_drives_and_uninstall_leaves_nothing(tmp_path: Path) -> None:
     root = tmp_path / "a root"
     root.mkdir()
     (root / "etc").mkdir()

@@ -166,9 +166,7 @@ def test_a_car_comes_acts_and_goes(tmp_path: Path, broker: Mosquitto, reader: Mq
         assert kept(broker) == {}
 
 
-def test_a_broker_that_goes_or_hangs_and_a_bridge_that_is_killed(
-    tmp_path: Path, broker: Mosquitto, reader: MqttReader
-) -> None:
+def test_broker_outage_and_killed_bridge(tmp_path: Path, broker: Mosquitto, reader: MqttReader) -> None:
     with contextlib.closing(FleetProcesses(f"tcp/127.0.0.1:{free_port()}", tmp_path)) as fleet:
         _, (link,) = fleet.simulate("red:arduino:tcp")
         gateway = fleet.gateway(link)

@@ -39,7 +39,7 @@ def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_what_publishers_hold_is_had_again_however_long_the_hub_was_away(tmp_path: Path) -> None:
+def test_backfill_recovers_after_any_hub_outage(tmp_path: Path) -> None:
     """Publishers cache a hundred seconds of a topic with two messages a second."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:

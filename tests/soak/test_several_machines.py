@@ -107,7 +107,7 @@ def test_an_operator_that_is_cut_off_stops_both(seed: int, stage: NetworkStage) 
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(ROUNDS))
-def test_a_car_that_is_cut_off_stops_and_the_other_one_drives_on(seed: int, stage: NetworkStage) -> None:
+def test_cut_off_car_stops_and_other_drives_on(seed: int, stage: NetworkStage) -> None:
     driver = stage.drive()
     stage.made.cut(PI)
     began = time.monotonic()
@@ -130,7 +130,7 @@ def test_a_car_that_is_cut_off_stops_and_the_other_one_drives_on(seed: int, stag
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("_", range(ROUNDS))
-def test_a_hub_that_is_killed_comes_back_and_nothing_old_is_obeyed(_: int, stage: NetworkStage) -> None:
+def test_killed_hub_returns_and_old_commands_are_not_obeyed(_: int, stage: NetworkStage) -> None:
     driver = stage.drive()
     stage.made.kill_hub()
     began = time.monotonic()

@@ -128,7 +128,7 @@ def test_with_one_stale_state_a_car_is_not_ready(old: str) -> None:
     assert state.stale_topics(10.0) == [old]
 
 
-def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came() -> None:
+def test_awaited_drive_ends_with_basis_and_not_early() -> None:
     def answered(ahead_s: float) -> CarState:
         reading = Reading.of("fleet/red/state/link", pb.Link(state="online", stamp=_stamp(NOW + ahead_s)), 0)
         return CarState.of_answers("red", [("state/link", reading)], NOW, present=True)
@@ -144,7 +144,7 @@ def test_an_answer_counts_from_its_stamp_and_what_is_published_from_when_it_came
     assert published.is_stale("state/link", NOW + 3.1)
 
 
-def test_of_the_answers_of_two_gateways_those_of_the_newer_one_count() -> None:
+def test_stop_supersedes_drive_and_waits_until_complete() -> None:
     said = {
         "state/link": (2.0, pb.Link(state="online", boot_id="b")),
         "state/mode": (1.0, pb.Mode(asked="tracking", boot_id="a")),
@@ -155,7 +155,7 @@ def test_of_the_answers_of_two_gateways_those_of_the_newer_one_count() -> None:
     assert (state.link.state, state.mode.asked, state.safety.motors) == ("online", "", "off")
 
 
-def test_an_answer_that_was_overtaken_and_the_words_of_an_earlier_gateway_do_not_count() -> None:
+def test_person_stop_holds_car_against_coordinator_until_resume() -> None:
     state = CarState("red")
     assert state.take("state/link", pb.Link(state="online", boot_id="a"), 10.0)
     assert state.take("state/safety", pb.Safety(motors="off", boot_id="a"), 10.0)

@@ -61,7 +61,7 @@ def test_stopped_is_said_only_of_what_was_shown(claim: CarClaim, begins: str, ba
     assert is_bad_rest(words) is bad
 
 
-def test_a_message_of_an_earlier_gateway_counts_only_if_that_one_runs_on() -> None:
+def test_hung_gateway_differs_from_late_answer() -> None:
     starts = GatewayStarts()
     assert starts.take("a", 10)
     assert starts.take("b", 20)

@@ -34,7 +34,7 @@ def test_each_job_has_a_thread_that_ends_with_it() -> None:
     assert threads.submit(job, 7).result(30) == 7
 
 
-def test_an_error_of_a_job_is_its_result_and_the_next_job_runs() -> None:
+def test_async_for_yields_readings_until_fleet_closes() -> None:
     threads = JobThreads(1, "job-b")
 
     def fail() -> None:
@@ -45,7 +45,7 @@ def test_an_error_of_a_job_is_its_result_and_the_next_job_runs() -> None:
     assert threads.submit(max, 1, 2).result(30) == 2
 
 
-def test_shutdown_drops_jobs_that_wait_and_ends_with_the_last_that_runs() -> None:
+def test_answer_overtaken_by_last_event_keeps_worst_case() -> None:
     threads, begun, over = JobThreads(1, "job-c"), threading.Event(), threading.Event()
 
     def job() -> None:

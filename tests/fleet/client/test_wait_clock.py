@@ -41,7 +41,7 @@ class SteppedWait:
 
 
 @pytest.mark.parametrize("step_s", [-HOUR_S, HOUR_S])
-def test_a_clock_that_is_set_ends_no_wait_for_an_hour(step_s: float) -> None:
+def test_check_of_fleet_file_includes_plan_and_world(step_s: float) -> None:
     wait = SteppedWait()
     assert not wait.hear(0.5)
     assert not wait.hear(0.5, step_s=step_s)
@@ -50,7 +50,7 @@ def test_a_clock_that_is_set_ends_no_wait_for_an_hour(step_s: float) -> None:
 
 @pytest.mark.parametrize("step_s", [-HOUR_S, HOUR_S])
 @pytest.mark.parametrize(("topic", "when"), [("sensor/range", "range_m < 0.3"), ("event/command", "verb == 'led'")])
-def test_how_long_it_must_hold_begins_again_and_no_step_counts(step_s: float, topic: str, when: str) -> None:
+def test_check_of_world_uses_simulated_cars_of_fleet_file(step_s: float, topic: str, when: str) -> None:
     wait = SteppedWait(topic, when, FOR_S)
     assert [wait.hear() for _ in range(4)] == [False] * 4
     assert not wait.hear(step_s=step_s)
@@ -81,11 +81,11 @@ def test_a_wait_ends_only_after_its_time_and_always_then(seen: list[tuple[bool, 
         (HOUR_S, False),
     ],
 )
-def test_a_stored_reading_from_before_the_clock_was_set_is_not_fresh(stamp_s: float, *, ends: bool) -> None:
+def test_doctor_of_session_names_car_time_and_cause_of_stops(stamp_s: float, *, ends: bool) -> None:
     assert SteppedWait().query(stamp_s) is ends
 
 
-def test_after_a_stored_reading_of_the_future_the_published_ones_count() -> None:
+def test_any_name_and_device_make_valid_fleet_file() -> None:
     wait = SteppedWait(for_s=2.0)
     assert not wait.query(HOUR_S)
     assert [wait.hear() for _ in range(3)] == [False, False, True]

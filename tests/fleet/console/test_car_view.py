@@ -80,7 +80,7 @@ def test_a_link_without_a_gateway_is_not_online() -> None:
     assert view.look_up("red").describe_gateway() == []
 
 
-def test_a_returning_gateway_does_not_bring_the_last_ones_claims_back() -> None:
+def test_certificate_is_kept_until_new_address_or_expiry() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     states = {
@@ -118,7 +118,7 @@ def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
 
 
 @pytest.mark.parametrize(("after_s", "silent_s"), [(SILENT_AFTER_S, None), (SILENT_AFTER_S + 0.1, 3), (90.0, 90)])
-def test_a_card_without_news_says_its_age_and_claims_no_link(after_s: float, silent_s: int | None) -> None:
+def test_world_readable_key_is_closed_and_damaged_key_named(after_s: float, silent_s: int | None) -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/link", pb.Link(state="online"), 9.0)
@@ -175,7 +175,7 @@ def test_the_last_event_and_the_ledger() -> None:
     assert len(car.ledger) == 60
 
 
-def test_a_car_that_a_page_names_is_not_added_and_a_temporary_one_leaves_nothing() -> None:
+def test_many_addresses_need_no_new_certificate_each_time() -> None:
     view = view_of()
     assert view.look_up("ghost").as_dict(0.0)["gateway"] is False
     assert view.names == ["red"]
@@ -203,7 +203,7 @@ def test_cars_that_nobody_lists_have_places_up_to_a_bound() -> None:
     assert len(view.names) == MAX_OTHER_CARS
 
 
-def test_the_car_that_is_silent_the_longest_gives_way_and_one_that_is_heard_to_none() -> None:
+def test_car_keeps_fleet_color_after_early_event_and_reload() -> None:
     view = view_of()
     invent(view, MAX_OTHER_CARS - 1, 1.0)
     now = 1.0

@@ -15,7 +15,7 @@ from fleet.console.people_file import PeopleFile
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
 
-def test_a_certificate_is_kept_until_an_address_is_new_or_it_expires(tmp_path: Path) -> None:
+def test_frame_before_event_of_its_command_is_shown(tmp_path: Path) -> None:
     made = ensure_certificate(["192.168.1.5", "laptop.local"], NOW, tmp_path)
     assert made.names == ("192.168.1.5", "laptop.local")
     key = made.key_path.read_bytes()
@@ -32,7 +32,7 @@ def test_a_certificate_is_kept_until_an_address_is_new_or_it_expires(tmp_path: P
     assert key == made.key_path.read_bytes(), "the key stays"
 
 
-def test_a_key_that_others_can_read_is_closed_and_a_damaged_one_is_named(tmp_path: Path) -> None:
+def test_own_page_is_served_on_both_names_with_cookie(tmp_path: Path) -> None:
     made = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
     made.key_path.chmod(0o644)
     ensure_certificate(["10.0.0.7"], NOW, tmp_path)
@@ -50,7 +50,7 @@ def test_another_key_makes_another_certificate(tmp_path: Path) -> None:
     assert ensure_certificate(["10.0.0.7"], NOW, tmp_path).fingerprint != made.fingerprint
 
 
-def test_a_computer_with_many_addresses_needs_no_new_certificate_each_time(tmp_path: Path) -> None:
+def test_log_rate_is_per_cause_and_counts_omissions(tmp_path: Path) -> None:
     many = [f"10.0.{number}.1" for number in range(certificate.MAX_NAMES + 5)]
     assert ensure_certificate(many, NOW, tmp_path) == ensure_certificate(many, NOW, tmp_path)
 

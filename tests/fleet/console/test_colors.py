@@ -22,9 +22,7 @@ from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 KEY = "fleet/@supervisor/status"
 
 
-async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_after_a_reload(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_map_places_equal_tables_at_100_random_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervision, "COLORS_TIMEOUT_S", PATIENCE_S)
     hub = FleetProcesses(free_endpoint(), tmp_path)
     asked: list[zenoh.Query] = []

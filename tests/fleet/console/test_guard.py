@@ -83,7 +83,7 @@ def test_a_stop_of_our_page_needs_no_cookie() -> None:
     assert call("http", "/stop", but(cookie=None), "POST")[0]["status"] == 200
 
 
-def test_our_page_is_served_on_both_names_and_gets_a_cookie() -> None:
+def test_map_trail_is_bounded_and_standing_car_adds_nothing() -> None:
     assert call("websocket", "/ws", OURS)[0]["type"] == "websocket.accept"
     for host in HOSTS:
         start = call("http", "/", {"host": host})[0]

@@ -11,7 +11,7 @@ def record(line: int, at: float) -> logging.LogRecord:
     return made
 
 
-def test_each_cause_has_a_rate_and_what_is_left_out_is_counted() -> None:
+def test_page_gets_hello_before_first_tick_then_ticks_first() -> None:
     limit, burst = LogRate(), int(LOG_BURST)
     assert sum(limit.filter(record(1, 0.0)) for _ in range(burst + 7)) == burst
     assert limit.filter(record(2, 0.0)), "another cause"

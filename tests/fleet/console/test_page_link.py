@@ -35,7 +35,7 @@ def sent_by(page_does: Any) -> list[str]:
     return asyncio.run(run())
 
 
-def test_a_page_is_greeted_before_its_first_tick_and_then_a_tick_goes_first() -> None:
+def test_class_code_pairs_guests_for_ten_minutes_until_closed() -> None:
     def tick_and_answer(page: PageLink) -> None:
         page.show("tick", '{"t": "tick"}')
         page.answer(t="hello")

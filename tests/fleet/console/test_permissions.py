@@ -123,7 +123,7 @@ def test_the_words_name_the_person_the_car_and_the_rule() -> None:
     assert refusals("red", red, TEACHER) == {}
 
 
-def test_the_recorder_and_the_plan_are_for_leads_where_the_fleet_has_some() -> None:
+def test_abandoned_or_dead_plan_check_spoils_no_other() -> None:
     red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
     blue = Authority(People.parse(["teacher:lead", "eve", "ann:other"]))
     assert [management_refusal({"red": red, "blue": blue}, each) for each in (TEACHER, ANN, EVE, ZED)] == [
@@ -147,7 +147,7 @@ def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
     assert rights_of(ANN, {})["pause"] == ""
 
 
-def test_mine_are_the_cars_of_a_person_whatever_else_refuses_now() -> None:
+def test_plan_hash_in_words_becomes_name() -> None:
     people = People.parse(["teacher:lead", "ann", "bob:other"])
     paused = (FleetPause("p1", TEACHER, "lunch", 0, LEAD),)
     cars = {

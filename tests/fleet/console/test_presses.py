@@ -25,7 +25,7 @@ def test_a_press_lives_while_new_ticks_are_echoed() -> None:
         assert book.expire(now + 0.05) == []
 
 
-def test_a_press_without_an_echo_ends_after_the_gap_and_stays_over() -> None:
+def test_mode_or_release_ends_no_press_of_higher_rank() -> None:
     book, _ = book_with_press()
     assert book.expire(9.99 + MAX_ECHO_GAP_S) == []
     (over,) = book.expire(10.01 + MAX_ECHO_GAP_S)
@@ -37,7 +37,7 @@ def test_a_press_without_an_echo_ends_after_the_gap_and_stays_over() -> None:
     assert book.begin(1, 2, RED, "forward", tick, 10.4)[0].id == 2
 
 
-def test_an_echo_after_the_gap_does_not_count_even_if_nothing_has_expired_it() -> None:
+def test_pairing_code_needs_person_of_fleet_and_running_console() -> None:
     """If our own loop was blocked, it handles the pending echoes before `expire`."""
     book, _ = book_with_press()
     late = book.tick(10.0 + MAX_ECHO_GAP_S + 0.1)
@@ -124,7 +124,7 @@ def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
             assert not (over and book.alive)
 
 
-def test_a_sleep_of_the_computer_ends_every_press_and_no_tick_from_before_counts() -> None:
+def test_class_joins_with_one_code_watches_stops_and_is_assigned() -> None:
     """The clock of the server stood still, so that neither the tick nor the echo looks old."""
     book, tick = book_with_press()
     (over,) = book.on_sleep()
@@ -140,7 +140,7 @@ def test_a_sleep_of_the_computer_ends_every_press_and_no_tick_from_before_counts
     ("person", "holder", "takes"),
     [("teacher", "pupil", True), ("pupil", "teacher", False), ("teacher", "head", False), ("pupil", "other", False)],
 )
-def test_a_lead_takes_a_car_from_a_person_and_nobody_else_takes_one(person: str, holder: str, *, takes: bool) -> None:
+def test_forbidden_command_of_pupil_ends_no_press_of_lead(person: str, holder: str, *, takes: bool) -> None:
     book, leads = PressBook(), ("head", "teacher")
     tick = book.tick(10.0)
     book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, leads=leads)
@@ -165,9 +165,7 @@ def test_a_lead_takes_a_car_from_a_person_and_nobody_else_takes_one(person: str,
         ("pupil", "pupil", True),
     ],
 )
-def test_a_mode_or_a_car_given_back_ends_no_press_of_somebody_who_need_not_yield(
-    person: str, holder: str, *, ends: bool
-) -> None:
+def test_plan_is_set_under_person_name_without_open_page(person: str, holder: str, *, ends: bool) -> None:
     book, leads = PressBook(), ("head", "teacher")
     book.begin(1, 1, RED, "forward", book.tick(10.0), 10.0, person=holder, leads=leads)
     assert not book.drop_cars_of({"blue"}, person, leads)

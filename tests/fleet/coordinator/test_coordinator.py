@@ -125,9 +125,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     assert {role.name: list(role.cars) for role in last.roles} == {"manual": ["green"], "tracking": ["red"]}
 
 
-def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_is_back(
-    cars: Cars, tmp_path: Path
-) -> None:
+def test_unreachable_plan_is_refused_at_start_and_over_bus(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
     lines = Lines(process)
     lines.until("red", "tracking", "role tracking")
@@ -143,7 +141,7 @@ def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_
     assert process.end(signal.SIGTERM) == 0
 
 
-def test_what_a_car_cannot_do_is_said_and_not_asked_for(cars: Cars, tmp_path: Path) -> None:
+def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(
         cars, tmp_path / "plan.yaml", "fixed: {blue: {mode: tracking}, green: {mode: manual}, purple: {mode: manual}}"
     )
@@ -185,7 +183,7 @@ roles:
 """
 
 
-def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_all(cars: Cars, tmp_path: Path) -> None:
+def test_car_is_unheard_until_all_denials_are_known(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     lines = Lines(process)
     lines.until("green", "manual", "role rest")
@@ -227,7 +225,7 @@ phases: {first: {roles: [line], timeout_s: 600, next: second}, second: {roles: [
 """
 
 
-def test_a_person_goes_on_to_the_next_phase_stops_the_plan_and_restarts_it(cars: Cars, tmp_path: Path) -> None:
+def test_car_is_forgotten_a_minute_after_gateway_unless_named(cars: Cars, tmp_path: Path) -> None:
     events: list[Any] = []
     cars.bus.subscribe("fleet/@coordinator/log", lambda sample: events.append(sample.message()))
 
@@ -285,9 +283,7 @@ cars:
 NEVER = "fixed: {purple: {mode: tracking}}\nroles: {ghost: {mode: tracking, cars: [green]}}"
 
 
-def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_over_the_bus(
-    cars: Cars, tmp_path: Path
-) -> None:
+def test_car_back_within_a_minute_is_not_forgotten(cars: Cars, tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(LISTED, encoding="utf-8")
     listed = ("--fleet-file", str(file))
@@ -324,7 +320,7 @@ def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_ove
     assert "the new plan: car red: the fleet file lets it take role scout" in process.stderr
 
 
-def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
+def test_ten_thousand_names_are_decided_rarely_and_forgotten(cars: Cars, tmp_path: Path) -> None:
     # The coordinator of the test before may have requested a mode that red still opens.
     wait_for(lambda: cars.state("safety", "red").trust != "stopping", "red changes no mode")
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)

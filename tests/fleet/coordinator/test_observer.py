@@ -30,7 +30,7 @@ def come(observer: FleetObserver, car: str, now: float) -> None:
         observer.on_sample(said(topic, car), now, None)
 
 
-def test_a_car_is_unheard_until_all_is_known_that_could_forbid_a_command() -> None:
+def test_late_hold_of_earlier_gateway_blocks_nobody() -> None:
     observer = FleetObserver()
     assert observer.unconfirmed == set()
     observer.on_token("red", 99.0, alive=True)
@@ -63,7 +63,7 @@ def test_a_car_is_in_doubt_while_its_gateway_says_so() -> None:
     assert not observer.cars["red"].doubted, "a car that cannot show its stops is used like any other"
 
 
-def test_a_car_is_forgotten_a_minute_after_its_gateway_went_but_not_one_that_is_named() -> None:
+def test_after_computer_sleep_no_old_reading_is_fresh() -> None:
     observer = FleetObserver({"blue": CarSnapshot(listed=True)})
     for car in ("red", "green", "blue"):
         come(observer, car, 100.0)
@@ -77,7 +77,7 @@ def test_a_car_is_forgotten_a_minute_after_its_gateway_went_but_not_one_that_is_
     assert observer.present == {"green"}
 
 
-def test_a_car_that_is_back_within_the_minute_is_not_forgotten() -> None:
+def test_each_metric_has_panel_and_panels_do_not_overlap() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     observer.on_token("red", 101.0, alive=False)
@@ -86,7 +86,7 @@ def test_a_car_that_is_back_within_the_minute_is_not_forgotten() -> None:
     assert observer.present == {"red"}
 
 
-def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgotten() -> None:
+def test_stale_metric_has_no_value_and_gone_gateway_is_down() -> None:
     """Most names have only a token, some also a state, and one is not on the bus. All of them disappear."""
     plan = parse("roles: {scout: {mode: manual}}")
     observer, memory, now = FleetObserver(), PolicyState(), 100.0
@@ -143,7 +143,7 @@ def test_the_people_are_those_that_any_gateway_knows() -> None:
     assert observer.people == NO_PEOPLE
 
 
-def test_a_late_hold_of_an_earlier_gateway_keeps_nobody_from_a_car() -> None:
+def test_each_command_phase_counts_once_with_closed_labels() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     held = pb.Safety(car="red", boot_id="a", hold=pb.Hold(by="ann"))
@@ -201,7 +201,7 @@ def test_a_token_that_names_no_car_is_ignored() -> None:
     assert observer.present == set()
 
 
-def test_after_a_sleep_of_the_computer_no_reading_from_before_is_fresh() -> None:
+def test_auto_shares_adapters_with_cars_that_name_one() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     observer.on_sample(said("sensor/range"), 100.0, None)

@@ -53,7 +53,7 @@ def test_a_car_has_the_values_of_its_messages() -> None:
     assert ("fleet_car_battery_volts", "red") not in values
 
 
-def test_what_is_stale_has_no_value_and_a_gateway_that_is_gone_is_down() -> None:
+def test_shared_ports_equal_pairwise_comparison() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     late = NOW + (topics.TOPICS["state/link"].stale_after_s or 0) + 1
@@ -64,7 +64,7 @@ def test_what_is_stale_has_no_value_and_a_gateway_that_is_gone_is_down() -> None
     assert found(metrics, late) == {("fleet_car_up", "red"): 0}
 
 
-def test_each_phase_of_a_command_counts_once_and_with_words_of_closed_sets_only() -> None:
+def test_large_fleet_file_takes_linear_time() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     for event in (

@@ -26,7 +26,7 @@ def usage_of(certificate: bytes) -> list[x509.ObjectIdentifier]:
     return list(found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
 
 
-def test_a_certificate_is_signed_by_its_authority_and_by_no_other(ca: authority.KeyPair) -> None:
+def test_store_change_waits_for_lock_but_not_for_killed_holder(ca: authority.KeyPair) -> None:
     made = x509.load_pem_x509_certificate(authority.issue(ca, "person.mia", NOW).certificate)
     made.verify_directly_issued_by(x509.load_pem_x509_certificate(ca.certificate))
     other = x509.load_pem_x509_certificate(authority.make_authority(NOW).certificate)
@@ -75,7 +75,7 @@ def test_a_request_with_another_ones_signature_is_refused(ca: authority.KeyPair)
         (timedelta(0), [], False),
     ],
 )
-def test_it_is_due_a_third_of_its_life_before_its_end_or_for_a_new_address(
+def test_false_hub_beside_right_authority_gets_nothing(
     ca: authority.KeyPair, after: timedelta, names: list[str], is_due: bool
 ) -> None:
     made = authority.issue(ca, "hub", NOW, ["127.0.0.1", "hall.local"]).certificate

@@ -55,7 +55,7 @@ def test_due_certificates_are_renewed_and_the_authority_stays(tmp_path: Path) ->
     assert store.credentials.listens == ["tls/0.0.0.0:7447"], "as before"
 
 
-def test_whoever_is_revoked_is_in_no_rule_and_comes_back_under_another_name(tmp_path: Path) -> None:
+def test_service_invited_elsewhere_is_taken_back(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     store.reserve(person("mia"), NOW)
     assert "person.mia" in common_names(store)
@@ -100,7 +100,7 @@ def test_without_a_certificate_the_way_to_one_is_said(tmp_path: Path) -> None:
         credentials.of_hub()
 
 
-def test_a_program_has_its_own_certificate_or_that_of_the_user(tmp_path: Path) -> None:
+def test_pose_is_allowed_to_own_gateway_and_locator(tmp_path: Path) -> None:
     credentials = store_in(tmp_path).credentials
     assert credentials.identity("car.red") == "car.red"
     with pytest.raises(NoCredentials, match="fleet hub init --car blue"):
@@ -187,9 +187,7 @@ def test_a_damaged_authority_is_named(name: str, tmp_path: Path) -> None:
         store.sign(request, person("eve"), NOW)
 
 
-def test_a_change_waits_for_another_ones_and_not_for_one_that_was_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sites_go_on_alone_and_are_one_fleet_when_linked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_in(tmp_path)
     monkeypatch.setattr("fleet.hub.hub_store.LOCK_TIMEOUT_S", 0.1)
     holder = (

@@ -80,7 +80,7 @@ def test_everyone_speaks_for_itself_only(identity: str) -> None:
         assert allows(identity, "ingress", "declare_queryable", caches) == may_locate(identity, of)
 
 
-def test_a_pose_is_said_by_the_cars_own_gateway_and_by_a_locator() -> None:
+def test_good_plan_passes_with_and_without_fleet_file() -> None:
     assert {each for each in EVERYONE if may_locate(each, "red")} == {car("red"), service(Service.LOCATOR)}
     assert may_locate("", "red"), "on a hub without certificates everyone may"
     locator = service(Service.LOCATOR)

@@ -103,7 +103,7 @@ def reached(bus: Bus, key: str) -> list[str]:
     return sorted(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
 
 
-def test_each_side_goes_on_by_itself_and_both_are_one_fleet_when_linked(sites: Sites) -> None:
+def test_plan_without_conflicts_passes(sites: Sites) -> None:
     sites.start(sites.first)
     sites.start(sites.second)
     with ExitStack() as stack:
@@ -128,7 +128,7 @@ def test_each_side_goes_on_by_itself_and_both_are_one_fleet_when_linked(sites: S
             )
 
 
-def test_the_rules_of_the_first_hub_are_those_of_every_site(sites: Sites) -> None:
+def test_unreachable_plan_with_fleet_file_is_refused_with_all_faults(sites: Sites) -> None:
     sites.start(sites.first)
     sites.start(sites.second)
     with gateway(sites.second, "blue"), Bus.open(sites.second, identity=EVE) as eve:

@@ -26,7 +26,7 @@ def event(verb: str, command: str, phase: str = "asked") -> pb.CommandEvent:
     return pb.CommandEvent(verb=verb, id=command, phase=phase)
 
 
-def test_a_stop_of_several_cars_is_one_and_what_stops_nothing_is_none() -> None:
+def test_wrong_topic_name_suggests_topic() -> None:
     found = StopCount()
     for verb, command, phase in itertools.product(("stop", "drive", "resume", "mode"), ("a", "b"), PHASES):
         found.add(event(verb, f"{verb} {command}", phase))

@@ -20,7 +20,7 @@ def test_the_file_is_what_the_tables_make() -> None:
     assert json.loads(FILE.read_text()) == foxglove_layout.layout(), command
 
 
-def test_every_path_is_a_field_of_a_topic_and_every_topic_is_shown() -> None:
+def test_layout_paths_are_fields_and_every_topic_is_shown() -> None:
     layout = json.loads(FILE.read_text())
     shown = set()
     for kind, config in ((name.partition("!")[0], each) for name, each in layout["configById"].items()):

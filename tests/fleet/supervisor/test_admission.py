@@ -22,13 +22,11 @@ from fleet.supervisor.admission import (
         ([0.0, 1.0, 2.0, 3.0], True),
     ],
 )
-def test_the_next_is_admitted_when_one_before_it_is_heard_or_has_had_its_time(
-    starting_since: list[float], admitted: bool
-) -> None:
+def test_admission_waits_for_predecessor_heard_or_timed_out(starting_since: list[float], admitted: bool) -> None:
     assert Admission(2).admit_start(100.0, starting_since, restart=False) is admitted
 
 
-def test_restarts_have_a_budget_for_the_whole_fleet_and_first_starts_have_none() -> None:
+def test_restart_budget_is_fleet_wide_without_first_starts() -> None:
     admission = Admission(100)
     assert all(admission.admit_start(0.0, [], restart=False) for _ in range(1000))
     assert sum(admission.admit_start(0.0, [], restart=True) for _ in range(1000)) == RESTARTS_AT_ONCE
@@ -47,7 +45,7 @@ def test_kills_have_a_budget_for_the_whole_fleet() -> None:
 
 @pytest.mark.parametrize("count", [1, 10, 100])
 @pytest.mark.parametrize("work_s", [0.3, 1.0])
-def test_a_fleet_starts_one_after_the_other_and_never_more_than_have_a_place(count: int, work_s: float) -> None:
+def test_fleet_starts_one_by_one_within_places(count: int, work_s: float) -> None:
     """On virtual time, starting processes share two processors, and each needs `work_s` of one."""
     admission, waiting, starting, now, most = Admission(3), count, list[list[float]](), 0.0, 0
     while waiting or starting:

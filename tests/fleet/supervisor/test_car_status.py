@@ -57,7 +57,7 @@ def test_a_row_says_what_is_new_once() -> None:
         (pb.Link(state="quiet"), "on", "", ""),
     ],
 )
-def test_a_car_is_ready_when_its_link_is_open_and_a_command_waits_for_nothing(
+def test_car_is_ready_with_open_link_and_no_waiting_command(
     link: pb.Link, motors: str, waits_for: str, why: str
 ) -> None:
     row = CarStatus("red")
@@ -99,7 +99,7 @@ def test_a_start_ends_with_one_line(names: list[str], missing: dict[str, str], w
     assert describe_start(names, missing, "s") == words
 
 
-def test_a_start_ends_when_nobody_has_become_ready_for_a_while() -> None:
+def test_start_timeout_counts_from_last_ready_car() -> None:
     progress = StartProgress()
     assert not progress.has_ended(3, 100.0, unreachable=False)
     assert not progress.has_ended(2, 100.0 + READY_TIMEOUT_S, unreachable=False), "another car is ready"
@@ -157,7 +157,7 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
         ),
     ],
 )
-def test_what_keeps_a_car_still_from_an_earlier_day_is_told_with_how_to_end_it(safety: pb.Safety, words: str) -> None:
+def test_old_hold_or_estop_is_told_with_release(safety: pb.Safety, words: str) -> None:
     assert describe_old_stops("red", safety, TODAY) == words
 
 
@@ -200,7 +200,7 @@ def test_the_table_fits_and_names_every_car(width: int) -> None:
     assert "obstacle_av" in green
 
 
-def test_the_table_names_who_keeps_or_drives_a_car_and_says_the_last_word_of_a_gateway_that_ended() -> None:
+def test_status_table_names_holder_driver_and_last_word() -> None:
     spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
     supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
     row = supervisor.rows["red"] = CarStatus("red")
@@ -236,7 +236,7 @@ def test_the_table_names_who_keeps_or_drives_a_car_and_says_the_last_word_of_a_g
         (5, {"car": 4, "mode": 4, "battery": 4}),
     ],
 )
-def test_columns_are_left_out_in_order_and_then_the_widest_is_shortened(width: int, columns: dict[str, int]) -> None:
+def test_columns_are_dropped_in_order_then_widest_shortened(width: int, columns: dict[str, int]) -> None:
     assert fit({"car": 5, "platform": 20, "mode": 30, "battery": 15}, width, ("platform",)) == columns
 
 
@@ -251,7 +251,7 @@ def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:
     assert "line 1800" in text
 
 
-def test_a_log_that_cannot_be_written_says_so_and_hurts_nobody(tmp_path: Path) -> None:
+def test_unwritable_log_is_told_and_harmless(tmp_path: Path) -> None:
     log = Log(tmp_path / "gone" / "red.log")
     log.add("x", 0.0)
     assert "cannot be written: No such file" in log.failed

@@ -36,9 +36,7 @@ from tests.support.processes import freeze, wait_for
         (0.99, 0.01, False, Sign.SPINNING),
     ],
 )
-def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
-    run_share: float, wait_share: float, ready: bool, sign: Sign
-) -> None:
+def test_silence_is_judged_by_cpu_time(run_share: float, wait_share: float, ready: bool, sign: Sign) -> None:
     pulse = Pulse()
     assert pulse.sign is Sign.UNKNOWN
     for half in range(10):
@@ -51,7 +49,7 @@ def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
     assert pulse.sign is Sign.UNKNOWN
 
 
-def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothing() -> None:
+def test_only_last_seconds_of_cpu_time_count() -> None:
     pulse = Pulse()
     for half in range(20):  # the process worked, then hangs
         pulse.add(half / 2, CpuTime(min(half, 8) / 2))
@@ -117,7 +115,7 @@ def test_the_watchers_clock_stands_while_the_watcher_does() -> None:
     assert clock.advance(now + 0.1) == pytest.approx(began + MAX_POLL_GAP_S + 0.1)
 
 
-def test_a_process_is_seen_to_be_blocked_to_spin_and_to_have_gone(tmp_path: Path) -> None:
+def test_blocked_spinning_and_gone_processes_are_told_apart(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         begun = wait_for(lambda: cpu_time.read(process.pid), "there is a process")

@@ -38,13 +38,13 @@ def running(at: float = 100.0) -> ProcessState:
 @pytest.mark.parametrize(
     ("falls", "delay"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 2.0), (5, 4.0), (6, 8.0), (7, 10.0), (1000, 10.0)]
 )
-def test_the_delay_doubles_to_its_longest_and_is_spread_either_way(falls: int, delay: float) -> None:
+def test_backoff_doubles_to_maximum_with_jitter(falls: int, delay: float) -> None:
     assert delay_s(falls, 0.5) == delay
     assert delay_s(falls, 0.0) == pytest.approx(delay * (1 - RESTART_JITTER))
     assert delay_s(falls, 1.0) == pytest.approx(delay * (1 + RESTART_JITTER))
 
 
-def test_a_gateway_is_killed_no_sooner_than_its_own_wait_for_evidence_is_over() -> None:
+def test_gateway_is_not_killed_before_its_evidence_timeout() -> None:
     state = running()
     assert state.end(200.0, GATEWAY_GRACE_S)
     assert state.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is RestartAction.NOTHING
@@ -62,7 +62,7 @@ def test_what_dies_is_started_again_after_the_delay() -> None:
     assert (state.state, state.restarts) == (RunState.STARTING, 1)
 
 
-def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadily_does_not() -> None:
+def test_crash_loop_backs_off_and_steady_run_resets() -> None:
     state, at, delays = ProcessState(PATIENCE, 0.0), 0.0, []
     for _ in range(8):
         state.on_started(at)
@@ -78,7 +78,7 @@ def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadil
     assert state.words == "ended with exit code 1: no"
 
 
-def test_a_process_that_refuses_its_arguments_is_retried_each_minute_and_at_once_after_a_reload() -> None:
+def test_rejected_arguments_are_retried_each_minute_or_after_reload() -> None:
     state = running()
     state.on_exit(2, "no such platform", 101.0, 0.5)
     assert state.state is RunState.REFUSED
@@ -97,7 +97,7 @@ def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, a
     assert running(100.0).turn(105.0, 0.0, leave_s) is act
 
 
-def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -> None:
+def test_ending_process_has_its_time_however_silent() -> None:
     state = running()
     state.end(110.0, 7.0)
     assert state.turn(117.0, 0.0, inf) is RestartAction.KILL
@@ -133,7 +133,7 @@ def test_who_starts_has_longer() -> None:
     assert state.turn(120.1, 0.0) is RestartAction.KILL
 
 
-def test_told_to_end_it_has_its_time_and_then_is_killed_and_not_started_again() -> None:
+def test_ended_process_is_killed_after_timeout_and_not_restarted() -> None:
     state = running()
     assert state.end(110.0, 7.0)
     assert not state.end(111.0, 7.0), "told twice is told once"
@@ -175,7 +175,7 @@ class FakeProcess:
         )
     )
 )
-def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[tuple[str, float, float]]) -> None:
+def test_restart_policy_runs_one_process_in_any_order(steps: list[tuple[str, float, float]]) -> None:
     state, process, now = ProcessState(PATIENCE, 0.0), FakeProcess(), 0.0
     for step, seconds, chance in steps:
         now += seconds
@@ -201,7 +201,7 @@ def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[
             assert state.due <= now + MAX_RESTART_DELAY_S * (1 + RESTART_JITTER)
 
 
-def test_who_is_heard_to_the_end_is_killed_when_it_hangs_while_it_ends_and_nobody_else() -> None:
+def test_hang_while_ending_is_killed_only_if_it_was_heard() -> None:
     for to_the_end in (True, False):
         state = ProcessState(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
         state.on_started(100.0)

@@ -69,7 +69,7 @@ def test_what_is_said_of_a_car(tmp_path: Path, code: int, states: list[Any], beg
     assert shutdown.shutdown.pending == []
 
 
-def test_the_last_state_of_a_gateway_may_come_after_its_end(tmp_path: Path) -> None:
+def test_last_state_of_gateway_may_follow_its_end(tmp_path: Path) -> None:
     shutdown = Shutdown(tmp_path, 0, [ONLINE, pb.Safety(motors="stopping", boot_id="a")])
     assert (shutdown.words, shutdown.shutdown.pending) == ("", ["red"])
     shutdown.row.take("state/safety", SHOWN, 0.0)

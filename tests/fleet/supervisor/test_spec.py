@@ -144,7 +144,7 @@ def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
         assert "--nonsense" in done.stderr, done.stderr
 
 
-def test_holds_of_a_simulated_car_belong_to_its_folder_and_those_of_a_real_one_to_its_link(tmp_path: Path) -> None:
+def test_simulated_holds_belong_to_folder_and_real_ones_to_link(tmp_path: Path) -> None:
     def holds_of(folder: str, car: str) -> str | None:
         (tmp_path / folder).mkdir(exist_ok=True)
         spec = build_spec(parse_fleet(FILE, tmp_path / folder / "fleet.yaml"), UpOptions(simulated=1))

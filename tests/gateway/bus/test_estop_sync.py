@@ -93,7 +93,7 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
         fleet.close()
 
 
-async def test_a_dozen_that_came_to_a_large_fleet_are_asked_one_by_one(tmp_path: Path) -> None:
+async def test_estop_sync_asks_newcomers_one_by_one(tmp_path: Path) -> None:
     """With one query to all gateways, the answers took half of the time in which a hundred gateways start."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     old, new = [f"old{number}" for number in range(24)], [f"new{number}" for number in range(12)]

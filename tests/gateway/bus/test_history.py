@@ -68,7 +68,7 @@ def test_a_range_is_half_open_in_nanoseconds(text: str, begin: Bound, end: Bound
         "(now()..)",
     ],
 )
-def test_what_is_no_range_is_refused_with_how_to_write_one(text: str) -> None:
+def test_invalid_history_range_is_refused_with_syntax(text: str) -> None:
     with pytest.raises(BadRange, match=r"cannot be read: write \[now\(-30s\)\.\.\]"):
         parse_range(text)
 
@@ -99,9 +99,7 @@ def filled(count: int, size: int = 5, *, clock_set_s: int = 0) -> HistoryBuffer:
         ("[now()..]", None, ""),
     ],
 )
-def test_the_ring_gives_the_latest_the_last_or_a_range_oldest_first(
-    time_range: str | None, last: str | None, found: str
-) -> None:
+def test_history_ring_returns_latest_last_or_range(time_range: str | None, last: str | None, found: str) -> None:
     values = filled(8).select(time_range=time_range, last=last, now=AT)
     assert b"".join(value.payload for value in values).decode() == found
 

@@ -133,7 +133,7 @@ def test_the_message_of_a_signal_has_its_duration_at_most() -> None:
             assert own == ({"duration_s"} if row.max_duration_s else set())
 
 
-def test_a_signal_with_a_duration_has_the_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """Made from `lend`, whose message has a duration."""
     monkeypatch.setattr(requests, "COMMANDS", {**COMMANDS, "lend": replace(COMMANDS["lend"], signal=True)})
     monkeypatch.delitem(requests._WHAT, "lend")
@@ -205,7 +205,7 @@ def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reaso
         ({"id": "x" * 200}, "too long"),
     ],
 )
-def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: str) -> None:
+def test_stop_with_invalid_fields_is_still_a_stop(payload: Any, words: str) -> None:
     stop = ask("stop", payload)
     assert stop.what == Stop()
     assert stop.note.startswith("the gateway stops the car in spite of an error: stop: ")
@@ -214,7 +214,7 @@ def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: 
 
 
 @pytest.mark.parametrize("wrong", [{"ttl_s": "soon"}, {"colour": 1}, {"kind": "boss"}, {"id": "x" * 200}], ids=str)
-def test_an_e_stop_in_which_something_is_wrong_keeps_its_scope_and_its_reason(wrong: dict[str, Any]) -> None:
+def test_invalid_estop_keeps_scope_and_reason(wrong: dict[str, Any]) -> None:
     stop = ask("estop", {"why": "smoke", "scope": "fleet", **wrong})
     assert stop.what == EmergencyStop("smoke", fleet_wide=True)
     assert "the gateway stops the car in spite of an error" in stop.note
@@ -222,7 +222,7 @@ def test_an_e_stop_in_which_something_is_wrong_keeps_its_scope_and_its_reason(wr
     assert ask("estop", as_message, f"{PROTOBUF};fleet.v1.EstopCommand").what == EmergencyStop("smoke", fleet_wide=True)
 
 
-def test_an_e_stop_of_all_without_an_id_is_the_same_one_for_every_gateway() -> None:
+def test_estop_of_all_without_id_is_same_for_every_gateway() -> None:
     first, second = (ask("estop", {"why": "smoke", "scope": "fleet"}, by_wildcard=True) for _ in range(2))
     assert first.id == second.id
     assert ask("estop", {"why": "fire", "scope": "fleet"}, by_wildcard=True).id != first.id
@@ -235,7 +235,7 @@ def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:
     assert "allowed are car (the default) and fleet" in ask("estop", {"scope": "world"}).note
 
 
-def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> None:
+def test_refusal_is_recorded_under_given_id_and_sender() -> None:
     error = refused("drive", {"motion": "up", "id": "abc", "sender": "mia", "kind": "person"})
     assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Rank.PERSON))
 
@@ -331,7 +331,7 @@ WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward",
     st.one_of(st.none(), st.integers(0, 1 << 63)),
     st.booleans(),
 )
-def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
+def test_any_bytes_on_any_verb_are_command_or_bad_request(
     verb: str, payload: bytes | None, encoding: str, sampled_ns: int | None, by_wildcard: bool
 ) -> None:
     request = Request(verb, payload, encoding, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
@@ -349,7 +349,7 @@ def test_deep_json_is_refused_in_no_time() -> None:
     assert time.monotonic() - began < 10
 
 
-def test_what_was_not_read_is_refused_and_a_stop_is_obeyed() -> None:
+def test_unread_payload_is_refused_but_stop_is_obeyed() -> None:
     error = refused("drive", None, unread="it is too large")
     assert (error.reason, error.words) == (Reason.BAD_VALUE, "drive: it is too large")
     stop = ask("stop", None, unread="it is too large")

@@ -56,7 +56,7 @@ def ask(asker: bus.Bus, selector: str, payload: bytes | None = None, timeout_s: 
     return [answer.words for answer in answers if isinstance(answer, bus.Failure)]
 
 
-async def test_what_is_too_large_is_handed_over_with_the_reason_and_not_read(hall: tuple[Hall, bus.Bus]) -> None:
+async def test_oversized_request_is_handed_over_unread_with_reason(hall: tuple[Hall, bus.Bus]) -> None:
     """A megabyte of JSON stalled the gateway for 0.2 s. 64 megabytes stalled it until a kill."""
     there, asker = hall
     there.attach()
@@ -75,7 +75,7 @@ async def test_what_is_too_large_is_handed_over_with_the_reason_and_not_read(hal
     assert there.requests[2].unread == there.requests[0].unread
 
 
-async def test_questions_of_the_past_wait_by_themselves_and_not_too_many(hall: tuple[Hall, bus.Bus]) -> None:
+async def test_history_queries_have_own_bounded_queue(hall: tuple[Hall, bus.Bus]) -> None:
     there, asker = hall
     there.attach()
 

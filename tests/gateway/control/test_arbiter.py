@@ -203,7 +203,7 @@ def test_the_table_has_every_command() -> None:
 @pytest.mark.parametrize(
     "what", [what for what in (*WHATS, *DIRECTIONS) if not isinstance(what, Stop | EmergencyStop | Pause)], ids=repr
 )
-def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
+def test_late_command_is_stale_but_never_a_stop(what: Action) -> None:
     calm = replace(
         situations()[0],
         asked=Mode.MANUAL,
@@ -222,9 +222,7 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     [(-1e12, True), (-3600.0, True), (-5.1, True), (-4.9, False), (0.0, False), (2.0, False), (3600.0, True)],
 )
 @pytest.mark.parametrize("what", [*WHATS, *DIRECTIONS], ids=repr)
-def test_a_time_far_from_now_is_refused_but_a_stop_looks_at_no_clock(
-    what: Action, age_s: float, *, refused: bool
-) -> None:
+def test_far_timestamp_is_refused_but_stop_ignores_clock(what: Action, age_s: float, *, refused: bool) -> None:
     calm = replace(situations()[0], asked=Mode.MANUAL, closing=False)
     refusal = refuse(Command("c", "verb", Sender("ann", Rank.PERSON), what, age_s=age_s, ttl_s=2.0), calm)
     is_stale = refusal is not None and refusal[0] is Reason.STALE

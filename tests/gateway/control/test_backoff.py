@@ -8,7 +8,7 @@ from gateway.control.backoff import FIRST_DELAY_S, MAX_LOGGED_CAUSES, MAX_RECONN
 
 
 @pytest.mark.parametrize(("failures", "longest_s"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 1.0), (10**9, 1.0)])
-def test_it_doubles_up_to_a_second_spread_over_the_upper_half(failures: int, longest_s: float) -> None:
+def test_backoff_doubles_to_a_second_with_jitter(failures: int, longest_s: float) -> None:
     assert delay_s(failures, 0.0) == longest_s / 2
     assert delay_s(failures, 1.0) == longest_s
 
@@ -18,7 +18,7 @@ def test_it_is_never_nothing_and_never_long(failures: int, jitter: float) -> Non
     assert FIRST_DELAY_S / 2 <= delay_s(failures, jitter) <= MAX_RECONNECT_DELAY_S
 
 
-def test_a_link_that_opens_and_dies_at_once_is_waited_for_longer_and_told_once() -> None:
+def test_flapping_link_waits_longer_and_is_told_once() -> None:
     attempts = Attempts()
     told, waits = [], []
     for cycle in range(6):
@@ -30,7 +30,7 @@ def test_a_link_that_opens_and_dies_at_once_is_waited_for_longer_and_told_once()
 
 
 @pytest.mark.parametrize(("after_s", "heard"), [(0.0, True), (PROVEN_S, False)])
-def test_one_that_was_of_use_is_tried_again_at_once_and_all_is_news_again(after_s: float, heard: bool) -> None:
+def test_useful_link_is_retried_at_once(after_s: float, heard: bool) -> None:
     attempts = Attempts()
     for _ in range(5):
         attempts.on_open(0.0)
@@ -44,6 +44,6 @@ def test_one_that_was_of_use_is_tried_again_at_once_and_all_is_news_again(after_
     assert not attempts.check_proven(20.0 + after_s, has_reading=heard), "its opening had been told"
 
 
-def test_causes_that_are_never_the_same_are_not_told_for_ever() -> None:
+def test_ever_changing_causes_are_not_told_for_ever() -> None:
     attempts = Attempts()
     assert sum(attempts.on_failed(f"error {number}") for number in range(100)) == MAX_LOGGED_CAUSES

@@ -35,7 +35,7 @@ def test_where_a_level_begins_may_be_told() -> None:
     assert [policy.level(volts) for volts in (7.4, 7.39, 7.2, 7.19)] == ["ok", "low", "low", "critical"]
 
 
-def test_under_load_the_estimate_is_of_the_voltage_at_rest_and_less_sure() -> None:
+def test_battery_under_load_is_estimated_at_rest_less_surely() -> None:
     assert charge(7.4, loaded=True) == (pytest.approx(0.6), pytest.approx(0.25))
 
 
@@ -69,7 +69,7 @@ def test_nothing_measured_is_no_level_and_refuses_nothing() -> None:
         (6.5, "critical", BatteryAction.REFUSE, True),
     ],
 )
-def test_the_first_readings_say_where_it_stands_when_they_have_held(
+def test_first_battery_readings_count_after_holding(
     voltage_v: float, expected: str, action: BatteryAction | None, refuses: bool
 ) -> None:
     battery = Battery()
@@ -79,7 +79,7 @@ def test_the_first_readings_say_where_it_stands_when_they_have_held(
     assert (battery.level, battery.action, bool(battery.refusal)) == (expected, action, refuses)
 
 
-def test_a_level_changes_when_it_has_held_and_not_by_one_reading() -> None:
+def test_battery_level_changes_after_holding_not_by_one_reading() -> None:
     battery = Battery()
     assert not hear(battery, 7.2, 6.9, 6.9, 7.1, 6.9, 6.9, 6.9, 6.9, 6.9)
     assert hear(battery, 6.9)
@@ -96,7 +96,7 @@ def test_critical_leads_back_over_low() -> None:
     assert "battery low: 6.80 V, charge 20% +- 15%" in battery.words
 
 
-def test_the_sag_of_a_drive_changes_nothing_nor_does_what_recovers_after_it() -> None:
+def test_sag_of_drive_and_recovery_change_no_level() -> None:
     battery = Battery()
     hear(battery, *[7.15] * 10)
     for _ in range(20):
@@ -106,7 +106,7 @@ def test_the_sag_of_a_drive_changes_nothing_nor_does_what_recovers_after_it() ->
     assert battery.level is BatteryLevel.OK
 
 
-def test_what_is_low_under_any_load_is_low_also_while_driving() -> None:
+def test_battery_low_under_any_load_is_low_while_driving() -> None:
     battery = Battery()
     hear(battery, 7.5)
     assert hear(battery, *[6.5] * 20, loaded=True)

@@ -49,7 +49,7 @@ class Gateway:
 
 
 @given(st.lists(STEPS, min_size=6, max_size=6))
-def test_leases_loans_holds_pauses_and_estops_last_as_long_as_they_should(steps: list[int]) -> None:
+def test_durations_survive_wall_clock_steps(steps: list[int]) -> None:
     gateway = Gateway()
     desk, safety = gateway.desk, gateway.desk.control.safety
 
@@ -78,7 +78,7 @@ def test_leases_loans_holds_pauses_and_estops_last_as_long_as_they_should(steps:
 
 @pytest.mark.parametrize("ahead_s", FAR)
 @pytest.mark.parametrize("verb", COMMANDS)
-def test_a_sender_whose_clock_is_wrong_may_stop_and_pause_and_nothing_else(verb: str, ahead_s: int) -> None:
+def test_sender_with_wrong_clock_may_only_stop_and_pause(verb: str, ahead_s: int) -> None:
     fields: dict[str, dict[str, Any]] = {
         "drive": {"motion": Motion.FORWARD},
         "mode": {"mode": "tracking"},
@@ -97,7 +97,7 @@ def test_a_sender_whose_clock_is_wrong_may_stop_and_pause_and_nothing_else(verb:
 
 
 @pytest.mark.parametrize(("step_ns", "left_s"), [(-HOUR, 600.0), (0, 540.0), (HOUR, -3060.0)])
-def test_a_step_while_no_gateway_runs_prolongs_no_loan_beyond_its_duration(step_ns: int, left_s: float) -> None:
+def test_clock_step_without_gateway_prolongs_no_loan(step_ns: int, left_s: float) -> None:
     loan = Loan("mia", "ann", Rank.PERSON, BEGAN, 600.0)
     safety = Safety.restore(PersistedSafety(loan=loan), 50.0, BEGAN + 60 * S + step_ns)
     assert safety.loan_until == 50.0 + left_s

@@ -132,7 +132,7 @@ def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- motion is a state
 
 
-def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Workbench) -> None:
+def test_changed_motion_is_resent_exactly_once(desk: Workbench) -> None:
     began = desk.now
     desk.ask(FORWARD)
     desk.run(4.9)
@@ -217,7 +217,7 @@ def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
     assert (desk.control.driver.model.motors, desk.control.driver.model.basis) == ("off", Basis.SENT)
 
 
-def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Workbench) -> None:
+def test_unshown_rest_is_renewed_with_growing_pauses(desk: Workbench) -> None:
     desk.ask(Drive(Motion.BACK, 0.7))
     desk.run(2.0)
     began, sent = desk.sent[-1][0], len(desk.sent)
@@ -236,7 +236,7 @@ def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
     assert (desk.frames, desk.control.driver.model.basis) == ([], Basis.SHOWN)
 
 
-def test_a_drive_that_had_to_wait_lasts_as_long_as_asked_and_says_that_it_waited(desk: Workbench) -> None:
+def test_delayed_drive_has_full_duration_and_says_it_waited(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.MANUAL))
     desk.run(0.1)
     desk.ask(Drive(Motion.BACK, 4.5), identity="it")
@@ -245,7 +245,7 @@ def test_a_drive_that_had_to_wait_lasts_as_long_as_asked_and_says_that_it_waited
     assert re.fullmatch(r"began after 1\.\d s: red was busy; sent for 4\.5 s", words)
 
 
-def test_a_waiting_drive_that_is_asked_again_lasts_as_asked_last(desk: Workbench) -> None:
+def test_repeated_waiting_drive_has_last_duration(desk: Workbench) -> None:
     desk.ask(WHISTLE)
     for duration_s in (3.0, 1.0):
         assert desk.ask(Drive(Motion.BACK, duration_s), identity=f"for {duration_s}").status is QUEUED
@@ -266,7 +266,7 @@ def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Workbench) -> None:
 
 
 @pytest.mark.parametrize("duration_s", [0.1, 0.5, 9.0])
-def test_a_drive_within_a_full_stop_waits_for_its_first_frames(desk: Workbench, duration_s: float) -> None:
+def test_drive_during_full_stop_waits_for_first_frames(desk: Workbench, duration_s: float) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop())
@@ -411,7 +411,7 @@ def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Workbench) -> No
     assert desk.frames == [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,PTZ30#", b"$4WD,MODE21#"]
 
 
-def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk: Workbench) -> None:
+def test_mode_while_driving_stops_then_opens(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(2.0)
     desk.ask(WHISTLE)
@@ -446,7 +446,7 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Workbench) -
 
 @pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
 @pytest.mark.parametrize("sender", [PERSON, SCRIPT], ids=["person", "script"])
-def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Workbench, what: Action, sender: Sender) -> None:
+def test_drive_mode_or_resume_of_person_or_script_ends_hold(desk: Workbench, what: Action, sender: Sender) -> None:
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
     assert desk.ask(what, sender).status is not Phase.REJECTED
@@ -531,7 +531,7 @@ def test_duplicate_and_stale(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- streams
 
 
-def test_a_stream_is_recorded_at_its_start_its_changes_and_its_end(desk: Workbench) -> None:
+def test_stream_is_recorded_at_start_changes_and_end(desk: Workbench) -> None:
     for motion in [Motion.FORWARD] * 10 + [Motion.LEFT] * 5:
         desk.ask(Drive(motion, 0.5), PERSON, streamed=True)
         desk.run(0.05)
@@ -602,7 +602,7 @@ def test_a_stop_under_way_fails_with_its_link(desk: Workbench) -> None:
     assert desk.end("it") == (Phase.FAILED, Reason.LINK_DOWN)
 
 
-def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -> None:
+def test_unanswered_recovery_goes_on_with_growing_pauses() -> None:
     desk = Workbench()
     began = desk.now
     desk.control.link_up(began)
@@ -703,7 +703,7 @@ def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Ca
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("platform", ["arduino", "unknown"])
-def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_stopped(
+def test_shutdown_without_reports_ends_in_time_and_says_not_stopped(
     platform: str, state: Callable[[Workbench], None]
 ) -> None:
     desk = Workbench(platform).ready()
@@ -724,7 +724,7 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
     assert desk.control.driver.model.basis is None
 
 
-def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Workbench) -> None:
+def test_shutdown_without_link_says_not_stopped_at_once(desk: Workbench) -> None:
     desk.control.driver.link_down("unplugged", desk.now)
     desk.control.driver.shut_down(desk.now)
     assert desk.control.driver.stops.finished
@@ -748,7 +748,7 @@ def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> N
     )
 
 
-def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:
+def test_shutdown_before_first_link_says_car_not_reached() -> None:
     """The previous gateway may have left the car driving."""
     desk = Workbench()
     desk.control.driver.shut_down(desk.now)
@@ -758,7 +758,7 @@ def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() 
     assert desk.control.driver.stops.not_stopped
 
 
-def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
+def test_shutdown_while_tracking_is_told() -> None:
     """The link loses all frames. Before the gateway gives up, it tries a recovery and waits for evidence."""
     pair = Pair(start_s=2.0).ready()
     pair.ask(SetMode(Mode.TRACKING))
@@ -772,7 +772,7 @@ def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
     assert pair.logs[-1].code == "not_stopped"
 
 
-def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_it_stands() -> None:
+def test_shutdown_while_tracking_waits_until_stop_is_shown() -> None:
     pair = Pair(start_s=2.0).ready()
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
@@ -809,7 +809,7 @@ def anything(moments: random.Random) -> Action:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "unknown"])
-def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_wins(platform: str) -> None:
+def test_any_commands_keep_one_frame_in_flight_and_stop_wins(platform: str) -> None:
     stops = {b"#", STOP, MODE00}
     for seed in range(60):
         moments = random.Random(seed)
@@ -873,7 +873,7 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
 
 
 @pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("arduino", False), ("raspberry_pi", True)])
-def test_a_car_that_never_sends_a_reading_is_told_how_to_say_so(platform: str, *, heard: bool) -> None:
+def test_car_without_readings_gets_advice(platform: str, *, heard: bool) -> None:
     desk = Workbench(platform)
     desk.control.link_up(desk.now)
     if heard:
@@ -887,7 +887,7 @@ def test_a_car_that_never_sends_a_reading_is_told_how_to_say_so(platform: str, *
 
 
 @pytest.mark.parametrize(("heard", "doubted"), [(True, False), (False, True)])
-def test_a_drive_of_an_unknown_car_whose_mode_nothing_shows_says_so(*, heard: bool, doubted: bool) -> None:
+def test_drive_in_unshown_mode_of_unknown_car_says_so(*, heard: bool, doubted: bool) -> None:
     desk = Workbench("unknown")
     desk.control.link_up(desk.now)
     desk.run(12.0, reports=heard)
@@ -898,7 +898,7 @@ def test_a_drive_of_an_unknown_car_whose_mode_nothing_shows_says_so(*, heard: bo
     assert ("Name its platform" in words) is doubted, words
 
 
-def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> None:
+def test_level_fan_stays_on_through_lights_drives_reports() -> None:
     pair = Pair("arduino", told="arduino+fan_level", traits=CarTraits(fan_level=True), start_s=2.0).ready()
     pair.control.driver.model.believed.fan = None  # as after a connect: a level needs no known state
     assert pair.ask(Fan(on=True)).status is QUEUED
@@ -912,7 +912,7 @@ def test_a_fan_that_is_a_level_stays_on_through_lights_drives_and_reports() -> N
     assert (pair.car.truth.fan, pair.control.driver.model.believed.fan) == (False, False)
 
 
-def test_readings_of_a_car_that_reports_by_a_timer_do_not_show_its_fan() -> None:
+def test_timer_reports_do_not_show_fan() -> None:
     pair = Pair("stm32", start_s=2.0).ready()
     pair.ask(Fan())
     pair.run(6.0)
@@ -923,7 +923,7 @@ def test_readings_of_a_car_that_reports_by_a_timer_do_not_show_its_fan() -> None
 
 
 @pytest.mark.parametrize("mode", [Mode.COLOR_LED, Mode.OBSTACLE_AVOIDANCE, Mode.TRACKING])
-def test_what_is_asked_while_a_mode_is_left_is_not_lost(mode: Mode) -> None:
+def test_command_during_mode_change_is_not_lost(mode: Mode) -> None:
     for seed in range(12):
         pair = Pair("arduino", seed=seed).ready()
         pair.ask(SetMode(mode))

@@ -49,7 +49,7 @@ def test_opened_at_the_origin_of_the_clock() -> None:
     assert health.reason == "no reading for 5.0 s, expected every 3 s"
 
 
-def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
+def test_silent_mode_link_is_quiet_and_heard_bytes_count() -> None:
     health = LinkHealth()
     health.on_open(1.0)
     assert judged(health, 2.0, limit_s=None) is LinkState.QUIET
@@ -58,7 +58,7 @@ def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
     assert judged(health, 6.1, limit_s=None) is LinkState.QUIET
 
 
-def test_a_new_connection_is_not_online_by_what_the_old_one_heard() -> None:
+def test_new_connection_is_not_online_by_old_bytes() -> None:
     health = LinkHealth()
     health.on_open(1.0)
     health.on_reading(2.0)
@@ -70,7 +70,7 @@ def test_a_new_connection_is_not_online_by_what_the_old_one_heard() -> None:
 
 
 @pytest.mark.parametrize("limit_s", [3.0, None])
-def test_a_link_is_not_online_while_the_car_counts_as_unheard(limit_s: float | None) -> None:
+def test_link_of_unheard_car_is_not_online(limit_s: float | None) -> None:
     health = LinkHealth()
     health.on_open(1.0)
     health.on_reading(2.0)

@@ -239,7 +239,7 @@ def desk() -> Workbench:
     return Workbench(people=PEOPLE).ready()
 
 
-def test_a_pause_stops_as_a_stop_does_and_only_a_lead_drives(desk: Workbench) -> None:
+def test_pause_stops_like_a_stop_and_only_leads_drive(desk: Workbench) -> None:
     desk.ask(FORWARD, ANN, identity="d")
     answer = desk.ask(Pause("listen"), TEACHER, identity="p")
     assert (answer.status, answer.words) == (Phase.QUEUED, "the pause lasts until `fleet unpause`")
@@ -287,7 +287,7 @@ def test_without_leads_each_person_may_pause_and_then_nobody_moves() -> None:
     assert desk.ask(Unpause(), ANN).status is Phase.SENT
 
 
-def test_a_pause_of_a_car_out_of_reach_is_in_force_all_the_same(desk: Workbench) -> None:
+def test_pause_of_unreachable_car_is_in_force(desk: Workbench) -> None:
     desk.control.driver.link_down("unplugged", desk.now)
     answer = desk.ask(Pause(), TEACHER)
     assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
@@ -297,7 +297,7 @@ def test_a_pause_of_a_car_out_of_reach_is_in_force_all_the_same(desk: Workbench)
     assert desk.ask(FORWARD, ANN).reason is Reason.PAUSED
 
 
-def test_a_pause_that_another_gateway_shows_stops_this_car_and_an_ended_one_stays_ended(desk: Workbench) -> None:
+def test_pause_from_another_gateway_stops_and_ended_one_stays_ended(desk: Workbench) -> None:
     desk.ask(FORWARD, ANN)
     pause = FleetPause("p1", "teacher@lab", "listen", 7, LEAD)
     desk.control.merge_pauses([pause], [], "blue", desk.now)
@@ -352,7 +352,7 @@ def test_a_table_without_leads_keeps_no_car_stopped_for_ever() -> None:
     assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
 
 
-def test_a_gateway_without_a_table_frees_nothing_that_a_lead_began() -> None:
+def test_gateway_without_people_frees_nothing_of_a_lead() -> None:
     kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
     desk = Workbench(kept=kept).ready()
     desk.control.merge_pauses([FleetPause("p1", "teacher@lab", "listen", 7, LEAD)], [], "blue", desk.now)
@@ -372,7 +372,7 @@ def test_a_gateway_without_a_table_frees_nothing_that_a_lead_began() -> None:
     assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
 
 
-def test_a_lent_car_is_the_borrowers_until_the_end_which_stops_it(desk: Workbench) -> None:
+def test_lent_car_is_borrowers_until_end_which_stops_it(desk: Workbench) -> None:
     desk.ask(FORWARD, ANN, identity="d")
     assert desk.ask(Lend("cid", 60.0), TEACHER).words == "lent to cid for 60 s"
     desk.run(5.0)
@@ -393,7 +393,7 @@ def test_a_lent_car_is_the_borrowers_until_the_end_which_stops_it(desk: Workbenc
     assert [log.code for log in desk.logs] == ["lent", "loan_ended"]
 
 
-def test_a_loan_that_ends_early_stops_a_mode_of_the_borrower_and_nobody_elses(desk: Workbench) -> None:
+def test_early_end_of_loan_stops_mode_of_borrower_only(desk: Workbench) -> None:
     desk.ask(Lend("cid", 60.0), TEACHER)
     desk.ask(SetMode(Mode.TRACKING), CID)
     desk.run(5.0)
@@ -412,7 +412,7 @@ def test_a_loan_that_ends_early_stops_a_mode_of_the_borrower_and_nobody_elses(de
     assert desk.ask(EndLoan(), TEACHER).words == "was not lent"
 
 
-def test_a_loan_goes_on_after_a_restart_for_the_time_that_is_left() -> None:
+def test_loan_continues_after_restart_for_remaining_time() -> None:
     loan = Loan("cid", "teacher@lab", LEAD, int(60.0 * 1e9), 100.0)
     desk = Workbench(kept=PersistedSafety(loan=loan), people=PEOPLE).ready()  # the workbench begins at 100 s
     assert desk.ask(FORWARD, ANN).reason is Reason.LENT
@@ -421,7 +421,7 @@ def test_a_loan_goes_on_after_a_restart_for_the_time_that_is_left() -> None:
     assert desk.control.safety.persisted.loan is None
 
 
-def test_a_car_that_is_not_theirs_says_whose_word_it_is(desk: Workbench) -> None:
+def test_refusal_for_foreign_car_names_who_decides(desk: Workbench) -> None:
     assert desk.ask(FORWARD, CID).words == (
         "cid may not drive red: `people:` in the fleet file gives cid other cars. "
         "teacher can lend it: `fleet lend red --to cid --for 10m`."

@@ -28,7 +28,7 @@ def test_an_e_stop_holds_and_the_hold_outlives_it() -> None:
     assert (safety.estops, safety.ended, safety.hold) == ((), ("b", "a"), Hold("eve", 7))
 
 
-def test_what_is_said_of_one_car_and_then_of_the_fleet_is_the_fleets() -> None:
+def test_fleet_estop_replaces_same_estop_of_car() -> None:
     safety = Safety()
     safety.latch(estop("a", fleet_wide=False))
     safety.latch(estop("a"))
@@ -64,7 +64,7 @@ def test_ended_ids_are_bounded() -> None:
     assert safety.ended == tuple(str(number) for number in range(9, MAX_ENDED_ESTOPS + 9))
 
 
-def test_e_stops_in_force_are_bounded_and_one_of_the_fleet_always_finds_room() -> None:
+def test_estops_are_bounded_and_fleet_one_always_fits() -> None:
     safety = Safety()
     for number in range(1000):
         safety.latch(estop(str(number), fleet_wide=False))
@@ -90,7 +90,7 @@ def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
     assert blue.merge((estop("fleet"),), ()) == ([], []), "ended wins over one who has not heard of it"
 
 
-def test_a_gateway_without_people_learns_that_a_lead_did_an_e_stop() -> None:
+def test_gateway_without_people_learns_rank_of_estop() -> None:
     """The e-stop of a lead reaches each gateway directly. A gateway without people latches it as a person's."""
     own = estop("a")
     lead = replace(own, rank=Rank.LEAD)
@@ -124,9 +124,7 @@ def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) 
 
 
 @given(st.permutations(range(4)), st.lists(st.tuples(st.integers(0, 3), st.sampled_from("abcd"), st.booleans())))
-def test_gateways_agree_on_pauses_in_whatever_order_they_see_each_other(
-    order: list[int], steps: list[tuple[int, str, bool]]
-) -> None:
+def test_gateways_agree_on_pauses_in_any_order(order: list[int], steps: list[tuple[int, str, bool]]) -> None:
     """A pause may reach the gateways with different times, and its end may arrive first."""
     cars = [Safety() for _ in order]
     for number, identity, ends in steps:
@@ -162,7 +160,7 @@ def test_pauses_are_bounded_and_an_ended_one_stays_ended() -> None:
     assert len(safety.ended_pauses) == MAX_ENDED_PAUSES
 
 
-def test_nobody_lowers_the_rank_of_another_ones_e_stop_or_hold() -> None:
+def test_nobody_lowers_rank_of_foreign_estop_or_hold() -> None:
     safety = Safety()
     lead = Estop("a", "eve", "", 1, fleet_wide=False, rank=Rank.LEAD)
     safety.latch(lead)

@@ -64,7 +64,7 @@ def test_a_mode_that_runs_is_stopped(desk: Workbench) -> None:
     assert desk.control.driver.model.at_rest
 
 
-def test_a_car_that_has_shown_that_it_stands_gets_no_frame(desk: Workbench) -> None:
+def test_car_shown_standing_gets_no_frame_after_sleep(desk: Workbench) -> None:
     desk.ask(Stop())
     desk.run(8.0)
     assert desk.control.driver.model.basis is Basis.SHOWN
@@ -118,7 +118,7 @@ def test_a_joystick_that_is_still_pushed_must_pause(desk: Workbench, *, counted:
     assert desk.ask(FORWARD, PERSON, streamed=True, age_s=0.0).status is not Phase.REJECTED
 
 
-def test_just_after_a_sleep_a_command_must_say_when_it_was_asked(desk: Workbench) -> None:
+def test_command_after_sleep_needs_a_timestamp(desk: Workbench) -> None:
     sleep(desk)
     assert desk.ask(FORWARD, SCRIPT).reason is Reason.STALE
     assert desk.ask(FORWARD, SCRIPT, age_s=NIGHT_S).reason is Reason.STALE
@@ -141,7 +141,7 @@ def test_a_loan_counts_the_sleep(desk: Workbench, slept_s: float, *, left: bool,
     assert (desk.control.safety.loan_at(desk.now) is not None) is left
 
 
-def test_a_sleep_while_the_link_is_down_sends_nothing_and_is_said(desk: Workbench) -> None:
+def test_sleep_with_link_down_sends_nothing_and_is_told(desk: Workbench) -> None:
     desk.control.driver.link_down("gone", desk.now)
     desk.logs.clear()
     sleep(desk)
@@ -149,7 +149,7 @@ def test_a_sleep_while_the_link_is_down_sends_nothing_and_is_said(desk: Workbenc
     assert [entry.code for entry in desk.logs] == ["slept"]
 
 
-def test_a_stop_that_waits_for_evidence_is_sent_again_at_once(desk: Workbench) -> None:
+def test_stop_awaiting_evidence_is_resent_after_sleep(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop(), identity="stop")
@@ -159,7 +159,7 @@ def test_a_stop_that_waits_for_evidence_is_sent_again_at_once(desk: Workbench) -
     assert MODE00 in desk.frames
 
 
-def test_a_sleep_at_the_end_of_the_gateway_begins_no_stop_after_it() -> None:
+def test_sleep_at_shutdown_begins_no_stop_after_it() -> None:
     desk = Workbench("raspberry_pi").ready()
     desk.ask(FORWARD)
     desk.run(1.0)

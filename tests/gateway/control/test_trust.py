@@ -81,7 +81,7 @@ def test_an_event_is_its_own_evidence() -> None:
 
 
 @given(st.lists(st.sampled_from(TrustEvent), max_size=30))
-def test_after_any_story_a_stop_goes_on_until_it_is_shown_or_sent(story: list[TrustEvent]) -> None:
+def test_stop_goes_on_until_shown_or_sent_after_any_story(story: list[TrustEvent]) -> None:
     trust = TrustState()
     linked = False
     for number, event in enumerate(story):

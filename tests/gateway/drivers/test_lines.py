@@ -7,7 +7,7 @@ from gateway.drivers.lines import LineSplitter
 
 
 @given(st.lists(st.binary(max_size=40), max_size=12), st.integers(1, 20))
-def test_the_pieces_do_not_matter_and_no_line_is_too_long(pieces: list[bytes], top: int) -> None:
+def test_line_splitter_ignores_pieces_and_bounds_lines(pieces: list[bytes], top: int) -> None:
     lines, whole = LineSplitter(top), LineSplitter(top)
     found = [line for piece in pieces for line in lines.feed(piece)]
     assert found == whole.feed(b"".join(pieces))

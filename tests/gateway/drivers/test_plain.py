@@ -44,7 +44,7 @@ def bench() -> TankBench:
     return made
 
 
-def test_a_drive_ends_with_a_stop_that_counts_as_sent_and_is_repeated(bench: TankBench) -> None:
+def test_plain_drive_ends_with_repeated_sent_stop(bench: TankBench) -> None:
     drive = bench.ask(Drive(Motion.FORWARD, 1.0))
     bench.run(1.6)
     assert bench.moves()[-3:] == [[0.5, 0.5], [0, 0], [0, 0]]
@@ -60,7 +60,7 @@ def test_a_drive_ends_with_a_stop_that_counts_as_sent_and_is_repeated(bench: Tan
 
 
 @pytest.mark.parametrize("before_s", [0.0, 0.2, 0.4, 0.6])
-def test_a_change_of_speed_at_the_end_of_a_drive_starts_no_car(bench: TankBench, before_s: float) -> None:
+def test_speed_change_at_end_of_drive_starts_no_car(bench: TankBench, before_s: float) -> None:
     bench.ask(Drive(Motion.FORWARD, 1.0))
     bench.run(1.0 - before_s)
     bench.ask(ChangeSpeed(SpeedStep.UP))
@@ -71,7 +71,7 @@ def test_a_change_of_speed_at_the_end_of_a_drive_starts_no_car(bench: TankBench,
     assert bench.moves()[-1] == [0.6, 0.6]
 
 
-def test_a_change_of_speed_counts_at_once_for_a_car_that_drives(bench: TankBench) -> None:
+def test_speed_change_applies_at_once_while_driving(bench: TankBench) -> None:
     bench.ask(Drive(Motion.FORWARD, 2.0))
     bench.run(0.4)
     bench.ask(ChangeSpeed(SpeedStep.DOWN))

@@ -45,7 +45,7 @@ def doubt(data: bytes, url: LinkUrl = LINK) -> tuple[str, str] | None:
     return (found[0].cause, found[0].words) if found else None
 
 
-def test_the_line_is_read_as_it_was_sent_at_the_right_rate() -> None:
+def test_baud_detection_reads_line_at_right_rate() -> None:
     assert received(REPORT, sent_at=9600, read_at=9600) == REPORT
 
 
@@ -81,7 +81,7 @@ def test_the_bytes_that_people_see() -> None:
         assert found[1] == f"203 bytes came, and never a frame: they look like a wrong baud rate. {words}"
 
 
-def test_text_few_bytes_and_a_link_with_frames_are_not_doubted() -> None:
+def test_baud_detection_trusts_text_few_bytes_and_frames() -> None:
     assert doubt(b"EXEC:F\r\n" * 100) is None, "a car without readings that prints lines"
     assert doubt(bytes(MIN_BYTES - 1)) is None
     watch = BaudWatch(LINK)

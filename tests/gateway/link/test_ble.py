@@ -100,9 +100,7 @@ async def test_a_frame_goes_in_pieces_of_what_the_module_takes(peer: BlePeer) ->
 
 
 @pytest.mark.parametrize("fault", ["refuses", "takes"])
-async def test_a_write_that_fails_in_the_middle_loses_the_link_and_nothing_follows(
-    link: Link, peer: BlePeer, fault: str
-) -> None:
+async def test_ble_write_failure_loses_link_and_nothing_follows(link: Link, peer: BlePeer, fault: str) -> None:
     if fault == "takes":
         peer.stall_after(1)
     else:
@@ -119,7 +117,7 @@ async def test_a_write_that_fails_in_the_middle_loses_the_link_and_nothing_follo
     assert peer.module.pieces == [LED[:20]]
 
 
-async def test_a_write_that_is_cancelled_in_the_middle_loses_the_link(link: Link, peer: BlePeer) -> None:
+async def test_cancelled_ble_write_loses_link(link: Link, peer: BlePeer) -> None:
     peer.module.takes = 1
     writing = asyncio.create_task(link.write(LED))
     await asyncio.to_thread(peer.receive, 20)
@@ -216,9 +214,7 @@ asyncio.run(main())
 
 
 @pytest.mark.parametrize("named", [False, True])
-async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_taken_over(
-    peer: BlePeer, *, named: bool
-) -> None:
+async def test_module_of_killed_gateway_is_taken_over(peer: BlePeer, *, named: bool) -> None:
     """A connected module does not advertise, so a scan alone would never find it again."""
     done = await asyncio.to_thread(
         subprocess.run, [sys.executable, "-c", KILLED, str(peer.url)], env=os.environ, timeout=60, check=False
@@ -232,7 +228,7 @@ async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_t
     assert not peer.module.connected
 
 
-async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(peer: BlePeer) -> None:
+async def test_dead_bluetooth_service_is_noticed_and_found_again(peer: BlePeer) -> None:
     """No callback of bleak reports the end of the service. After the restart, bleak still reports a connection."""
     link = await open_link(peer.url)
     peer.bluez.kill()

@@ -105,14 +105,14 @@ def test_a_car_that_may_be_moving_goes_first(tmp_path: Path) -> None:
     assert other.try_take()
 
 
-def test_without_a_place_for_a_lock_a_gateway_connects_all_the_same(tmp_path: Path) -> None:
+def test_missing_lock_place_does_not_prevent_connect(tmp_path: Path) -> None:
     (tmp_path / "bluetooth").write_text("a file")
     turn = Turn("hci0", first=False, directory=tmp_path)
     assert turn.try_take()
     turn.release()
 
 
-async def test_a_connect_waits_for_its_turn_and_a_stop_does_not(peer: BlePeer) -> None:
+async def test_connect_waits_for_turn_and_stop_does_not(peer: BlePeer) -> None:
     hci0 = peer.bluez.adapters[0]
     late, moving = more(peer, 2)
     link = await open_link(peer.url)
@@ -165,7 +165,7 @@ async def test_a_link_uses_the_adapter_that_it_names(peer: BlePeer) -> None:
     assert words.endswith("?adapter=hci7: no Bluetooth adapter hci7 that is on. There are: hci0, hci1")
 
 
-async def test_auto_takes_an_adapter_with_room_in_whose_range_the_car_is(peer: BlePeer) -> None:
+async def test_auto_takes_adapter_with_room_in_range(peer: BlePeer) -> None:
     hci0, hci1 = peer.bluez.adapters
     auto = BleUrl(peer.module.address, adapter="auto")
     more(peer, 1, hci0)
@@ -185,7 +185,7 @@ async def test_auto_takes_an_adapter_with_room_in_whose_range_the_car_is(peer: B
         await each.close()
 
 
-async def test_auto_goes_on_to_the_next_adapter_if_one_holds_fewer_than_most_do(peer: BlePeer) -> None:
+async def test_auto_goes_on_to_adapter_with_fewer_connections(peer: BlePeer) -> None:
     hci0, hci1 = peer.bluez.adapters
     hci0.slots = 3
     more(peer, 3, hci0)
@@ -211,7 +211,7 @@ async def test_an_adapter_without_room_is_said(peer: BlePeer) -> None:
     await link.close()
 
 
-async def test_the_connection_of_a_killed_gateway_makes_room_and_those_of_others_stay(peer: BlePeer) -> None:
+async def test_connection_of_killed_gateway_makes_room(peer: BlePeer) -> None:
     """The system keeps the connection of a program that was killed."""
     hci0 = peer.bluez.adapters[0]
     hci0.slots = 3
@@ -253,7 +253,7 @@ def fleet(tmp_path: Path, two_adapters: BlePeer) -> Iterator[FleetProcesses]:
     started.close()
 
 
-def test_eight_gateways_connect_in_time_and_a_killed_one_frees_its_place(
+def test_eight_gateways_connect_in_time_and_killed_one_frees_place(
     fleet: FleetProcesses, two_adapters: BlePeer
 ) -> None:
     hci0, hci1 = two_adapters.bluez.adapters
@@ -278,9 +278,7 @@ def test_eight_gateways_connect_in_time_and_a_killed_one_frees_its_place(
     assert all(each.connected for each in cars[1:])
 
 
-def test_a_gateway_whose_car_may_be_moving_waits_in_the_first_lane(
-    fleet: FleetProcesses, two_adapters: BlePeer
-) -> None:
+def test_gateway_of_possibly_moving_car_connects_first(fleet: FleetProcesses, two_adapters: BlePeer) -> None:
     hci0 = two_adapters.bluez.adapters[0]
     hci0.connect_s = 0.0
     sim, (port,) = fleet.simulate("red:arduino:pty")

@@ -81,7 +81,7 @@ def test_out_of_range_while_it_drives(fleet: FleetProcesses, peer: BlePeer, sim:
     fleet.ready()
 
 
-def test_a_killed_gateways_successor_takes_the_module_over_and_stops_the_car(
+def test_successor_of_killed_gateway_takes_module_over_and_stops_car(
     fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess
 ) -> None:
     gateway = fleet.gateway(str(peer.url))

@@ -155,7 +155,7 @@ async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
     await link.close()
 
 
-async def test_a_write_after_death_is_lost_at_the_latest_when_that_is_known(link: Link, peer: Peer) -> None:
+async def test_write_after_link_death_is_reported_lost(link: Link, peer: Peer) -> None:
     peer.die()
     words = await until_lost(lambda: link.write(STOP))
     assert words.startswith(str(peer.url))
@@ -209,7 +209,7 @@ async def test_it_opens_again_after_every_kind_of_end(peer: Peer) -> None:
 
 
 @pytest.mark.parametrize("peer", ["serial", "tcp"], indirect=True)  # radio has no flow control: test_ble.py
-async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link, peer: Peer) -> None:
+async def test_firehose_into_blocked_loop_is_held_back(link: Link, peer: Peer) -> None:
     """A sender of more bytes than fit must wait. The reader gets all bytes in order."""
     total = 24 * 1024 * 1024 if isinstance(peer, TcpPeer) else 8 * 1024 * 1024
     block = bytes(range(256)) * 256
@@ -246,7 +246,7 @@ async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link
     await asyncio.to_thread(thread.join)
 
 
-async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, peer: Peer) -> None:
+async def test_car_that_stops_reading_loses_link_not_loop(link: Link, peer: Peer) -> None:
 
     async def write() -> None:
         await link.write(FRAME * 20)
@@ -352,7 +352,7 @@ async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path)
     peer.close()
 
 
-async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: Path) -> None:
+async def test_write_to_vanishing_port_is_lost_only(tmp_path: Path) -> None:
     """The reader's thread closes a dead port, but never between a write's check of the descriptor and its use."""
     peer = PtyPeer(tmp_path)
     usual = sys.getswitchinterval()
@@ -373,7 +373,7 @@ async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: P
 
 @pytest.mark.parametrize("says", [b"", FRAME])
 @pytest.mark.parametrize("reset", [False, True])
-async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes, reset: bool) -> None:
+async def test_second_client_is_told_of_the_first(says: bytes, reset: bool) -> None:
     """A car has one client. A car that sends bytes and then closes the connection has other reasons."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = await open_link(TcpUrl("127.0.0.1", server.getsockname()[1]))
@@ -418,7 +418,7 @@ async def test_what_a_bridge_says_before_it_closes_is_shown(says: bytes, shown: 
         await link.close()
 
 
-async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
+async def test_frames_do_not_wait_for_tcp_acknowledgement() -> None:
     """A delayed frame would go out in one segment with the next frame. A car obeys only the first of the two."""
     peer = TcpPeer()
     assert isinstance(peer.url, TcpUrl)
@@ -478,9 +478,7 @@ async def test_what_a_stuck_port_never_took_is_thrown_away(tmp_path: Path) -> No
     peer.close()
 
 
-async def test_a_port_that_hangs_in_opening_is_tried_by_one_thread_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_hanging_port_open_uses_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The test delays pyserial's open, because no device of this machine hangs in opening as a Bluetooth tty can."""
     peer = PtyPeer(tmp_path)
     hangs = threading.Event()

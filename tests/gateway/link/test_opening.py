@@ -202,7 +202,7 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
     assert "there is no host" in await refused(TcpUrl("a..b", 8888))
 
 
-async def test_a_name_with_several_addresses_is_tried_on_each_and_says_why_in_the_same_words() -> None:
+async def test_host_with_several_addresses_is_tried_on_each() -> None:
     """The text of asyncio itself would be "Multiple exceptions", without the number that identifies a refusal."""
     with socket.socket() as taken, socket.create_server(("127.0.0.1", 0)) as server:
         taken.bind(("127.0.0.1", 0))
@@ -250,7 +250,7 @@ main()
 """
 
 
-def test_bluetooth_that_is_not_installed_is_one_line_and_nothing_is_started() -> None:
+def test_missing_bluetooth_is_one_line_and_starts_nothing() -> None:
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_BLEAK], capture_output=True, text=True, timeout=60, check=False
     )
@@ -277,7 +277,7 @@ asyncio.run(main())
 """
 
 
-def test_a_name_server_that_does_not_answer_holds_one_thread_and_not_the_end_of_the_process() -> None:
+def test_hung_name_server_holds_one_thread_not_process_end() -> None:
     done = subprocess.run(
         [sys.executable, "-c", WITH_A_SILENT_NAME_SERVER], capture_output=True, text=True, timeout=60, check=False
     )
@@ -285,7 +285,7 @@ def test_a_name_server_that_does_not_answer_holds_one_thread_and_not_the_end_of_
     assert (done.stdout, done.stderr) == (3 * words + "1\n", "")
 
 
-async def test_a_name_server_that_answers_late_is_of_use_to_the_next_try(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_late_name_server_answer_serves_next_try(monkeypatch: pytest.MonkeyPatch) -> None:
     answered = threading.Event()
     ask = socket.getaddrinfo
 

@@ -82,9 +82,7 @@ async def until_trouble(link: Link, peer: PtyPeer) -> str:
     return link.trouble
 
 
-async def test_a_second_program_at_the_port_is_named_and_stops_still_reach_the_car(
-    peer: PtyPeer, tmp_path: Path
-) -> None:
+async def test_second_program_at_port_is_named_and_stops_pass(peer: PtyPeer, tmp_path: Path) -> None:
     link = await open_link(peer.url)
     reader = Reader(tmp_path / "tty")
     try:
@@ -102,7 +100,7 @@ async def test_a_second_program_at_the_port_is_named_and_stops_still_reach_the_c
     await link.close()
 
 
-async def test_a_second_program_whose_name_is_hidden_is_to_be_found_with_a_command(
+async def test_hidden_second_program_is_found_with_a_command(
     peer: PtyPeer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Programs of other users show their descriptors to root only."""
@@ -127,7 +125,7 @@ async def test_an_unplugged_port_is_no_second_program(peer: PtyPeer) -> None:
     await link.close()
 
 
-async def test_a_program_that_only_has_the_port_open_is_found_on_request(peer: PtyPeer, tmp_path: Path) -> None:
+async def test_program_with_open_port_is_found_on_request(peer: PtyPeer, tmp_path: Path) -> None:
     """A reader that is always faster leaves no empty read: the bytes are gone before the link wakes."""
     link = await open_link(peer.url)
     link.look_for_trouble()
@@ -162,7 +160,7 @@ def test_a_gateway_says_which_program_takes_the_bytes(tmp_path: Path) -> None:
         started.close()
 
 
-def test_a_port_that_another_has_open_is_said_by_the_check_before_it_is_opened(peer: PtyPeer, tmp_path: Path) -> None:
+def test_check_tells_port_opened_by_another(peer: PtyPeer, tmp_path: Path) -> None:
     reader = Reader(tmp_path / "tty")
     try:
         assert isinstance(peer.url, SerialUrl)
@@ -178,7 +176,7 @@ def test_a_port_that_another_has_open_is_said_by_the_check_before_it_is_opened(p
 
 @pytest.mark.parametrize("number", [112, 111, 113, 110, 5])
 @pytest.mark.parametrize("path", ["/dev/rfcomm0", "link to it"])
-def test_a_classic_module_that_does_not_answer_is_no_missing_port(number: int, path: str, tmp_path: Path) -> None:
+def test_silent_classic_bluetooth_module_is_no_missing_port(number: int, path: str, tmp_path: Path) -> None:
     """Opening /dev/rfcomm0 connects. No test can have such a port: it needs a radio."""
     if path != "/dev/rfcomm0":
         (tmp_path / "red").symlink_to("/dev/rfcomm0")

@@ -110,7 +110,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
 
 @pytest.mark.parametrize("asked", ["serial://?vid=2341", "serial:///no/such/ttyACM0"])
 @pytest.mark.parametrize("failure", [TypeError("int() can't convert None"), OSError(19, "No such device"), KeyError()])
-async def test_a_device_that_goes_while_the_ports_are_listed_costs_one_try(
+async def test_device_vanishing_during_listing_costs_one_try(
     asked: str, failure: Exception, tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The numbers of a device are in files that disappear with it. After a failed read, the next try must not hang."""
@@ -198,7 +198,7 @@ async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> No
     )
 
 
-async def test_a_path_by_id_leads_to_the_port_that_the_device_has_now(tmp_path: Path) -> None:
+async def test_path_by_id_resolves_to_current_port(tmp_path: Path) -> None:
     """As with /dev/serial/by-id, the symlink points to another port. The first port still exists, but is dead."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)

@@ -83,7 +83,7 @@ async def test_a_firehose_is_held_back_not_hoarded(pair: Simulation) -> None:
         assert car.firmware.backlog(asyncio.get_running_loop().time()) < 1000
 
 
-async def test_a_dropped_pty_is_gone_and_comes_back_under_its_name(pair: Simulation, tmp_path: Path) -> None:
+async def test_dropped_pty_returns_under_its_name(pair: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "red"
     first = path.readlink()
     with serial.Serial(str(path), timeout=5) as port:
@@ -134,7 +134,7 @@ async def test_a_tcp_firehose_is_held_back_too(pair: Simulation) -> None:
     writer.transport.abort()
 
 
-async def test_a_dropped_tcp_link_resets_refuses_and_comes_back_by_itself(pair: Simulation) -> None:
+async def test_dropped_tcp_link_resets_refuses_and_returns(pair: Simulation) -> None:
     host, port = where(pair, "green")
     reader, writer = await asyncio.open_connection(host, port)
     writer.write(RUN)
@@ -244,7 +244,7 @@ async def test_a_symlink_that_a_killed_simulator_left_is_replaced(tmp_path: Path
     assert not path.is_symlink()
 
 
-async def test_a_number_that_a_newer_terminal_has_is_no_reason_to_keep_a_symlink(tmp_path: Path) -> None:
+async def test_reused_pty_number_keeps_no_stale_symlink(tmp_path: Path) -> None:
     """A killed simulator's terminal is gone, and the system gives its number to the next program."""
     path = tmp_path / "red"
     controller, device = pty.openpty()
@@ -494,7 +494,7 @@ def test_bad_arguments(arguments: list[str], code: int, words: str) -> None:
     assert (code == 2 and "usage" in done.stderr) or done.stderr.count("\n") == 1
 
 
-def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[SimProcess]) -> None:
+def test_truth_is_on_bus_when_hub_comes_later(started: list[SimProcess]) -> None:
     endpoint = free_endpoint()
     sim = SimProcess("--car", "red:arduino:pty", "--connect", endpoint, "--fleet", "mine")
     started.append(sim)

@@ -86,7 +86,7 @@ def test_the_follow_world_begins_with_room_for_all() -> None:
     assert spec.cars_meet
 
 
-def test_cars_without_a_place_begin_where_there_is_room_before_those_that_have_one() -> None:
+def test_unplaced_cars_start_where_there_is_room() -> None:
     text = (WORLDS / "follow.yaml").read_text()
     text += "\nboxes: [{x_m: 0, y_m: 0, width_m: 1, depth_m: 1}]\n"
     world = read_world(text, "follow").world()
@@ -312,7 +312,7 @@ def test_no_text_is_a_traceback(text: str) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(1, 4))
-def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chance: random.Random, count: int) -> None:
+def test_mutated_world_file_is_world_or_faults(chance: random.Random, count: int) -> None:
     text = EVERYTHING
     for _ in range(count):
         at = chance.randrange(len(text))

@@ -104,7 +104,7 @@ def test_what_each_link_is(
     assert other.received == b""
 
 
-def test_a_probe_asks_what_is_silent_and_stops_what_is_in_mode_0(
+def test_probe_asks_silent_and_stops_mode_0_car(
     simulate: Callable[..., Any], command: Command, stranger: Callable[[], SpeakingStranger]
 ) -> None:
     sim, links = simulate("red:arduino:pty", "blue:arduino:pty")
@@ -153,9 +153,7 @@ def test_for_a_person(simulate: Callable[..., Any], command: Command, stranger: 
     assert nothing.startswith("  silent: ")
 
 
-def test_a_link_that_is_not_there_fails_and_the_others_are_shown(
-    command: Command, simulate: Callable[..., Any]
-) -> None:
+def test_missing_link_fails_and_others_are_shown(command: Command, simulate: Callable[..., Any]) -> None:
     _, [link] = simulate("red:arduino:pty")
     found, done = _scan(command, "/dev/nope", link, more=("--for", "4"))
     assert done.returncode == 1

@@ -46,9 +46,7 @@ def test_a_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], co
 
 
 @pytest.mark.parametrize(("where", "why"), [(">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")])
-def test_how_it_is_stopped_is_said_also_when_stdout_cannot_be_written(
-    where: str, why: str, simulate: Callable[..., Any]
-) -> None:
+def test_send_tells_how_to_stop_even_without_stdout(where: str, why: str, simulate: Callable[..., Any]) -> None:
     sim, [link] = simulate("red:arduino:pty")
     frame = [sys.executable, "-m", "gateway.cli", "send", "--link", link, "$1,0,0,0,0,0,0,0,0#"]
     done = subprocess.run(
@@ -119,7 +117,7 @@ def test_a_link_that_cannot_be_had_is_one_line(command: Command) -> None:
     assert "no such port" in done.stderr
 
 
-def test_a_tcp_car_that_nothing_could_stop_is_not_set_going(command: Command) -> None:
+def test_unstoppable_tcp_car_is_not_started(command: Command) -> None:
     car = TcpCar()
     try:
         for more in ([], ["--platform", "raspberry_pi"]):

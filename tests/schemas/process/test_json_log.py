@@ -12,7 +12,7 @@ def line_of(message: str, *arguments: object, level: int = logging.INFO, **value
     return JsonFormatter("gateway").format(record)
 
 
-def test_a_line_is_one_object_and_one_line_whatever_its_texts_hold() -> None:
+def test_json_log_line_is_one_object_whatever_its_texts() -> None:
     line = line_of('%s "said"\n{"level": "error"}\x1b[31m', "\udcff\u2028", car="red", code="", words=None, odd={1})
     assert line.isascii()
     assert line.isprintable()

@@ -41,7 +41,7 @@ def taken(manager: socket.socket) -> list[bytes]:
             return found
 
 
-def test_the_first_message_says_ready_and_the_others_come_while_it_is_fed(manager: socket.socket) -> None:
+def test_notifier_sends_ready_then_watchdog_while_fed(manager: socket.socket) -> None:
     notifier = ServiceNotifier({NOTIFY_SOCKET: manager.getsockname(), WATCHDOG_USEC: SECONDS})
     assert taken(manager) == []
     for now in (100.0, 100.1, 101.9, 102.0, 103.9, 104.5):

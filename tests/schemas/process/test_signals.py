@@ -9,7 +9,7 @@ from schemas.process import signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_comes_while_it_is_held_back_counts_when_all_is_done(number: signal.Signals) -> None:
+def test_signals_held_back_count_afterwards(number: signal.Signals) -> None:
     done: list[str] = []
 
     def interrupt() -> None:

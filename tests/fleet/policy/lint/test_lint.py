@@ -197,12 +197,12 @@ def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
         "patrol: {mode: obstacle_avoidance, cars: [green], count: all}",
     ],
 )
-def test_a_need_that_cars_measure_before_they_have_the_role_is_let_alone(others: str) -> None:
+def test_named_absent_car_without_fleet_file_is_warning(others: str) -> None:
     plan = parse(f"roles: {{{others}, guide: {{mode: tracking, needs: battery_v > 7}}}}")
     assert [each.words for each in check(plan, {**FLEET, "blue": listed("arduino")}) if "never get" in each.words] == []
 
 
-def test_a_good_plan_is_let_alone_with_and_without_a_fleet_file() -> None:
+def test_fleet_file_role_missing_in_plan_is_told() -> None:
     plan = parse("""
 roles: {scout: {mode: tracking, needs: battery.voltage_v > 7}, rest: {mode: manual, count: all, priority: -1}}
 rules: [{when: {any_car: line.left_outer, with_role: scout, for_s: 1}, then: {who: other_cars, mode: color_led}}]
@@ -235,7 +235,7 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
         "phases: {a: {until: line.left_outer, next: b}, b: {until: not line.left_outer, next: a}}",
     ],
 )
-def test_what_does_not_get_into_its_own_way_is_let_alone(more: str) -> None:
+def test_large_fleet_and_long_plan_are_checked_in_time(more: str) -> None:
     plan = parse("roles: {scout: {mode: tracking, count: all}, near: {mode: manual}}\n" + more)
     assert [
         str(each) for each in check(plan, FLEET) if each.severity is Severity.ERROR or "together" in str(each)
@@ -250,7 +250,7 @@ roles:
 """)
 
 
-def test_with_a_fleet_file_a_plan_that_can_never_work_is_refused_with_all_that_is_wrong() -> None:
+def test_fixed_mode_of_car_is_own_role() -> None:
     refusal = find_faults(BROKEN, FLEET).refusal("plan.yaml")
     assert [line.split(": ")[2] for line in refusal.splitlines()] == [
         "car purple",
@@ -260,7 +260,7 @@ def test_with_a_fleet_file_a_plan_that_can_never_work_is_refused_with_all_that_i
     assert all(line.startswith("plan.yaml:") for line in refusal.splitlines())
 
 
-def test_without_one_a_named_car_that_is_not_there_is_a_warning() -> None:
+def test_yaml_1_1_words_stay_words() -> None:
     plan = parse("fixed: {purple: {mode: tracking}, red: {mode: manual}}")
     assert find_faults(plan).warnings == ()
     found = find_faults(plan, None, {"red", "green"})
@@ -283,7 +283,7 @@ def test_a_misspelled_word_for_cars_is_an_error_once() -> None:
     assert find_faults(named).errors == ()
 
 
-def test_a_role_of_the_fleet_file_that_the_plan_does_not_have_is_told() -> None:
+def test_forbidden_field_hides_no_other_fault() -> None:
     fleet = {"red": listed("arduino", "patroll", "patrol"), "blue": listed("arduino")}
     (found,) = check(parse("roles: {patrol: {mode: tracking}}"), fleet)
     assert found.severity is Severity.WARNING

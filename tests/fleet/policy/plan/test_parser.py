@@ -19,7 +19,7 @@ def test_the_example_plans_are_plans(path: Path) -> None:
     assert check(plan) == ()
 
 
-def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:
+def test_condition_of_maximum_length_is_accepted() -> None:
     plan = parse(
         "fixed: {red: {mode: tracking}, blue: {mode: tracking}, green: {role: patrol}}\n"
         "roles: {patrol: {mode: following}}"
@@ -32,7 +32,7 @@ def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:
     assert plan.version == parse(plan.text).version != parse(plan.text + "#").version
 
 
-def test_words_that_yaml_1_1_takes_for_something_else_are_words() -> None:
+def test_condition_of_maximum_depth_is_accepted() -> None:
     plan = parse("fixed: {on: {mode: manual}, no: {mode: tracking}, 'off': {mode: manual}, y: {mode: manual}}")
     assert list(plan.fixed) == ["on", "no", "off", "y"]
 
@@ -163,7 +163,7 @@ phases:
 """
 
 
-def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itself() -> None:
+def test_any_plan_text_is_accepted_or_raises_declared_error() -> None:
     """Faults in names, types, references and conditions are reported at once, without follow-up errors."""
     with pytest.raises(BadFile) as raised:
         parse(EVERYTHING_WRONG, "p")
@@ -196,6 +196,6 @@ def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itsel
 
 
 @pytest.mark.parametrize("text", ["7", "[]", "roles: 7", "roles: [a]\nrules: 3", "cars: {red: !!set {}}", "rules: {}"])
-def test_with_little_that_is_sound_there_is_a_fault_all_the_same(text: str) -> None:
+def test_phase_timeout_counts_from_cars_in_modes(text: str) -> None:
     with pytest.raises(BadFile):
         parse(text, "p")

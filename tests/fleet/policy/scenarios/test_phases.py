@@ -34,7 +34,7 @@ def ends_at(run: PolicyRun) -> float:
         (HERE, 0.0, 60.0, PHASE_SETTLE_TIMEOUT_S + 5.1),  # never obeys: the wait is limited
     ],
 )
-def test_a_time_out_counts_from_when_the_cars_are_in_their_modes(
+def test_debounce_delays_changes_and_ignores_unknown(
     before: object, known_at: float, in_mode_at: float, ends: float
 ) -> None:
     run = PolicyRun(PLAN, "red", obey=False)
@@ -48,7 +48,7 @@ def test_a_time_out_counts_from_when_the_cars_are_in_their_modes(
     assert (run.now if run.memory.phase.name == "done" else ends_at(run)) == pytest.approx(ends, abs=0.3)
 
 
-def test_a_recovery_during_the_start_of_a_phase_is_waited_for_and_a_hold_is_not() -> None:
+def test_doubted_car_is_left_alone_and_delays_no_phase() -> None:
     for fields, ends in (({"motors": "unknown"}, 12.0), ({"held_by": "ann"}, 5.1)):
         run = PolicyRun(PLAN, "red")
         run.change("red", **fields)
@@ -57,9 +57,7 @@ def test_a_recovery_during_the_start_of_a_phase_is_waited_for_and_a_hold_is_not(
         assert ends_at(run) == pytest.approx(ends, abs=0.3), fields
 
 
-def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_role_moves_after_debounce_and_does_not_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
@@ -89,7 +87,7 @@ def test_a_restarted_plan_begins_with_its_first_phase() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 0.0, 3600.0])
-def test_a_step_of_the_wall_clock_is_no_time_of_the_phase(
+def test_paused_fleet_leaves_plan_and_continues_after(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: float
 ) -> None:
     """The clock is set while the coordinator runs. The next one must not take the step for time that has passed."""

@@ -45,9 +45,7 @@ def status(bus: Bus) -> Any:
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_there_is_room(
-    kind: str, endpoint: str, bus: Bus, tmp_path: Path
-) -> None:
+def test_backlog_is_written_as_room_allows(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         process = record(endpoint, there.root, *there.options)
         session = ready(process)
@@ -108,7 +106,7 @@ def holds(session: Path, key: str) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_drops(
+def test_context_is_of_that_moment_and_stale_states_do_not_count(
     kind: str, endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
     with disk(kind, tmp_path) as there:
@@ -155,9 +153,7 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lying_there(
-    kind: str, endpoint: str, bus: Bus, tmp_path: Path
-) -> None:
+def test_quote_in_session_name_is_no_sql(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         there.fill()
         process = record(endpoint, there.root, *there.options)
@@ -187,9 +183,7 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lyin
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_nothing(
-    kind: str, endpoint: str, tmp_path: Path
-) -> None:
+def test_tables_are_made_once_and_again_for_grown_session(kind: str, endpoint: str, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         there.fill()
         process = record(endpoint, there.root, *there.options)
@@ -209,7 +203,7 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
-def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
+def test_session_asked_while_recording_is_named_once_cut(tmp_path: Path) -> None:
     with disk("really full", tmp_path) as there:
         tape = SessionWriter(there.root, "fleet", Options(reserve=Reserve(0)), BEGUN_NS)
         there.fill()

@@ -106,7 +106,7 @@ def test_a_car_that_is_not_heard_any_more_is_lost_until_now() -> None:
     ]
 
 
-def test_what_is_so_at_a_time_is_the_later_of_two_that_touch() -> None:
+def test_stray_type_has_own_topic_even_if_first() -> None:
     lanes = Lanes()
     for at_s, word in ((0, "manual"), (2, "tracking"), (3, "tracking")):
         lanes.add("red", MODE, mode(word), at_s * S)

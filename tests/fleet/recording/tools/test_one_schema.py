@@ -33,7 +33,7 @@ def written(session: Session, out: Path) -> OneSchema:
     return write(session.rows(), session.extras(), out)
 
 
-def test_a_stray_has_a_topic_of_its_own_even_if_it_comes_first(tmp_path: Path) -> None:
+def test_undecodable_messages_are_kept_as_bytes(tmp_path: Path) -> None:
     made = Mixed(tmp_path / "one.mcap")
     made.stray(LINK, RANGE)
     made.own(LINK, 25)
@@ -76,7 +76,7 @@ def test_every_message_is_there_under_one_schema(seed: int, tmp_path: Path) -> N
     assert done.strays.total == strays[True]
 
 
-def test_the_command_writes_a_file_and_a_layout_for_its_cars(tmp_path: Path) -> None:
+def test_stop_finding_has_car_time_person_cause_once(tmp_path: Path) -> None:
     every_type.make(tmp_path / "one.mcap")
     arguments = ["sessions", "export", str(tmp_path / "one.mcap"), "--foxglove", str(tmp_path / "out")]
     assert CliRunner().invoke(cli, arguments).exit_code == 0

@@ -30,7 +30,7 @@ def logged(at_s: int, code: str, words: str = NOT_REACTED) -> Log:
     return Log(name=f"red {code}", message=words, timestamp=Timestamp(seconds=at_s))
 
 
-def test_a_stop_has_car_local_time_who_and_cause_and_is_told_once() -> None:
+def test_gap_is_named_with_publisher_numbers_and_time() -> None:
     found = StopFindings()
     found.add("red", "state/link", pb.Link(state="lost", reason="unplugged"))
     found.add("red", "state/health", pb.Health(shows_stops="yes", doubted=True, shows_stops_words="red is in doubt"))

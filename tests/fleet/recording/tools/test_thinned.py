@@ -68,7 +68,7 @@ def description(path: Path) -> dict[str, Any]:
     return found
 
 
-def test_what_the_quota_took_is_no_damage_and_each_file_is_named(thinned: Path) -> None:
+def test_schema_of_another_version_and_invalid_schema_are_told(thinned: Path) -> None:
     code, listed = sessions(thinned.parent)
     assert code == 0
     assert {one["name"]: (one["state"], one["lost"]) for one in listed} == {
@@ -157,7 +157,7 @@ def test_a_cut_says_what_the_quota_had_taken_of_it(thinned: Path) -> None:
     assert made["pins"] == []
 
 
-def test_a_cut_has_the_marks_inside_it_and_stays_of_the_quota_only_with_one(tmp_path: Path) -> None:
+def test_condition_pins_before_first_and_after_last_reading(tmp_path: Path) -> None:
     path = record(tmp_path, BEGUN_NS)
     about = description(path)
     about["marks"] = [

@@ -37,7 +37,7 @@ def metadata(segment: Path) -> dict[str, dict[str, str]]:
         return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
 
 
-def test_every_message_of_who_comes_later_lies_in_the_file_as_it_was_published(endpoint: str, tmp_path: Path) -> None:
+def test_queue_overflow_is_counted_by_key_and_never_blocks(endpoint: str, tmp_path: Path) -> None:
     sent: dict[str, list[bytes]] = {}
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)
@@ -69,7 +69,7 @@ def test_every_message_of_who_comes_later_lies_in_the_file_as_it_was_published(e
     assert description["messages"] == len(rows)
 
 
-def test_schemas_decode_without_our_code_and_there_is_one_per_type(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_huge_message_is_recorded_and_oversized_one_counted(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
@@ -122,9 +122,7 @@ def own_config(endpoint: str) -> zenoh.Config:
     )
 
 
-def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
-    endpoint: str, bus: Bus, tmp_path: Path
-) -> None:
+def test_flush_each_second_reaches_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     key = "fleet/red/sensor/range"
     with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path)
@@ -143,7 +141,7 @@ def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
     assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
 
 
-def test_what_a_car_said_while_it_was_cut_off_is_had_when_it_is_back(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_wall_clock_step_keeps_message_order(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     """The recorder stays connected, so it hears of the gap only after it, with the next message of the car."""
     tap = Tap(endpoint.replace("tcp/", "tcp://"))
     with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
@@ -167,7 +165,7 @@ def test_what_a_car_said_while_it_was_cut_off_is_had_when_it_is_back(endpoint: s
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])
-def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
+def test_backfilled_message_keeps_published_key(
     limits: dict[str, Any], endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
     with Bus.open(endpoint) as own:
@@ -199,9 +197,7 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
     assert json.loads(metadata(session / "0001.mcap")["recording"]["drops"]) == dict(outcome.drops)
 
 
-def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_large_is_counted(
-    hub_apart: str, tmp_path: Path
-) -> None:
+def test_segment_ends_at_size_and_none_is_empty(hub_apart: str, tmp_path: Path) -> None:
     payload = os.urandom(20_000_000)
     with Bus.open(hub_apart) as own, zenoh.open(own_config(hub_apart)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path, max_bytes=30_000_000)
@@ -257,7 +253,7 @@ def test_a_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: 
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_flush_each_second_puts_a_young_session_on_the_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_quota_removes_oldest_unmarked_only(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     from fleet.recording.reading.session import Session
 
     with Bus.open(endpoint) as own:
@@ -290,7 +286,7 @@ def test_topics_that_are_recorded_match_the_subscriptions() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
-def test_a_wall_clock_that_is_set_leaves_the_order_of_the_messages(endpoint: str, tmp_path: Path, step_s: int) -> None:
+def test_quota_broken_by_marks_is_told_and_removes_none(endpoint: str, tmp_path: Path, step_s: int) -> None:
     key, step_ns = "fleet/red/sensor/range", [0]
     with Bus.open(endpoint) as own, Bus.open(endpoint) as cars:
         recorder = Recorder(own, "fleet", tmp_path, wall_ns=lambda: time.time_ns() + step_ns[0])
@@ -311,7 +307,7 @@ def test_a_wall_clock_that_is_set_leaves_the_order_of_the_messages(endpoint: str
     assert description["ended"] >= description["started"]
 
 
-def test_what_is_had_again_has_the_key_under_which_it_was_published(tmp_path: Path) -> None:
+def test_redecode_of_verdict_and_dropped_reading(tmp_path: Path) -> None:
     from fleet.recording.reading.session import Session
 
     topics = {

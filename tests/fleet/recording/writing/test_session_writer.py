@@ -31,7 +31,7 @@ def payloads(paths: Iterable[Path]) -> int:
 
 
 @pytest.mark.parametrize("sync", list(Sync))
-def test_a_file_ends_at_its_size_and_none_is_begun_for_nothing(tmp_path: Path, sync: Sync) -> None:
+def test_writer_segment_ends_at_size_and_none_is_empty(tmp_path: Path, sync: Sync) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, sync=sync), BEGUN_NS)
     for second in range(20):
         feed(tape, BEGUN_NS + second * SECOND_NS, count=20)
@@ -118,7 +118,7 @@ def session(root: Path, number: int, *, closed: bool = True) -> Path:
     return tape.path
 
 
-def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: Path) -> None:
+def test_quota_removes_oldest_unmarked_sessions_only(tmp_path: Path) -> None:
     paths = [session(tmp_path, number) for number in range(6)]
     marked = SessionInfo.read(paths[1])
     assert marked is not None
@@ -136,7 +136,7 @@ def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: 
     tape.close(BEGUN_NS + 7 * 3600 * SECOND_NS)
 
 
-def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp_path: Path) -> None:
+def test_quota_exceeded_by_marked_sessions_is_told(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(100_000)), BEGUN_NS)
     tape.mark("keep this", "me", BEGUN_NS)
     feed(tape, BEGUN_NS, count=400)

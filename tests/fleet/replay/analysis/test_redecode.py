@@ -66,7 +66,7 @@ def test_every_field_of_a_vector_counts(path: Path) -> None:
     assert changed
 
 
-def test_a_verdict_and_a_reading_that_is_not_published_any_more() -> None:
+def test_redecode_of_verdict_and_unpublished_reading() -> None:
     known: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, Mode.TRACKING)]
     frame = Rx(S, TRACKING, "sensors", ("sensor/line",), LINE)
     assert redecoded([*known, frame])[0] == []
@@ -77,7 +77,7 @@ def test_a_verdict_and_a_reading_that_is_not_published_any_more() -> None:
     ]
 
 
-def test_an_echo_is_known_by_what_was_sent_and_for_two_seconds() -> None:
+def test_echo_is_known_by_sent_bytes_for_two_seconds() -> None:
     sent = b"$1,0,0,0,0,0,0,0,0#"
     known: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, None), Tx(3 * S, sent)]
     echo = Rx(4 * S, sent, "echo")
@@ -89,7 +89,7 @@ def test_an_echo_is_known_by_what_was_sent_and_for_two_seconds() -> None:
     assert len(redecoded([*known[:2], replace(echo, at_ns=3 * S)])[0]) == 1
 
 
-def test_what_the_recording_does_not_tell_is_no_difference_and_is_counted() -> None:
+def test_redecode_counts_what_recording_lacks_as_no_difference() -> None:
     """A frame of following without obstacles has the text of light seeking before its #."""
     seen = {"sensor/obstacle": {"left": True, "right": True}}
     frame = Rx(S, FOLLOWING, "sensors", ("sensor/obstacle",), seen)
@@ -104,7 +104,7 @@ def test_what_the_recording_does_not_tell_is_no_difference_and_is_counted() -> N
     assert [each.what for each in redecoded([KnownPlatform(0, "arduino"), wrong])[0]] == ["sensor/obstacle left"]
 
 
-def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_path: Path) -> None:
+def test_redecode_differences_equal_those_of_vector(tmp_path: Path) -> None:
     """In the generated session, most line readings differ from their frames."""
     session = tmp_path / "made.mcap"
     make(session, seconds=12)
@@ -131,7 +131,7 @@ def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_p
     ]
 
 
-def test_a_session_that_was_cut_off_is_decoded_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_cut_off_session_is_redecoded_as_far_as_it_goes(tmp_path: Path) -> None:
     session = tmp_path / "made.mcap"
     make(session)
     session.write_bytes(session.read_bytes()[:-9000])

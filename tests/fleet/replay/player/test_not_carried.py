@@ -25,7 +25,7 @@ def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
     started.close()
 
 
-def test_what_cannot_be_carried_is_refused_and_the_rest_is_played(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_uncarriable_messages_are_refused_and_rest_is_played(fleet: FleetProcesses, tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "x.mcap")
     for key in BAD_KEYS:
         made.put(key, "", b"{}", "json")

@@ -208,7 +208,7 @@ def test_a_clock_that_went_back_is_not_waited_for(fleet: FleetProcesses, tmp_pat
     assert player.lines()[-1].startswith("4 messages in ")
 
 
-def test_who_ends_it_before_the_first_message_is_told_no_fault(fleet: FleetProcesses, session: Path) -> None:
+def test_player_ended_before_first_message_is_no_fault(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--from", "2s", "--rate", "0.01")
     wait_for(lambda: fleet.bus.tokens("fleet-replay/red"), "it has begun")
     assert player.end(signal.SIGINT) == 0

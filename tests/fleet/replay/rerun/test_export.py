@@ -219,9 +219,7 @@ def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]
     assert "byte " in result.stderr
 
 
-def test_what_is_damaged_is_said_and_only_what_is_whole_is_shown(
-    made: tuple[Path, Counter[str]], tmp_path: Path
-) -> None:
+def test_export_tells_damage_and_shows_whole_part(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     whole = made[0].read_bytes()
     for share in (0.3, 0.6, 0.9):
         damaged = bytearray(whole)
@@ -312,7 +310,7 @@ def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: P
     assert list(work.iterdir()) == [work / "out.rrd"]
 
 
-def test_cars_come_from_the_keys_and_foreign_keys_do_no_harm() -> None:
+def test_export_takes_cars_from_keys_and_ignores_foreign_ones() -> None:
     keys = frozenset(
         {"fleet/red/sensor/range", "fleet/@recorder/status", "fleet/red/@cmd/drive", "x", "fleet/blue/other"}
     )

@@ -114,7 +114,7 @@ def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path
     assert layout == export.APPLICATION
 
 
-def test_strays_and_junk_on_the_bus_hide_no_message_and_are_counted(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_live_view_counts_strays_and_junk(fleet: FleetProcesses, tmp_path: Path) -> None:
     out = tmp_path / "now.rrd"
     link, log = "fleet/red/state/link", "fleet/red/event/log"
     with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
@@ -198,9 +198,7 @@ def test_killed_it_leaves_no_viewer(fleet: FleetProcesses, who: str) -> None:
     wait_for(lambda: ended(viewer), "the viewer has ended")
 
 
-def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
-    fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hung_viewer_blocks_nothing_and_takes_no_memory(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "MAX_WAITING_MESSAGES", 500)
     port, page = free_port(), free_port()
     with Viewer("--serve-web", "--port", str(port), "--web-viewer-port", str(page)) as viewer:

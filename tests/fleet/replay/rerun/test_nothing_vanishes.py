@@ -23,7 +23,7 @@ def replayed(path: Path) -> export.Replayed:
 
 
 @pytest.mark.parametrize("first", ["fleet.v1.Link", "fleet.v1.Range"])
-def test_a_stray_message_does_not_hide_the_own_ones_of_a_key(tmp_path: Path, first: str) -> None:
+def test_stray_message_hides_no_own_message_of_key(tmp_path: Path, first: str) -> None:
     # Rerun chooses a schema at random: once would prove nothing.
     for number in range(8):
         made = Mixed(path := tmp_path / f"{number}.mcap")
@@ -77,7 +77,7 @@ def test_files_that_reruns_reader_refuses_are_shown(tmp_path: Path, options: dic
     assert (found.shown, found.left_out.total) == ({RANGE: 5}, 0)
 
 
-def test_a_file_without_a_message_of_a_fleet_is_no_traceback(tmp_path: Path) -> None:
+def test_replay_without_fleet_message_is_no_traceback(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "x.mcap", use_chunking=False)
     made.put("/imu/\x1b]0;pwn\x07data", "J", b"{}", "json")
     made.close()

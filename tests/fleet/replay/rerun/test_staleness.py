@@ -36,7 +36,7 @@ def drawn(ends: StaleStates, now: float) -> list[float]:
     return found
 
 
-def test_a_gap_in_a_batch_between_batches_and_at_the_end_ends_lanes() -> None:
+def test_gaps_within_between_and_after_batches_end_lanes() -> None:
     ends = StaleStates()
     ends.add(LINE, "sensor/line", batch(1, 2, 10, 11))
     ends.add(LINE, "sensor/line", batch(20, 21))
@@ -59,7 +59,7 @@ def test_batches_may_come_in_any_order() -> None:
     assert drawn(ends, 20) == [3 + STALE_S, 16 + STALE_S]
 
 
-def test_live_an_end_is_told_once_and_again_after_more_was_heard() -> None:
+def test_live_staleness_is_told_once_and_again_after_news() -> None:
     ends = StaleStates()
     ends.add(LINE, "sensor/line", batch(1, 2))
     assert drawn(ends, 4) == []

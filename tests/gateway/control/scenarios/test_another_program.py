@@ -48,7 +48,7 @@ def met(kept_s: float, traits: CarTraits) -> Pair:
     ],
     ids=str,
 )
-def test_a_kept_rhythm_of_another_program_is_learned_again_while_stops_go_out(kept_s: float, traits: CarTraits) -> None:
+def test_rhythm_of_another_program_is_relearned_during_stops(kept_s: float, traits: CarTraits) -> None:
     pair = met(kept_s, traits)
     pair.run(60.0)
     learned = pair.control.driver.model.learned
@@ -64,7 +64,7 @@ def test_a_kept_rhythm_of_another_program_is_learned_again_while_stops_go_out(ke
     assert len(closes) <= 6, "it is not stopped for ever"
 
 
-def test_a_car_that_could_not_show_its_stops_shows_them_when_its_wire_is_whole() -> None:
+def test_car_shows_stops_again_when_wire_is_whole() -> None:
     pair = Pair(start_s=2.0)
     feed = pair.car.feed
     pair.car.feed = lambda *_: None  # type: ignore[method-assign]
@@ -97,7 +97,7 @@ def test_numbers_of_no_car_are_not_restored(damage: dict[str, Any]) -> None:
         Learned.restore(json.loads(json.dumps(KEPT | damage)))
 
 
-def test_a_drive_right_after_the_connect_is_not_said_to_have_been_ignored() -> None:
+def test_drive_right_after_connect_is_not_called_ignored() -> None:
     pair = Pair(start_s=2.0)
     pair.connect()
     pair.until(lambda: pair.control.is_free(pair.now), 20.0)
@@ -126,7 +126,7 @@ def test_the_repeats_of_a_stop_give_way_at_once() -> None:
         assert pair.now <= max(asked_at, closed_at + 1.0) + 0.3
 
 
-def test_a_report_that_mode_00_has_delayed_is_no_rhythm_if_a_drive_follows_it() -> None:
+def test_report_delayed_by_mode_00_is_no_rhythm() -> None:
     """The drive takes the place of the stop, so its `MODE00` is not judged. The car blocks all the same."""
     for seed in range(80):
         moments = random.Random(seed)
@@ -140,7 +140,7 @@ def test_a_report_that_mode_00_has_delayed_is_no_rhythm_if_a_drive_follows_it() 
         assert all(abs(each - 2.2) < 0.1 for each in intervals_s), f"seed {seed}: {intervals_s}"
 
 
-def test_a_raspberry_pi_car_that_never_sends_a_reading_is_taken_as_such_until_one_arrives() -> None:
+def test_silent_raspberry_pi_is_taken_as_such_until_reading() -> None:
     pair = Pair("course", told="raspberry_pi", start_s=2.0)
     pair.connect()
     control = pair.control
@@ -201,7 +201,7 @@ def test_readings_end_the_option_that_there_are_none(platform: str, told: str, c
 
 @pytest.mark.parametrize("told", ["auto", "arduino"])
 @pytest.mark.parametrize("other", ["raspberry_pi", "stm32"])
-def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, other: str) -> None:
+def test_claim_of_previous_program_ends_with_first_readings(told: str, other: str) -> None:
     name, auto = parse_option(told)
     pair = Pair("arduino", told="arduino", start_s=2.0)
     pair.control = control(parse_platform(name), auto=auto)
@@ -221,7 +221,7 @@ def test_a_claim_of_the_program_before_ends_with_its_first_readings(told: str, o
 @pytest.mark.parametrize(
     ("first", "other"), [("raspberry_pi", "arduino"), ("arduino", "raspberry_pi"), ("stm32", "arduino")]
 )
-def test_a_detected_platform_is_detected_again_when_the_program_is_swapped(first: str, other: str) -> None:
+def test_platform_is_detected_again_after_program_swap(first: str, other: str) -> None:
     pair = Pair(first, start_s=2.0)
     name, auto = parse_option("auto")
     pair.control = control(parse_platform(name), auto=auto)
@@ -279,7 +279,7 @@ def test_another_head_is_used_as_soon_as_it_is_known() -> None:
 
 
 @pytest.mark.parametrize("told", ["arduino", "auto"])
-def test_a_head_that_is_corrected_neither_cuts_nor_delays_a_drive(told: str) -> None:
+def test_corrected_head_neither_cuts_nor_delays_drive(told: str) -> None:
     name, auto = parse_option(told)
     for tenth in range(0, 40, 3):
         pair = Pair(start_s=2.0, traits=CarTraits(head="3WD"))

@@ -75,7 +75,7 @@ def test_several_e_stops_in_force_are_named_by_their_ids(desk: Workbench) -> Non
     assert desk.ask(Resume(("e1", "e3")), PERSON).words.startswith("2 e-stops released; still on hold by mia")
 
 
-def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench) -> None:
+def test_estop_of_unreachable_car_is_latched(desk: Workbench) -> None:
     desk.control.driver.link_down("unplugged", desk.now)
     answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
     assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
@@ -135,7 +135,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
     assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
 
 
-def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only(desk: Workbench) -> None:
+def test_finished_command_line_keeps_lease_from_lower_rank_only(desk: Workbench) -> None:
     """If a person stops a car and drives it a little, the coordinator must not drive it off at once."""
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
@@ -173,7 +173,7 @@ def test_a_release_shortens_the_lease(desk: Workbench) -> None:
     assert desk.ask(FORWARD, Sender("other")).status is QUEUED
 
 
-def test_a_person_outranks_a_script_and_the_loser_is_told_by_whom(desk: Workbench) -> None:
+def test_person_outranks_script_and_loser_learns_by_whom(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT, identity="d")
     assert desk.ask(Drive(Motion.LEFT, 1.0), PERSON).status is QUEUED
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
@@ -193,7 +193,7 @@ def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Workbench)
 
 
 @pytest.mark.parametrize("what", [TakeLease(), ChangeSpeed(SpeedStep.UP)])
-def test_what_is_asked_on_the_way_does_not_shorten_the_lease(desk: Workbench, what: Action) -> None:
+def test_command_during_drive_does_not_shorten_lease(desk: Workbench, what: Action) -> None:
     desk.ask(FORWARD, PERSON)
     desk.run(0.5)
     assert desk.ask(what, PERSON).status in (SENT, QUEUED)
@@ -227,7 +227,7 @@ def test_a_stop_needs_no_lease_and_ends_it(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- streams after a stop
 
 
-def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: Workbench) -> None:
+def test_held_stick_does_not_resume_after_stop_of_another(desk: Workbench) -> None:
     stick = Drive(Motion.FORWARD, 0.5)
     for _ in range(10):
         desk.ask(stick, SCRIPT, streamed=True)
@@ -264,7 +264,7 @@ def test_what_only_continues_a_drive_begins_none(desk: Workbench) -> None:
     assert desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True).status is QUEUED, "pressed again"
 
 
-def test_a_stick_that_a_lease_kept_out_does_not_drive_when_it_lapses_after_a_stop(desk: Workbench) -> None:
+def test_stick_kept_out_by_lease_does_not_drive_after_stop(desk: Workbench) -> None:
     stick = Drive(Motion.FORWARD, 0.5)
     for _ in range(10):
         desk.ask(stick, PERSON, streamed=True)
@@ -295,7 +295,7 @@ def test_a_single_drive_is_no_stream(desk: Workbench) -> None:
     assert desk.ask(FORWARD, SCRIPT).status is QUEUED
 
 
-def test_who_asks_for_one_drive_after_another_lets_go_first_too(desk: Workbench) -> None:
+def test_repeated_drives_release_first(desk: Workbench) -> None:
     for _ in range(5):
         desk.ask(Drive(Motion.FORWARD, 0.5), SCRIPT)
         desk.run(0.1)
@@ -318,7 +318,7 @@ def test_a_script_that_drives_stops_and_drives_leans_on_nothing(desk: Workbench)
 # ---------------------------------------------------------------------- what ends no hold
 
 
-def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Workbench) -> None:
+def test_refused_drive_and_released_stick_end_no_hold(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     desk.ask(Stop(), PERSON)
     desk.run(0.55)
@@ -333,7 +333,7 @@ def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Wo
     assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.HELD
 
 
-def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> None:
+def test_car_that_went_its_own_way_is_not_standing(desk: Workbench) -> None:
     for _ in range(3):
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
@@ -341,7 +341,7 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> No
     assert desk.ask(Led(1, 2, 3), PERSON).reason is None, "the gateway stops it first"
 
 
-def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> None:
+def test_mode_sender_has_lease_until_mode_is_in_force(desk: Workbench) -> None:
     """A mode opens for 3.5 s, longer than a lease outlives its drive. The coordinator must not close it meanwhile."""
     desk.ask(SetMode(Mode.TRACKING), PERSON)
     desk.run(4.0, reports=False)
@@ -350,7 +350,7 @@ def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> No
     assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).status is QUEUED
 
 
-def test_a_token_that_is_known_only_from_its_end_ends_the_drive() -> None:
+def test_unknown_token_that_ends_ends_the_drive() -> None:
     """The bus service merges changes of tokens. Of a token that came and went within 50 ms it reports only the end."""
     desk = Workbench().ready()
     desk.ask(Drive(Motion.FORWARD, 60.0), SCRIPT, identity="drive")

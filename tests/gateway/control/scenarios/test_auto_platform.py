@@ -31,7 +31,7 @@ def paired(platform: str) -> Pair:
         ("raspberry_pi", "raspberry_pi", b"$0,0,0,0,0,0,0,0,0#"),
     ],
 )
-def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: str, first: bytes) -> None:
+def test_auto_platform_detects_and_stops_each_car(platform: str, settled: str, first: bytes) -> None:
     pair = paired(platform)
     assert pair.control.driver.model.profile.name == "unknown"
     pair.until(lambda: pair.control.driver.model.known, 20.0)
@@ -49,14 +49,14 @@ def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: st
     assert pair.off_for_good_at()
 
 
-def test_before_it_is_settled_only_what_every_car_knows_is_sent() -> None:
+def test_undetected_platform_gets_only_common_frames() -> None:
     pair = paired("arduino")
     assert pair.ask(SetMode(Mode.TRACKING)).reason == "unsupported"
     pair.until(lambda: pair.control.driver.model.profile.name == "arduino", 20.0)
     assert pair.ask(SetMode(Mode.TRACKING)).reason is None
 
 
-def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
+def test_returning_link_may_have_another_car() -> None:
     pair = paired("arduino")
     pair.until(lambda: pair.control.driver.model.profile.name == "arduino", 20.0)
     pair.control.driver.link_down("unplugged", pair.now)
@@ -81,9 +81,7 @@ def in_a_silent_mode(platform: str, mode: Mode) -> Pair:
 @pytest.mark.parametrize(
     ("platform", "mode"), [("arduino", Mode.OBSTACLE_AVOIDANCE), ("stm32", Mode.TRACKING)], ids=["arduino", "stm32"]
 )
-def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
-    platform: str, mode: Mode, gateway: str
-) -> None:
+def test_car_left_in_silent_mode_is_stopped_as_its_platform(platform: str, mode: Mode, gateway: str) -> None:
     pair = in_a_silent_mode(platform, mode)
     if gateway == "the same":
         pair.control.driver.link_down("unplugged", pair.now)
@@ -98,7 +96,7 @@ def test_a_car_that_was_left_in_a_silent_mode_is_stopped_as_what_it_was(
     assert pair.control.driver.model.learned.opened_as == "", "a report has shown mode 0"
 
 
-def test_what_a_car_was_is_forgotten_if_its_link_ends_without_a_word_after_a_mode_frame() -> None:
+def test_platform_is_forgotten_if_link_ends_after_mode_frame() -> None:
     """Behind the same address there may be a program that ends at a mode frame now. It must not end again and again."""
     pair = in_a_silent_mode("arduino", Mode.OBSTACLE_AVOIDANCE)
     pair.control.driver.link_down("unplugged", pair.now)

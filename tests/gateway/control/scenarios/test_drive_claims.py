@@ -23,21 +23,21 @@ def driven(*, deaf: bool) -> Pair:
     return pair
 
 
-def test_a_drive_of_a_deaf_car_was_sent_and_nothing_shows_that_it_moved() -> None:
+def test_drive_of_deaf_car_is_sent_and_not_shown() -> None:
     pair = driven(deaf=True)
     last = [record for record in pair.records if record.command.id == "drive"][-1]
     assert (last.phase, last.basis) == (Phase.SENT, "sent")
     assert "red may not have moved" in last.words
 
 
-def test_a_drive_whose_distance_has_changed_says_so_and_claims_no_more() -> None:
+def test_drive_with_changed_distance_claims_only_that() -> None:
     """Something else may have moved before the car, and one change does not show that it drove all the time."""
     last = [record for record in driven(deaf=False).records if record.command.id == "drive"][-1]
     assert (last.phase, last.basis) == (Phase.SENT, "sent")
     assert last.evidence[0].startswith("its distance changed from ")
 
 
-def test_a_drive_without_a_report_in_it_was_sent_for_its_time() -> None:
+def test_drive_without_report_is_sent_for_its_time() -> None:
     pair = Pair(start_s=2.0).ready()
     pair.ask(Drive(Motion.FORWARD, 0.3), identity="drive")
     pair.run(1.0)
@@ -46,7 +46,7 @@ def test_a_drive_without_a_report_in_it_was_sent_for_its_time() -> None:
     assert (last.phase, last.basis, last.words) == (Phase.SENT, "sent", "sent for 0.3 s")
 
 
-def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:
+def test_drive_does_not_hide_unshown_stop() -> None:
     pair = Pair(start_s=2.0).ready()
     pair.ask(Drive(Motion.FORWARD, 9.0))
     pair.run(1.5)
@@ -66,7 +66,7 @@ def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:
 
 
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 90.0])
-def test_no_mode_is_confirmed_by_old_evidence_while_a_stop_goes_on(seconds: float) -> None:
+def test_old_evidence_confirms_no_mode_during_stop(seconds: float) -> None:
     pair = Pair(start_s=2.0).ready()
     assert pair.control.driver.model.mode.confirmed is not None
     pair.deaf_until = float("inf")

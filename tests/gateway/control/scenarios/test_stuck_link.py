@@ -45,7 +45,7 @@ class Wire:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_again(platform: str) -> None:
+def test_unheard_car_may_be_moving_and_is_stopped_on_return(platform: str) -> None:
     pair = Pair(platform, start_s=2.0).ready()
     pair.logs.clear()
     wire = Wire(pair)
@@ -66,7 +66,7 @@ def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_a
     assert codes.index("recovered") > codes.index("answers_again") > codes.index("unheard"), "no claim before it"
 
 
-def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
+def test_driven_car_is_not_assumed_heard() -> None:
     """Frames without a block explain no silence, however many."""
     pair = Pair("arduino", start_s=2.0).ready()
     wire = Wire(pair)
@@ -81,7 +81,7 @@ def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
     assert "nothing shows that it hears this" in answer.words
 
 
-def test_a_stream_from_before_a_silence_or_a_lost_link_drives_no_car_after_it() -> None:
+def test_stream_from_before_silence_or_lost_link_drives_no_car() -> None:
     for how in ("silence", "link"):
         pair = Pair("arduino", start_s=2.0).ready()
         wire = Wire(pair)
@@ -133,7 +133,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     assert pair.control.driver.model.motors == "off"
 
 
-def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None:
+def test_stop_in_obstacle_avoidance_is_no_silence() -> None:
     pair = Pair("arduino", start_s=2.0).ready()
     pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
     pair.run(8.0)
@@ -181,7 +181,7 @@ def deaf(pair: Pair) -> list[bytes]:
     return lost
 
 
-def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on() -> None:
+def test_lost_stop_is_never_complete_and_goes_on() -> None:
     """A deaf car keeps reporting, or no pause shows the stop (docs/reference/protocol.md#evidence-of-a-stop)."""
     tries = 40
     for seed in range(tries):
@@ -224,7 +224,7 @@ def doubtful() -> Pair:
     return pair
 
 
-def test_a_car_that_was_deaf_from_the_start_is_one_that_cannot_show_a_stop() -> None:
+def test_car_deaf_from_start_cannot_show_stop() -> None:
     """Nothing tells it from a car whose program reports by a timer. It can be used, and no claim is `shown`."""
     pair = Pair("arduino", start_s=2.0)
     deaf(pair)
@@ -236,7 +236,7 @@ def test_a_car_that_was_deaf_from_the_start_is_one_that_cannot_show_a_stop() -> 
     assert pair.ask(Drive(Motion.FORWARD, 1.0)).status is Phase.QUEUED
 
 
-def test_a_deaf_car_is_told_for_ever_with_pauses_that_grow_to_ten_seconds_at_most() -> None:
+def test_deaf_car_is_stopped_for_ever_with_growing_pauses() -> None:
     pair = doubtful()
     pair.run(300.0)
     assert pair.control.driver.model.trust.state is CarTrust.UNPROVEN
@@ -248,7 +248,7 @@ def test_a_deaf_car_is_told_for_ever_with_pauses_that_grow_to_ten_seconds_at_mos
     assert len(pair.logs) < 6
 
 
-def test_a_deaf_car_that_somebody_drives_all_the_same_is_stopped_again_and_never_claimed() -> None:
+def test_deaf_car_driven_by_others_is_stopped_again_and_never_claimed() -> None:
     pair = doubtful()
     pair.shown_at.clear()
     for number in range(3):
@@ -264,7 +264,7 @@ def test_a_deaf_car_that_somebody_drives_all_the_same_is_stopped_again_and_never
     assert len(pair.shown_at) <= 1, "the one from before it was deaf"
 
 
-def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_asks() -> None:
+def test_doubt_without_reason_ends_before_anybody_asks() -> None:
     pair = doubtful()
     assert pair.control.driver.model.motors == "unknown"
     pair.car.feed = pair.hears  # type: ignore[method-assign,attr-defined]

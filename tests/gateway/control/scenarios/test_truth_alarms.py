@@ -30,7 +30,7 @@ def test_no_alarm_in_normal_running(mode: Mode, world: str) -> None:
         ("stm32", "stm32", Transport.SERIAL),
     ],
 )
-def test_nor_on_another_platform_nor_on_one_that_is_not_known(
+def test_healthy_car_of_other_platforms_raises_no_alarm(
     platform: str, told: str, transport: Transport, world: str
 ) -> None:
     run = NormalRun(world, seed=8, platform=platform, told=told, transport=transport)

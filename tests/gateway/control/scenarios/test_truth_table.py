@@ -56,7 +56,7 @@ def never(pair: Pair, row: Row) -> None:
     assert pair.control.driver.model.mode.inferred is None
 
 
-def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
+def test_truth_table_is_complete_and_says_what_is_unknowable() -> None:
     assert {modes(row) for row in TABLE} == {(asked, true) for asked in Mode for true in Mode}
     assert len(TABLE) == len(Mode) ** 2
     for row in TABLE:
@@ -93,7 +93,7 @@ def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str) -> 
 
 
 @pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.MANUAL], ids=str)
-def test_a_mode_in_which_an_stm32_car_is_silent_stays_assumed(mode: Mode) -> None:
+def test_silent_mode_of_stm32_stays_assumed(mode: Mode) -> None:
     pair = car_in(mode, "room", seed=1, platform="stm32")
     pair.run(LONG_S)
     assert pair.car.truth.mode is mode, "the gateway does not end it"

@@ -154,7 +154,7 @@ def test_no_echo_is_said_and_is_no_distance() -> None:
 
 @pytest.mark.parametrize("mode", [mode for mode in MEASURED if mode is not Mode.MANUAL])
 @given(data=st.data())
-def test_a_damaged_frame_publishes_no_filler_while_its_mode_is_confirmed(mode: Mode, data: st.DataObject) -> None:
+def test_damaged_frame_publishes_no_filler_in_confirmed_mode(mode: Mode, data: st.DataObject) -> None:
     """One byte is wrong or lost. Without a checksum the frame may look like a mode-0 frame."""
     texts = {
         Mode.TRACKING: b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00",

@@ -11,7 +11,7 @@ TOLD = [("arduino", "raspberry_pi"), ("stm32", "raspberry_pi"), ("raspberry_pi",
 
 
 @pytest.mark.parametrize(("platform", "told"), TOLD)
-def test_a_car_of_another_platform_than_told_is_stopped_by_what_stops_any(platform: str, told: str) -> None:
+def test_wrong_platform_car_is_stopped_by_common_stop(platform: str, told: str) -> None:
     pair = Pair(platform, told=told, start_s=2.0).ready()
     pair.until(lambda: pair.control.driver.model.platform.doubted, 10.0)
     pair.ask(Stop(), identity="first")
@@ -32,7 +32,7 @@ def test_a_car_of_another_platform_than_told_is_stopped_by_what_stops_any(platfo
     assert pair.control.driver.model.motors == "off"
 
 
-def test_a_car_told_to_know_no_modes_that_tracks_is_stopped() -> None:
+def test_mode_car_told_without_modes_is_stopped() -> None:
     pair = Pair(told="raspberry_pi", start_s=2.0).ready()
     pair.car.feed(b"$4WD,MODE21#", pair.now)
     pair.until(lambda: pair.car.truth.mode is Mode.TRACKING, 3.0)
@@ -47,7 +47,7 @@ def test_a_car_told_to_know_no_modes_that_tracks_is_stopped() -> None:
     assert pair.control.driver.model.motors == "off"
 
 
-def test_a_fan_that_runs_over_a_cut_link_can_be_toggled_and_the_car_used_again() -> None:
+def test_fan_over_cut_link_can_be_toggled_and_car_reused() -> None:
     """A car whose fan runs reports nothing (docs/reference/protocol.md#hazards), so its recovery goes on."""
     pair = Pair(start_s=2.0).ready()
     pair.ask(Fan(), identity="on")

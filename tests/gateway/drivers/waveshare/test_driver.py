@@ -29,7 +29,7 @@ def commands(episode: UgvEpisode, since: float = 0.0) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("platform", ["wave_rover", "ugv01", "ugv02", "ugv_rover", "ugv_beast"])
-def test_nothing_moves_before_the_firmware_is_known_and_the_chassis_is_set(platform: str) -> None:
+def test_ugv_moves_only_with_known_firmware_and_chassis(platform: str) -> None:
     episode = UgvEpisode(1, platform, frozen_options=frozenset())
     episode.connect()
     episode.ask(Drive(Motion.FORWARD, 1.0))
@@ -119,7 +119,7 @@ def test_a_motion_that_nobody_commanded_is_stopped() -> None:
     assert episode.control.driver.model.trust.state in (CarTrust.RECOVERING, CarTrust.STOPPED)
 
 
-def test_the_open_web_page_of_a_car_without_encoders_is_named() -> None:
+def test_open_web_page_of_car_without_encoders_is_named() -> None:
     episode = ready("wave_rover")
     episode.car.press(Button.FORWARD, episode.now)
     episode.run(8.0)
@@ -152,7 +152,7 @@ def test_the_stop_of_a_person_waits_for_nothing() -> None:
     assert commands(episode)[0] == {"T": 11, "L": 0, "R": 0, "n": 1}
 
 
-def test_what_such_a_car_lacks_is_refused_and_its_lights_work() -> None:
+def test_ugv_refuses_what_it_lacks_and_lights_work() -> None:
     episode = ready("wave_rover")
     for what in (Led(1, 2, 3), Signal(Verb.WHISTLE), AimServo(1), SetLight(Light.RED), SetMode(Mode.TRACKING)):
         assert episode.ask(what) is Phase.REJECTED
@@ -194,7 +194,7 @@ def test_an_echo_that_is_switched_off_ends_stops_as_sent() -> None:
     assert (episode.control.driver.model.motors, episode.control.driver.model.basis) == (Motors.OFF, Basis.SENT)
 
 
-def test_a_chassis_whose_echo_never_comes_whole_locks_no_car_out() -> None:
+def test_missing_chassis_echo_locks_no_car_out() -> None:
     episode = UgvEpisode(1, "ugv01", frozen_options=frozenset())
     printed = episode.car._print
     episode.car._print = lambda data: printed(data.replace(b'"T":900', b'"T": 900'))  # type: ignore[method-assign]  # its own spelling
@@ -238,7 +238,7 @@ def test_errors_of_servos_keep_no_car_from_its_setup() -> None:
     assert episode.control.driver.wait_words(episode.now) == ""  # type: ignore[attr-defined]  # of this family
 
 
-def test_an_estop_in_a_boot_is_repeated_and_counts_for_nothing_until_then() -> None:
+def test_estop_during_boot_is_repeated_and_not_counted() -> None:
     episode = ready("ugv01", options=frozenset({"mission"}))
     episode.car.brown_out(episode.now)
     episode.run(0.02)

@@ -39,7 +39,7 @@ def read(fields: dict[str, Any]) -> Any:
     return event
 
 
-def test_the_two_firmwares_are_told_apart_and_read_in_one_unit() -> None:
+def test_firmwares_are_told_apart_and_read_in_one_unit() -> None:
     one, two = read(GENERAL), read(ROS)
     assert (one.firmware, one.left_m_s, one.right_m_s, one.voltage_v) == (UgvFirmware.GENERAL, 0.0, 0.25, 11.64)
     assert one.attitude_rad == pytest.approx((math.radians(1), math.radians(-2), math.pi / 2))

@@ -41,7 +41,7 @@ def test_a_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) ->
     assert not played.done
 
 
-def test_it_waits_for_a_host_and_does_not_begin_again_for_another() -> None:
+def test_capture_waits_for_host_and_does_not_restart() -> None:
     played = CaptureCar(PIECES)
     assert played.next_event() == inf
     assert played.advance(100.0) == []

@@ -24,7 +24,7 @@ async def test_it_knows_the_motions_and_sends_nothing(tcp: bool) -> None:
 
 
 @pytest.mark.parametrize("frame", [MODE00, opening(2), PTZ90, b"#", b"$1,0,1,0,0,0,0,0,0#"])
-async def test_any_other_frame_ends_it_with_the_motors_as_they_were(frame: bytes) -> None:
+async def test_other_frame_ends_course_program_with_motors_unchanged(frame: bytes) -> None:
     car = virtual("course")
     await car.write(RUN)
     await car.until(lambda truth: truth.driving)

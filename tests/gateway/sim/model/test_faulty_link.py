@@ -31,7 +31,7 @@ def test_without_a_fault_bytes_pass_as_they_come() -> None:
     assert link.lost_bytes == {Direction.TO_CAR: 0, Direction.TO_HOST: 0}
 
 
-def test_a_slow_link_hands_on_byte_by_byte_and_catches_up_afterwards() -> None:
+def test_slow_link_delivers_bytewise_and_catches_up() -> None:
     link = line()
     link.slow(0.1, until=10.0)
     assert both(link, FRAME, 5.0) == (b"", b"")
@@ -57,7 +57,7 @@ def test_frames_in_a_slow_link_queue_behind_each_other() -> None:
     assert b"".join(link.to_car(38.5 / 96)) == b"#"
 
 
-def test_a_slow_link_holds_so_much_for_the_host_and_no_more() -> None:
+def test_slow_link_buffers_a_bounded_amount() -> None:
     link = line()
     link.slow(0.001, until=inf)
     for _ in range(100):
@@ -81,7 +81,7 @@ def test_a_lossy_link_loses_its_share(share: float) -> None:
     assert both(link, FRAME, 5.0) == (FRAME, FRAME), "it ends"
 
 
-def test_what_is_lost_depends_on_the_seed_and_the_bytes_of_its_way_only() -> None:
+def test_loss_depends_on_seed_and_own_bytes() -> None:
     def run(seed: int, *, other: bool, piece: int) -> bytes:
         link = line(seed)
         link.lossy(0.3, tuple(Direction), until=inf)
@@ -124,7 +124,7 @@ def test_an_echo_comes_back_and_is_heard() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 10, 19, 30])
 @pytest.mark.parametrize("piece", [1, 7, 1000])
-def test_a_write_is_cut_so_many_bytes_into_the_next_frame(count: int, piece: int) -> None:
+def test_write_is_cut_after_given_bytes(count: int, piece: int) -> None:
     link = line()
     link.cut_next(count)
     data = b"0,0#\r\n" + FRAME + FRAME

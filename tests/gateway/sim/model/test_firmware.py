@@ -51,9 +51,7 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize(("what", "frame", "least", "most"), BLOCKS, ids=[row[0] for row in BLOCKS])
-async def test_a_frame_sent_while_blocked_is_obeyed_when_the_block_is_over(
-    what: str, frame: bytes, least: float, most: float
-) -> None:
+async def test_frame_sent_while_blocked_is_obeyed_later(what: str, frame: bytes, least: float, most: float) -> None:
     car = virtual()
     await car.wait(0.2)  # well before the first report
     await car.write(frame)
@@ -314,7 +312,7 @@ def lit_body(lamp: Lamp) -> CarBodyState:
     return CarBody(World(world.walls, world.line, [lamp]), Pose(0.0, -1.05, 0.0), random.Random(1))
 
 
-async def test_light_seeking_drives_to_a_lamp_and_brakes_in_the_dark() -> None:
+async def test_light_seeking_drives_to_lamp_and_brakes_in_dark() -> None:
     car = VirtualStranger(ArduinoCar(lit_body(Lamp(1.0, -1.05)), random.Random(1)))
     await car.write(opening(5))
     await car.until(lambda truth: truth.driving)
@@ -322,7 +320,7 @@ async def test_light_seeking_drives_to_a_lamp_and_brakes_in_the_dark() -> None:
     assert car.car.pose(car.now).x_m > 0.8
 
 
-async def test_following_runs_at_what_its_infrared_sees_and_its_bits_are_inverted() -> None:
+async def test_following_uses_infrared_with_inverted_bits() -> None:
     wall = World([(0.5, -1.0, 0.5, 1.0)])
     for x, word in ((0.0, b"HW11"), (0.25, b"HW00")):
         body = CarBody(wall, Pose(x, 0.0, 0.0), random.Random(1))
@@ -363,7 +361,7 @@ async def test_avoidance_without_echo_is_braked_and_deaf_for_ever() -> None:
     assert car.truth.blocked
 
 
-async def test_near_an_obstacle_avoidance_is_deaf_for_4_3_s_at_most() -> None:
+async def test_avoidance_near_obstacle_is_deaf_for_4_3_s() -> None:
     longest = 0.0
     for seed in range(8):
         car = virtual(seed=seed)
@@ -377,7 +375,7 @@ async def test_near_an_obstacle_avoidance_is_deaf_for_4_3_s_at_most() -> None:
     assert 3.9 < longest <= 4.31
 
 
-async def test_a_brown_out_boots_to_mode_0_with_the_motors_off() -> None:
+async def test_brown_out_boots_to_mode_0_with_motors_off() -> None:
     car = virtual()
     await car.write(general(motion=1, speed=1, light=2, fan=1))
     await car.wait(0.1)
@@ -406,7 +404,7 @@ async def test_a_brown_out_cuts_the_frame_that_is_being_sent() -> None:
     assert b"#" not in car.received
 
 
-async def test_a_dropped_link_loses_what_is_on_the_wire_and_leaves_half_a_frame() -> None:
+async def test_dropped_link_loses_bytes_and_leaves_half_frame() -> None:
     car = virtual()
     await car.write(RUN)
     await car.wait(0.012)
@@ -433,7 +431,7 @@ async def test_a_raspberry_pi_camera_turns_until_told_otherwise() -> None:
     assert car.car.camera["horizontal"] == 90
 
 
-async def test_a_raspberry_pi_comes_back_from_a_brown_out_even_if_its_program_had_died() -> None:
+async def test_raspberry_pi_recovers_from_brown_out() -> None:
     car = virtual("raspberry_pi")
     await car.write(b"$0#")
     await car.until(lambda truth: not truth.alive)

@@ -63,7 +63,7 @@ async def test_a_raspberry_pi_does_not_see_it() -> None:
     assert not car.truth.driving
 
 
-async def test_a_press_while_the_mode_opens_is_obeyed_when_it_is_open_and_only_the_first_is_kept() -> None:
+async def test_first_press_during_mode_opening_is_obeyed_later() -> None:
     car = virtual()
     await car.wait(0.2)
     await car.write(opening(1))

@@ -119,7 +119,7 @@ async def test_seeking_a_lamp(where: str, world: World, word: bytes, motors: tup
     assert (car.truth.motor_left, car.truth.motor_right) == motors
 
 
-async def test_a_report_of_mode_0_has_the_same_three_and_its_bits_are_not_inverted() -> None:
+async def test_mode_0_report_has_same_bits_not_inverted() -> None:
     starts = {"red": HOME, "green": Pose(0.30, -0.22, 0.0)}
     world = World([(2.0, -9.0, 2.0, 9.0)], lamps=[Lamp(0.5, 0.6)], starts=starts, cars_meet=True)
     car = VirtualStranger(cars(world, "red", "green")["red"])
@@ -162,7 +162,7 @@ def test_ranging(what: str, world: World, bearing: float, cm: float | None) -> N
     assert red.range_cm(0.0, bearing) == (None if cm is None else pytest.approx(cm, abs=1.5)), what
 
 
-def test_cars_of_a_world_in_which_they_do_not_meet_are_as_if_alone() -> None:
+def test_cars_that_do_not_meet_are_as_if_alone() -> None:
     world = World(starts={"red": HOME, "green": Pose(0.3, 0.0, 0.0)})
     red, green = (CarBody(world, world.start_pose(0, name), random.Random(1), name=name) for name in ("red", "green"))
     assert red.obstacle(0) == (False, False)
@@ -193,7 +193,7 @@ def test_two_that_meet_head_on_stand_against_each_other() -> None:
     assert 0.2 < red.x_m < 0.6
 
 
-def test_a_thing_that_moves_pushes_a_car_that_stands_but_through_no_wall() -> None:
+def test_moving_thing_pushes_standing_car_not_through_wall() -> None:
     cart = MovingObject("cart", radius_m=0.1, path=((-1.0, 0.0), (9.0, 0.0)), speed_m_s=0.2)
     world = World([(0.5, -1.0, 0.5, 1.0)], things=[cart])
     car = CarBody(world, HOME, random.Random(1), name="red")
@@ -202,7 +202,7 @@ def test_a_thing_that_moves_pushes_a_car_that_stands_but_through_no_wall() -> No
     assert car.pose(40.0).x_m <= 0.5 - RADIUS_M + HAIR_M
 
 
-def test_a_thing_goes_round_its_path_at_its_speed_and_from_where_it_is_if_that_changes() -> None:
+def test_thing_follows_path_at_its_speed() -> None:
     square = MovingObject("cart", radius_m=0.1, path=((0, 0), (1, 0), (1, 1), (0, 1)), speed_m_s=0.5)
     for at_s, x, y in ((0, 0, 0), (1, 0.5, 0), (3, 1, 0.5), (7, 0, 0.5), (8, 0, 0), (9, 0.5, 0)):
         assert square.pose(at_s)[:2] == pytest.approx((x, y))
@@ -214,7 +214,7 @@ def test_a_thing_goes_round_its_path_at_its_speed_and_from_where_it_is_if_that_c
     assert guide.waiting(1.0, near=False).waiting(5.0, near=True).pose(6.0)[:2] == pytest.approx((1, 0))
 
 
-def test_cars_that_meet_do_the_same_whoever_is_looked_at_first() -> None:
+def test_meeting_cars_are_independent_of_order() -> None:
     seen = []
     for order in itertools.permutations(("red", "green", "blue")):
         world = World.room()
@@ -267,7 +267,7 @@ def lively_worlds(draw: st.DrawFn) -> tuple[World, list[Pose]]:
 
 @settings(max_examples=60, deadline=None)
 @given(lively_worlds(), st.lists(st.tuples(st.floats(0.0, 0.7), st.integers(0, 2), powers, powers), max_size=20))
-def test_whatever_cars_and_things_do_nobody_is_in_a_wall_or_in_another(
+def test_nobody_is_inside_a_wall_or_another(
     scene: tuple[World, list[Pose]], drives: list[tuple[float, int, int, int]]
 ) -> None:
     world, starts = scene
@@ -305,7 +305,7 @@ def test_who_sees_is_seen(
     assert world.clear(a, b, now=now) == world.clear(b, a, now=now)
 
 
-async def test_a_car_that_lost_its_leader_finds_it_again_when_it_is_put_before_it() -> None:
+async def test_lost_follower_finds_leader_put_before_it() -> None:
     world = lit(Lamp(9.0, 9.0), thing=MovingObject("post", 2.0, 0.0, radius_m=0.1))
     car = await opened(world, 6)
     assert not car.truth.driving

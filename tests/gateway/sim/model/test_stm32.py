@@ -26,7 +26,7 @@ async def test_no_frame_delays_a_report(frame: bytes) -> None:
 
 
 @pytest.mark.parametrize("frame", [MODE00, *(opening(mode) for mode in range(1, 7))])
-async def test_a_mode_frame_turns_motors_and_led_off_at_once_and_blocks_nothing(frame: bytes) -> None:
+async def test_mode_frame_turns_motors_and_led_off_without_block(frame: bytes) -> None:
     car = stm32()
     await car.wait(0.3)
     await car.write(b"$2,0,0,0,0,0,2,0,0#")
@@ -67,7 +67,7 @@ async def test_a_general_frame_is_obeyed_in_every_mode_at_once(mode: int) -> Non
     assert (-51, -51) in [each[1:] for each in car.car.motor_log]
 
 
-async def test_the_loop_of_a_mode_drives_on_after_a_general_stop() -> None:
+async def test_mode_loop_drives_on_after_general_stop() -> None:
     car = stm32()
     await car.write(opening(2))
     await car.until(lambda truth: truth.driving)
@@ -76,7 +76,7 @@ async def test_the_loop_of_a_mode_drives_on_after_a_general_stop() -> None:
     await car.until(lambda truth: truth.driving, within=0.1)
 
 
-async def test_the_last_of_two_frames_counts_while_a_report_is_sent() -> None:
+async def test_last_of_two_frames_counts_during_report() -> None:
     car = stm32()
     await report_times(car, 1.5)
     for first, last, driving in [(RUN, STOP, False), (STOP, RUN, True)]:
@@ -124,7 +124,7 @@ async def drives_a_standing_car(offset_s: float) -> bool:
     return car.truth.driving
 
 
-async def test_a_half_received_mode_frame_over_a_stop_starts_a_standing_car() -> None:
+async def test_half_mode_frame_over_stop_starts_standing_car() -> None:
     # The stop is complete 40 ms before MODE00 begins. So the report must begin in between, and end in `$4W`.
     tries = [await drives_a_standing_car(offset / 2000) for offset in range(-10, 100)]
     assert 3 <= sum(tries) <= 5, "a window of two bytes, 2.1 ms"
@@ -145,7 +145,7 @@ async def test_nothing_starts_it_if_a_report_fits_between_two_frames() -> None:
 LIGHTS = [(1, "#ffffff"), (2, "#ff0000"), (3, "#0000ff"), (4, "#00ff00"), (5, "#00ff00"), (7, "#00ff00"), (8, "off")]
 
 
-async def test_lights_three_and_four_are_swapped_and_five_to_seven_unknown() -> None:
+async def test_lights_three_and_four_are_swapped() -> None:
     car = stm32()
     for digit, led in LIGHTS:
         await car.write(b"$0,0,0,0,0,0,%d,0,0#" % digit)

@@ -68,9 +68,7 @@ DELAYS = [
 
 @pytest.mark.parametrize(("frame", "delay_s"), DELAYS)
 @pytest.mark.parametrize("timer", [False, True])
-async def test_a_frame_that_blocks_delays_one_report_unless_a_timer_sends_it(
-    frame: bytes, delay_s: float, timer: bool
-) -> None:
+async def test_blocking_frame_delays_report_unless_timer(frame: bytes, delay_s: float, timer: bool) -> None:
     car = virtual(traits=CarTraits(interval_s=MEASURED_S, timer=timer))
     before = (await report_times(car, 3.0))[-1]
     await car.write(frame)
@@ -228,7 +226,7 @@ async def test_constants_in_place_of_four_readings() -> None:
     assert re.match(rb"\$4WD,CSB[0-9.]+,PV[0-9.]+,GS0,LF0000,HW00,GM00#", car.received)
 
 
-async def test_a_report_with_a_field_of_its_own_is_damage_and_no_reading() -> None:
+async def test_report_with_foreign_field_is_damage() -> None:
     car = virtual(traits=CarTraits(more="TP31.5"))
     await report_times(car, 3.0)
     events = Decoder().feed(bytes(car.received), car.now)

@@ -69,7 +69,7 @@ def test_a_negative_dead_man_is_none() -> None:
     assert host.car.moving
 
 
-def test_too_great_numbers_leave_the_old_speed_and_feed_the_dead_man() -> None:
+def test_too_great_numbers_keep_old_speed_and_feed_dead_man() -> None:
     host = Host("ugv_rover").send(FORWARD)
     for _ in range(10):
         host.send('{"T":1,"L":9,"R":9}\n').run(1.0)
@@ -87,7 +87,7 @@ def test_what_is_wrong_is_ignored_without_a_word(line: str) -> None:
     assert (host.car.moving, host.heard) == (False, b"")
 
 
-def test_a_partial_line_spoils_the_next_and_a_line_end_clears_it() -> None:
+def test_partial_line_spoils_next_and_line_end_clears_it() -> None:
     assert not Host("wave_rover").send('{"T":1,"L":0.', FORWARD).run(0.3).car.moving
     assert Host("wave_rover").send('{"T":1,"L":0.', "\n", FORWARD).run(0.3).car.moving
 
@@ -123,7 +123,7 @@ def test_volts_come_in_two_units() -> None:
     assert 900 < two < 1300
 
 
-def test_a_reset_forgets_the_chassis_on_one_firmware_and_drives_the_wrong_way() -> None:
+def test_reset_forgets_chassis_on_one_firmware() -> None:
     host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n')
     host.car.brown_out(host.now)
     host.run(UGV_BOOT_S + 0.5).send(FORWARD).run(0.5)
@@ -167,7 +167,7 @@ def test_http_runs_a_command_that_is_cut() -> None:
     assert not host.run(UGV_DEAD_MAN_S + 0.5).car.moving
 
 
-def test_a_search_for_wifi_keeps_commands_and_the_dead_man_waiting() -> None:
+def test_wifi_search_delays_commands_and_dead_man() -> None:
     host = Host("wave_rover").send(FORWARD)
     host.car.take_http('{"T":404}', host.now)
     host.run(UGV_DEAD_MAN_S).send('{"T":1,"L":0,"R":0}\n').run(WIFI_S - UGV_DEAD_MAN_S - 1.0)
@@ -175,14 +175,14 @@ def test_a_search_for_wifi_keeps_commands_and_the_dead_man_waiting() -> None:
     assert not host.run(1.5).car.moving
 
 
-def test_a_mission_without_an_end_keeps_the_dead_man_waiting_until_a_byte_comes() -> None:
+def test_endless_mission_delays_dead_man_until_a_byte() -> None:
     host = Host("wave_rover").send(FORWARD, '{"T":242,"name":"dance"}\n').run(20.0)
     assert host.car.moving
     assert not host.send("\n").run(0.5).car.moving, "the dead-man was due for long"
 
 
 @pytest.mark.parametrize("platform", ["ugv01", "ugv_rover"])
-def test_the_numbers_of_an_arm_stand_in_the_place_of_others(platform: str) -> None:
+def test_arm_numbers_replace_other_fields(platform: str) -> None:
     host, place = Host(platform, "arm").send('{"T":130}\n'), "y" if platform == "ugv01" else "ay"
     of_arm = host.feedback()[place]
     main = UGV_BUILDS[platform].main

@@ -70,7 +70,7 @@ def test_every_ranging_in_the_room_has_an_echo() -> None:
         assert body(world, x, y, where.uniform(0, 360)).range_cm(0, where.uniform(-90, 90)) is not None
 
 
-def test_no_echo_in_the_open_beyond_reach_or_at_a_grazing_angle() -> None:
+def test_no_echo_in_open_or_at_grazing_angle() -> None:
     assert body(World.open_field()).range_cm(0, 0) is None
     assert body(World([(5.2, -9.0, 5.2, 9.0)])).range_cm(0, 0) is None
     assert body(World([(4.5, -9.0, 4.5, 9.0)])).range_cm(0, 0) == pytest.approx(440)
@@ -119,7 +119,7 @@ def test_the_tape_is_brighter_or_darker_than_the_floor() -> None:
     assert body(world, pose.x_m, pose.y_m).grayscale(0) != body(world, 0.0, 0.6).grayscale(0)
 
 
-def test_any_number_of_cars_begins_on_the_line_apart_from_each_other() -> None:
+def test_any_number_of_cars_starts_apart_on_the_line() -> None:
     world = World.room()
     poses = [world.start_pose(index) for index in range(50)]
     assert all(world.on_line(pose.x_m, pose.y_m) for pose in poses)

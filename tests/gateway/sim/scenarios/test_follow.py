@@ -76,7 +76,7 @@ class Row:
 
 
 @pytest.mark.parametrize(("seed", "late_s"), [(1, 0.0), (2, 0.3), (3, 0.7)])
-def test_two_follow_a_leader_that_seeks_a_moving_lamp_for_a_minute(seed: int, late_s: float) -> None:
+def test_two_follow_leader_seeking_lamp_for_a_minute(seed: int, late_s: float) -> None:
     row = Row(spec().world(), seed=seed)
     began = row.places()
     row.go(late_s=late_s)
@@ -94,7 +94,7 @@ def test_two_follow_a_leader_that_seeks_a_moving_lamp_for_a_minute(seed: int, la
     assert min(way) > 1.8
 
 
-def test_without_its_light_the_leader_stands_and_with_it_the_row() -> None:
+def test_row_stands_without_light_of_leader() -> None:
     row = Row(spec().world())
     row.go()
     row.world.change_lamp("beacon", on=False)

@@ -77,7 +77,7 @@ def test_over_the_wire(hazard: Hazard, outcomes: dict[str, BaseException | None]
         raise failure
 
 
-async def test_without_echo_a_run_and_a_stop_60_ms_apart_lose_the_stop_about_every_second_time() -> None:
+async def test_run_and_stop_60_ms_apart_lose_stop_half_the_time() -> None:
     """The car loses the stop 6 times in 10 (docs/reference/protocol.md#hazards)."""
     moments = random.Random(5)
     lost = 0

@@ -66,7 +66,7 @@ async def test_a_stuck_pty_is_stuck_after_a_drop_too(cars: Simulation) -> None:
         await asyncio.to_thread(port.write, RUN)
 
 
-async def test_what_a_host_sends_to_a_stuck_tcp_car_arrives_when_it_is_over(cars: Simulation) -> None:
+async def test_bytes_to_stuck_tcp_car_arrive_later(cars: Simulation) -> None:
     reader, writer = await asyncio.open_connection(*address(cars))
     car = cars.cars["green"]
     await cars.inflict(Fault(FaultKind.STUCK, "green"))
@@ -163,7 +163,7 @@ async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
         assert car.lost_bytes["host"] == 0
 
 
-async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(cars: Simulation) -> None:
+async def test_cut_write_reaches_car_then_link_is_gone(cars: Simulation) -> None:
     """The car still has the half frame, and loses the stop after it (docs/reference/protocol.md#hazards)."""
     host, port = address(cars)
     reader, writer = await asyncio.open_connection(host, port)
@@ -196,7 +196,7 @@ async def _to_the_end(reader: asyncio.StreamReader) -> None:
         pass
 
 
-async def test_a_cut_on_a_pty_is_an_unplugged_cable_and_happens_once(cars: Simulation, tmp_path: Path) -> None:
+async def test_cut_on_pty_is_unplugged_cable_once(cars: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "red"
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.CUT_WRITE, "red", bytes=0))
@@ -235,7 +235,7 @@ async def test_a_path_goes_and_another_comes(cars: Simulation, tmp_path: Path) -
     assert not (tmp_path / "other").is_symlink()
 
 
-async def test_a_renamed_plain_pty_and_tcp_car_say_where_they_are(cars: Simulation) -> None:
+async def test_renamed_pty_and_tcp_car_tell_where_they_are(cars: Simulation) -> None:
     before = {name: cars.cars[name].url for name in ("plain", "green")}
     named: dict[str, str] = {}
     for name in before:
@@ -247,7 +247,7 @@ async def test_a_renamed_plain_pty_and_tcp_car_say_where_they_are(cars: Simulati
     open_port(cars, "plain").close()
 
 
-async def test_a_path_that_is_taken_or_nowhere_is_refused_and_the_car_stays(cars: Simulation, tmp_path: Path) -> None:
+async def test_taken_or_missing_path_is_refused(cars: Simulation, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("precious")
     for path, words in ((tmp_path / "file", "is there already"), (tmp_path / "no" / "x", "directory is not there")):
         with pytest.raises(EndpointError, match=words):
@@ -257,7 +257,7 @@ async def test_a_path_that_is_taken_or_nowhere_is_refused_and_the_car_stays(cars
     open_port(cars).close()
 
 
-async def test_a_path_that_is_taken_while_a_link_is_gone_is_told(cars: Simulation, tmp_path: Path) -> None:
+async def test_path_taken_during_outage_is_told(cars: Simulation, tmp_path: Path) -> None:
     told: list[str] = []
     cars.cars["red"].on_failed = lambda _, error: told.append(str(error))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red", for_s=0.2))

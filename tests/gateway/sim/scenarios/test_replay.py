@@ -88,7 +88,7 @@ def read(connection: socket.socket, count: int) -> list[tuple[float, bytes]]:
     return got
 
 
-def test_over_tcp_it_begins_with_the_host_and_keeps_the_times(start: Any, kept: Path) -> None:
+def test_tcp_capture_starts_with_host_and_keeps_times(start: Any, kept: Path) -> None:
     sim = start("--replay", f"{kept}:old:tcp")
     line = sim.line()
     assert (line["car"], line["replay"]) == ("old", str(kept))

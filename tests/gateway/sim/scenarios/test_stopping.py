@@ -189,7 +189,7 @@ async def test_a_stop_begun_at_many_random_moments(case: Case) -> None:
     await stops_begun_at_random_moments(case, 4 * MOMENTS)
 
 
-async def test_a_stop_and_mode00_every_1_1_s_keep_a_car_that_opens_a_mode_driving() -> None:
+async def test_stop_and_mode00_every_1_1_s_keep_opening_car_driving() -> None:
     """More frames are not better (docs/reference/protocol.md#stops).
 
     All frames become one string, in which each stop hides the mode digits.

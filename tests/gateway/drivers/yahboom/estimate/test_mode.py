@@ -67,7 +67,7 @@ def test_its_own_shape_confirms_a_mode(mode: Mode) -> None:
     assert (truth.evidence, truth.evidence_at) == (f"a reading as in mode {mode}", 3.0)
 
 
-def test_a_shape_of_two_modes_confirms_neither_and_speaks_against_neither() -> None:
+def test_ambiguous_shape_neither_confirms_nor_contradicts() -> None:
     for mode in (Mode.LIGHT_SEEKING, Mode.FOLLOWING):
         truth = asked(mode)
         for number in range(2 * CONTRADICTING_FRAMES):
@@ -111,7 +111,7 @@ def test_a_damaged_reading_of_another_mode_does_not_confirm() -> None:
     assert truth.verdict is CONFIRMED, "three running are not damaged"
 
 
-def test_readings_that_were_under_way_while_it_opens_do_not_count() -> None:
+def test_readings_under_way_during_mode_change_do_not_count() -> None:
     truth = asked(Mode.TRACKING)
     for number in range(20):
         truth.on_reading(reading(SHAPES[Mode.MANUAL], SETTLED_S[Mode.TRACKING] * number / 20))
@@ -150,7 +150,7 @@ def test_blocks_of_ours_explain_as_much_silence_as_they_last() -> None:
     assert truth.verdict is CONTRADICTED, "a block before the reading is over, and a motion is none"
 
 
-def test_a_frame_may_be_obeyed_after_the_reading_that_was_under_way() -> None:
+def test_frame_may_be_obeyed_after_reading_under_way() -> None:
     truth = asked(Mode.MANUAL)
     truth.on_written(0.65, now=9.2)
     truth.on_reading(reading(SHAPES[Mode.MANUAL], 10.0))
@@ -165,7 +165,7 @@ def test_no_frames_however_many_explain_a_silence_for_ever() -> None:
     assert truth.verdict is CONTRADICTED
 
 
-def test_a_fan_that_runs_silences_the_car_and_what_was_confirmed_fades() -> None:
+def test_fan_silences_car_and_confirmation_fades() -> None:
     truth = asked(Mode.MANUAL)
     truth.on_reading(reading(SHAPES[Mode.MANUAL], 10.0))
     truth.on_silence(now=13.0, fan=True)
@@ -179,7 +179,7 @@ def test_a_fan_that_runs_silences_the_car_and_what_was_confirmed_fades() -> None
     assert truth.verdict is CONTRADICTED
 
 
-def test_a_mode_without_its_own_readings_is_contradicted_as_by_silence() -> None:
+def test_mode_without_own_readings_is_contradicted_by_silence() -> None:
     """Mode 0 reports once a second, so three of its readings would take three times as long."""
     truth = asked(Mode.TRACKING)
     truth.on_reading(reading(SHAPES[Mode.TRACKING], 9.9))
@@ -192,7 +192,7 @@ def test_a_mode_without_its_own_readings_is_contradicted_as_by_silence() -> None
 
 
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING])
-def test_silence_shows_nothing_in_a_mode_in_which_the_car_has_never_reported(mode: Mode) -> None:
+def test_silence_in_never_reported_mode_shows_nothing(mode: Mode) -> None:
     truth = estimator()
     truth.on_mode_sent(mode, now=0.0, block_s=BLOCK_S)
     truth.on_silence(now=60.0, fan=False)
@@ -205,7 +205,7 @@ def test_silence_shows_nothing_in_a_mode_in_which_the_car_has_never_reported(mod
 
 
 @pytest.mark.parametrize(("interval_s", "limit_s"), [(0.3, 3.0), (1.25, 3.0), (1.5, 3.25), (3.0, 4.75)])
-def test_the_silence_that_contradicts_mode_0_is_that_of_the_car(interval_s: float, limit_s: float) -> None:
+def test_silence_that_contradicts_mode_0_is_learned(interval_s: float, limit_s: float) -> None:
     truth = estimator()
     truth.learned.echo.intervals.clear()
     truth.learned.add_interval(interval_s, echo=True)
@@ -225,7 +225,7 @@ def test_silence_never_confirms(mode: Mode) -> None:
     assert truth.verdict is ASSUMED
 
 
-def test_two_stray_readings_in_a_silent_mode_are_forgotten_after_silence() -> None:
+def test_stray_readings_in_silent_mode_are_forgotten() -> None:
     truth = asked(Mode.COLOR_LED)
     for at in (10.0, 11.0, 20.0, 21.0):
         truth.on_reading(reading(SHAPES[Mode.MANUAL], at))
@@ -247,9 +247,7 @@ def test_asked_again_for_manual_a_confirmed_car_stays_confirmed() -> None:
 @pytest.mark.parametrize(
     ("before", "latest_s"), [(Mode.OBSTACLE_AVOIDANCE, 5.3), (Mode.COLOR_LED, 1.75), (Mode.TRACKING, 1.1), (None, 5.3)]
 )
-def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_over(
-    before: Mode | None, latest_s: float
-) -> None:
+def test_new_mode_counts_after_old_turn_and_block(before: Mode | None, latest_s: float) -> None:
     truth = estimator()
     if before is not None:
         truth.on_mode_sent(before, now=0.0, block_s=BLOCK_S)
@@ -260,7 +258,7 @@ def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_ov
 
 
 @pytest.mark.parametrize(("platform", "fits"), [("raspberry_pi", ()), ("unknown", SILENT)])
-def test_silence_of_a_car_that_knows_no_silent_mode_is_none_of_its_modes(platform: str, fits: tuple[Mode, ...]) -> None:
+def test_silence_of_car_without_silent_modes_is_no_mode(platform: str, fits: tuple[Mode, ...]) -> None:
     truth = estimator(platform)
     truth.on_mode_sent(Mode.MANUAL, now=0.0, block_s=0.0)
     truth.on_reading(reading(b"$4WD,CSB57,PV8.4,GS0,LF1011,HW01,GM10#", 5.0))

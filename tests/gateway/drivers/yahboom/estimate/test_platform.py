@@ -55,7 +55,7 @@ def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
         assert truth.profile.name == name, "what was told is kept"
 
 
-def test_a_contradiction_is_told_when_it_first_stands_and_ends_when_three_readings_do_not_show_it() -> None:
+def test_contradiction_is_told_at_start_and_end() -> None:
     truth = PlatformDetector(parse_platform("stm32"))
     assert not hear(truth, PI, PI)
     assert hear(truth, PI) == list(truth.contradictions) != []
@@ -118,7 +118,7 @@ def test_auto_takes_another_head_from_three_readings() -> None:
 
 
 @pytest.mark.parametrize("auto", [False, True])
-def test_damaged_frames_do_not_change_the_head_with_which_a_car_was_read(*, auto: bool) -> None:
+def test_damaged_frames_do_not_change_head(*, auto: bool) -> None:
     """A link that loses every second frame's `4` made the gateway send `$WD,MODE00#`, which no car knows."""
     truth = PlatformDetector(parse_platform("unknown" if auto else "arduino"), auto=auto)
     for count in range(1, OTHER_PROGRAM_FRAMES):
@@ -137,7 +137,7 @@ def test_the_bytes_know_the_head_better_than_an_option() -> None:
     assert truth.profile.name == "unknown+head=BALA"
 
 
-def test_another_head_than_the_named_one_is_taken_and_said_once() -> None:
+def test_unexpected_head_is_taken_and_told_once() -> None:
     truth = PlatformDetector(parse_platform("arduino+arm+head=CART"))
     (words,) = hear_raw(truth, *["BALA"] * 9)
     assert "arduino+arm+head=BALA" in words
@@ -159,7 +159,7 @@ def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
 
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
-def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platform: str, world: str) -> None:
+def test_simulated_cars_are_detected_without_contradiction(platform: str, world: str) -> None:
     for mode in Mode:
         car = build(platform, WORLDS[world](), 0, random.Random(3), options=frozenset({"arm"}))
         told = PlatformDetector(parse_platform(f"{platform}+arm"))

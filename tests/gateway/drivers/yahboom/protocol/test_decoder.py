@@ -60,7 +60,7 @@ def test_arm_and_gyro_frames_of_the_table(row: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("row", BAD, ids=ids(BAD))
-def test_bad_input_is_counted_by_cause_and_the_next_good_frame_decodes(row: dict[str, str]) -> None:
+def test_bad_frames_are_counted_by_cause_and_next_decodes(row: dict[str, str]) -> None:
     bad = wire(row["bytes"])
     *rejected, good = Decoder().feed(bad + GOOD, 1.0)
     assert [event.cause for event in rejected if isinstance(event, Rejected)] == row["causes"].split()
@@ -76,7 +76,7 @@ def test_every_cause_has_a_test() -> None:
     assert seen | {Cause.OVERLONG, Cause.OUT_OF_RANGE} == set(Cause)
 
 
-def test_a_missing_end_is_accepted_when_the_next_byte_starts_a_frame() -> None:
+def test_missing_frame_end_is_accepted_at_next_frame() -> None:
     first, second = Decoder().feed(FOLLOWING + GOOD, 1.0)
     assert isinstance(first, Sensors)
     assert (first.raw, first.terminated, first.by_silence) == (FOLLOWING, False, False)
@@ -84,7 +84,7 @@ def test_a_missing_end_is_accepted_when_the_next_byte_starts_a_frame() -> None:
     assert second.terminated
 
 
-def test_a_missing_end_is_accepted_after_50_ms_of_silence_and_not_before() -> None:
+def test_missing_frame_end_is_accepted_after_50_ms_silence() -> None:
     decoder = Decoder()
     assert decoder.feed(FOLLOWING, 1.0) == []
     assert decoder.deadline() == pytest.approx(1.05)
@@ -255,7 +255,7 @@ class TestEnd:
         assert (event.cause, event.raw) == (Cause.TRUNCATED, GOOD[:-5])
         assert decoder.end() == []
 
-    def test_a_whole_one_without_its_end_counts_as_ended_by_silence(self) -> None:
+    def test_whole_frame_without_end_counts_after_silence(self) -> None:
         decoder = Decoder()
         decoder.feed(FOLLOWING, 1.0)
         (event,) = decoder.end()
@@ -297,11 +297,11 @@ NO_TEXT = [
 
 
 @pytest.mark.parametrize("junk", NO_TEXT)
-def test_a_piece_of_a_frame_or_of_a_line_is_no_text(junk: bytes) -> None:
+def test_piece_of_frame_or_line_is_no_text(junk: bytes) -> None:
     assert kinds(Decoder().feed(junk + GOOD, 1.0)) == [("no_start", junk.rstrip()), ("sensors", GOOD)]
 
 
-def test_text_between_damage_is_one_event_and_each_run_of_damage_another() -> None:
+def test_text_and_damage_runs_are_separate_events() -> None:
     events = Decoder().feed(b"\xff\r\n\xfe\r\nEXEC:F\r\n\r\n12\r\nEX" + GOOD, 1.0)
     expected = [("no_start", b"\xff\r\n\xfe"), ("text", b"EXEC:F\r\n"), ("no_start", b"12\r\nEX"), ("sensors", GOOD)]
     assert kinds(events) == expected
@@ -321,7 +321,7 @@ def test_the_rest_of_a_line_is_no_line() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 7, 100])
-def test_a_line_after_a_frame_is_whole_whatever_came_before_the_frame(size: int) -> None:
+def test_line_after_frame_is_whole(size: int) -> None:
     decoder = Decoder()
     decoder.feed(b"\xff\xfe", 1.0)
     rest, events = GOOD + b"EXEC:F\r\n", []
@@ -354,5 +354,5 @@ def test_a_recorded_line_of_text_decodes_again() -> None:
         (b"$4WD,MODE00#", None),
     ],
 )
-def test_the_head_of_a_sensors_frame_is_known_from_its_bytes(raw: bytes, head: str | None) -> None:
+def test_head_of_sensors_frame_is_read_from_its_bytes(raw: bytes, head: str | None) -> None:
     assert head_of(raw) == head

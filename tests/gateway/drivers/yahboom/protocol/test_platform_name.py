@@ -17,7 +17,7 @@ def test_a_platform_that_is_none_says_which_there_are() -> None:
         parse_option("uno")
 
 
-def test_options_are_in_any_case_and_the_head_keeps_its_own() -> None:
+def test_platform_options_ignore_case_except_head() -> None:
     assert parse_name("STM32+Fan_Level+3S+HEAD=BaLa") == ("stm32", {"fan_level", "3s", "head=BaLa"})
     assert parse_option("Auto+Text+Head=4WD")[0] == "unknown+text+head=4WD"
 
@@ -33,7 +33,7 @@ def test_a_car_has_one_head() -> None:
         parse_name("arduino+head=AB+head=CD")
 
 
-def test_an_option_without_its_value_and_one_with_a_value_are_unknown() -> None:
+def test_option_value_missing_or_surplus_is_unknown() -> None:
     for name in ("arduino+head", "arduino+text=1"):
         with pytest.raises(ValueError, match="Unknown option") as error:
             parse_name(name)

@@ -162,7 +162,7 @@ def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, obse
         ("+arm", 'Unknown platform "". There are'),
     ],
 )
-def test_a_platform_that_is_none_is_refused_with_the_words_allowed(text: str, words: str) -> None:
+def test_unknown_platform_is_refused_with_choices(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         parse_platform(text)
 
@@ -181,7 +181,7 @@ def test_options_say_in_what_a_car_differs() -> None:
     assert parse_platform(other.name) == other
 
 
-def test_a_car_without_readings_measures_nothing_and_is_silent_in_every_mode() -> None:
+def test_car_without_readings_measures_nothing_and_is_silent() -> None:
     profile = parse_platform("arduino+no_readings+arm")
     assert all(profile.measurable(mode) == set() for mode in Mode)
     assert profile.silent_modes == profile.modes
@@ -210,13 +210,13 @@ def test_a_field_that_no_car_has_is_rejected_once() -> None:
     assert parse_platform("arduino").rejects(event) == event.rejects
 
 
-def test_constants_of_an_stm32_car_are_no_measurements_if_all_are_there() -> None:
+def test_stm32_constants_are_no_measurements() -> None:
     profile = parse_platform("stm32")
     assert profile.measured(sensors(b"$4WD,CSB57.24,PV7.91,GS0,LF0000,HW00,GM00#", "#")) == {"range", "battery"}
     assert profile.measured(sensors(b"$4WD,CSB57.24,PV7.91,GS0,LF0000,HW00,GM01#", "#")) == EVERY_MEASUREMENT
 
 
-def test_no_frame_blocks_an_stm32_car_and_its_modes_are_silent() -> None:
+def test_no_frame_blocks_stm32_and_its_modes_are_silent() -> None:
     profile = parse_platform("stm32")
     frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
     assert {profile.block_s(frame) for frame in frames if frame} == {FRAME_S}

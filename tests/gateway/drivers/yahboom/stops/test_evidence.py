@@ -129,7 +129,7 @@ def test_two_pauses_show_a_stop_and_one_does_not(interval_s: float) -> None:
     assert PAUSES == 2
 
 
-def test_three_pauses_are_needed_if_one_is_longer_than_the_block() -> None:
+def test_three_pauses_are_needed_if_one_exceeds_block() -> None:
     """A link that delays a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like pauses."""
     watch = EvidenceWatch()
     assert watch.pause(10.0, 1.4) is PAUSE
@@ -138,7 +138,7 @@ def test_three_pauses_are_needed_if_one_is_longer_than_the_block() -> None:
     assert watch.evidence.words == "3 pauses in its reports, each after MODE00"
 
 
-def test_a_pause_with_another_block_in_it_may_be_longer_by_that() -> None:
+def test_pause_with_second_block_may_be_longer() -> None:
     watch = EvidenceWatch()
     watch.reports(10.0)
     watch.evidence.blocked(Blocking.WHISTLE, 0.3, 10.1)
@@ -177,21 +177,21 @@ def test_delays_of_a_stop_before_show_no_other_stop() -> None:
     assert SETTLING not in unlike(watch, 40.0, 0.6)
 
 
-def test_a_delay_that_is_longer_than_the_time_since_mode_00_is_not_its_own() -> None:
+def test_delay_longer_than_time_since_mode_00_is_not_its_own() -> None:
     watch = EvidenceWatch()
     found = [each for number in range(4) for each in unlike(watch, 10.0 + 6 * number, 0.6, closed_s=INTERVAL_S + 0.4)]
     assert SETTLING not in found
     assert watch.learned.blocks == {}
 
 
-def test_pauses_of_a_stop_before_do_not_count_after_a_motion() -> None:
+def test_pauses_before_a_motion_do_not_count() -> None:
     watch = EvidenceWatch()
     assert watch.pause(40.0) is PAUSE
     watch.evidence.sent_motion()
     assert watch.pause(43.5) is PAUSE, "the car may have moved since the first one"
 
 
-def test_a_lost_report_is_told_from_a_pause_by_its_length() -> None:
+def test_lost_report_differs_from_pause_by_length() -> None:
     """The link loses `MODE00` and the report after it, three times: 2.50 s, where a pause is 2.25 s."""
     watch = EvidenceWatch()
     for number in range(3):
@@ -200,7 +200,7 @@ def test_a_lost_report_is_told_from_a_pause_by_its_length() -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.5, 1.0, 1.02])
-def test_where_it_cannot_be_told_a_frame_that_does_not_block_is_the_control(interval_s: float) -> None:
+def test_non_blocking_frame_is_control_where_ambiguous(interval_s: float) -> None:
     """A half-duplex link loses the report after each of our frames, and the car hears none of them."""
     watch, at = EvidenceWatch(known(interval_s)), 10.0
     watch.reports(at)
@@ -225,7 +225,7 @@ def test_where_it_cannot_be_told_a_frame_that_does_not_block_is_the_control(inte
     st.integers(0, 40),
     st.lists(st.tuples(st.integers(0, 29), st.floats(0.05, 0.95)), max_size=12),
 )
-def test_a_car_that_hears_nothing_shows_nothing_also_where_one_report_is_lost(
+def test_deaf_car_shows_nothing_even_with_lost_report(
     interval_s: float, spreads: list[float], lost: int, closings: list[tuple[int, float]]
 ) -> None:
     """The gateway writes `MODE00` at any times, and the car keeps reporting."""
@@ -252,7 +252,7 @@ def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.3, 0.9, 1.25, 2.2])
-def test_a_report_that_follows_the_last_pause_too_early_was_held_by_the_link(interval_s: float) -> None:
+def test_report_too_early_after_last_pause_was_held_by_link(interval_s: float) -> None:
     """The link holds a report for a second. The next one comes an interval after it was due."""
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
@@ -298,7 +298,7 @@ def test_a_loop_that_slept_has_perhaps_taken_reports_late() -> None:
     assert watch.reports(15.75) == [REPORT]
 
 
-def test_from_the_second_try_on_a_slow_link_has_more_time() -> None:
+def test_slow_link_has_more_time_from_second_try() -> None:
     watch = EvidenceWatch()
     watch.reports(9.5)
     watch.evidence.tried_again()
@@ -360,7 +360,7 @@ def test_a_car_that_never_reacts_cannot_show_a_stop() -> None:
     assert watch.learned.shows is Shows.NO
 
 
-def test_a_car_that_has_shown_a_stop_does_not_become_one_that_cannot() -> None:
+def test_car_that_showed_stop_stays_able_to_show() -> None:
     watch = EvidenceWatch()
     for number in range(3 * UNREACTED):
         assert watch.pause(10.0 + 5 * number, 0.0) is LOST
@@ -426,9 +426,7 @@ LEFT_S = ARDUINO.reopened_s + WIRE_S
     ],
 )
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
-def test_a_mode_0_report_soon_after_mode00_shows_that_a_mode_was_left(
-    mode: Mode, frame: bytes, after_s: float, *, shown: bool
-) -> None:
+def test_mode_0_report_after_mode00_shows_left_mode(mode: Mode, frame: bytes, after_s: float, *, shown: bool) -> None:
     watch = tracking(10.0) if mode is Mode.TRACKING else silent()
     watch.closed(10.0)
     assert (watch.reports(10.0 + after_s, frame=frame)[-1] is SHOWN) == shown
@@ -438,7 +436,7 @@ def test_a_mode_0_report_soon_after_mode00_shows_that_a_mode_was_left(
 
 
 @pytest.mark.parametrize("shows", [Shows.UNKNOWN, Shows.NO])
-def test_only_a_car_that_was_seen_to_block_shows_it_by_one_report(shows: Shows) -> None:
+def test_only_blocking_car_shows_left_mode_by_one_report(shows: Shows) -> None:
     """A car that reports by a timer does so in the middle of a block, with the motors on."""
     watch = tracking(10.0, known(shows=shows))
     watch.closed(10.0)
@@ -457,7 +455,7 @@ def test_a_general_stop_after_mode00_leaves_the_report_unjudged() -> None:
     [(0.01, [PAUSE, SETTLING]), (LATE_S - 0.01, [PAUSE, SETTLING]), (LATE_S + 0.01, [REPORT, PAUSE])],
 )
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
-def test_such_a_report_on_a_slow_link_counts_as_a_pause(mode: Mode, late_s: float, found: list[Finding]) -> None:
+def test_single_report_on_slow_link_counts_as_pause(mode: Mode, late_s: float, found: list[Finding]) -> None:
     watch = tracking(10.0) if mode is Mode.TRACKING else silent()
     watch.closed(10.0)
     at = 10.0 + LEFT_S + late_s
@@ -478,7 +476,7 @@ def test_it_shows_nothing_if_mode00_was_not_the_first_frame(mode: Mode, first: s
     assert watch.reports(11.95)[-1] is not SHOWN
 
 
-def test_the_shape_of_the_mode_long_after_mode00_shows_the_opposite() -> None:
+def test_mode_shape_long_after_mode00_shows_the_opposite() -> None:
     watch = tracking(10.0)
     watch.closed(10.0)
     for number in range(30):
@@ -494,14 +492,14 @@ def test_one_damaged_reading_is_no_mode_that_was_seen() -> None:
     assert watch.reports(11.95)[-1] is not SHOWN
 
 
-def test_a_silent_mode_that_was_opened_from_a_rest_that_nothing_had_shown() -> None:
+def test_silent_mode_opened_from_unshown_rest() -> None:
     watch = silent(shown=False)
     watch.closed(10.0)
     assert watch.reports(11.95)[-1] is not SHOWN
 
 
 @given(st.floats(0.0, 4.0))
-def test_older_reports_of_a_slow_link_do_not_show_that_a_silent_mode_was_left(delay_s: float) -> None:
+def test_old_reports_of_slow_link_do_not_show_left_mode(delay_s: float) -> None:
     """The car sent these reports once a second before its mode opened at 5.0. They come until `delay_s` later."""
     watch = silent()
     closed_at = 5.0 + delay_s - 1.0
@@ -595,7 +593,7 @@ def test_a_soft_stop_shows_nothing() -> None:
     assert pair.control.driver.model.rest_case is cases.SOFT
 
 
-def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
+def test_frame_at_shown_rest_leaves_it_sent() -> None:
     """The row `acted`."""
     pair = Pair(start_s=2.0).ready()
     pair.until(lambda: pair.control.driver.model.basis == Basis.SHOWN, 9.0)

@@ -58,7 +58,7 @@ def can_show(seen: Seen) -> bool:
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_stop_at_any_moment_stops_for_good_within_the_announced_time(case: StopTestCase) -> None:
+def test_stop_at_any_moment_ends_within_announced_time(case: StopTestCase) -> None:
     for seed in range(MOMENTS):
         seen = play(case, seed)
         judge(seen)
@@ -72,7 +72,7 @@ def test_a_stop_on_a_link_that_was_just_restored(case: StopTestCase) -> None:
         judge(play(case, seed))
 
 
-def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> None:
+def test_avoidance_without_echo_is_deaf_with_braked_motors() -> None:
     for seed in range(MOMENTS):
         pair = Pair(seed=seed, world=World.open_field(), start_s=2.0).ready()
         inside(AVOIDANCE)(pair, random.Random(seed))
@@ -84,7 +84,7 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
         assert pair.control.driver.model.motors == "unknown", "it is not heard"
 
 
-def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
+def test_recovery_of_car_that_wakes_for_one_millisecond() -> None:
     """The car has half a frame, and its ranging ends when only the `$` of recovery's `MODE00` has come.
 
     The `$` goes with the string of the half frame, and `4WD,MODE00#` stays. The car knows it neither as a MODE frame
@@ -209,7 +209,7 @@ FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence
 )
 
 
-def test_the_choice_of_a_stop_over_the_whole_product_of_its_inputs() -> None:
+def test_stop_case_over_whole_input_product() -> None:
     everything = situations()
     assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2 * 2
     for situation in everything:
@@ -239,7 +239,7 @@ def test_every_recipe_ends_alone_in_the_buffer() -> None:
             assert last.after_s >= REPEAT_INTERVAL_S - 1e-9 or last.gate is Gate.ALONE, recipe
 
 
-def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
+def test_announced_time_is_never_less_than_waited() -> None:
     for each in situations():
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
             pacing = Pacing(each.profile, Learned())
