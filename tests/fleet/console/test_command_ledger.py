@@ -49,7 +49,7 @@ def test_the_panel_has_the_doctors_lines() -> None:
     shown = view.diagnose(5.0)  # its gateway has said nothing for 4 s
     hangs, *others = shown["findings"]
     assert (hangs.rpartition("Type: ")[2], others) == ("fleet logs red", [lost])
-    facts = dict(shown["facts"])
+    facts = {name: words for name, words, _ in shown["facts"]}
     assert facts["link"].startswith("lost (4 s old) for 4 s, 0 frames in")
     assert facts["refused"] == "stop of mia 3 s ago: rejected [link_down]"
     assert "services" not in facts
