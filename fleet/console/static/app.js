@@ -238,7 +238,7 @@ function Connection() {
         ? ["⚠", "old", t.connection.old(t.ago(store.silent_s))]
         : !state.hub
           ? ["⚠", "bus", t.connection.bus]
-          : ["●", "live", t.connection.live];
+          : ["●", "live", store.past === null ? t.connection.live : t.connection.past];
   return html`<span class=${`connection ${kind === "live" ? "" : "bad"}`} data-connection=${kind}><span aria-hidden="true">${symbol}</span> ${words}</span>`;
 }
 

@@ -61,7 +61,7 @@ const Doctor = ({ doctor }) => html`<section data-doctor>
   <ul class="plain findings">
     ${doctor.findings.length === 0
       ? html`<li>${doctor.facts.some(([, , isDoubtful]) => isDoubtful) ? `? ${t.onlyDoubts}` : `✓ ${t.nothingOdd}`}</li>`
-      : doctor.findings.map((words) => html`<li key=${words}>⚠ ${words}</li>`)}
+      : doctor.findings.map((words) => html`<li key=${words}>⚠ ${t.inTerminal(words)}</li>`)}
   </ul>
   <h3>${t.facts}</h3>
   <dl class="wide">${doctor.facts.map(([name, words, isDoubtful]) => html`<div class="row" key=${name}><dt>${name}</dt>

@@ -114,11 +114,13 @@ export const t = {
   refusedWhy: (why) => `The console refuses this page: ${why}.`,
   connection: {
     live: "live",
+    past: "connected", // what is shown is not of now
     old: (ago) => `${ago} old`,
     bus: "bus lost",
     none: "not connected",
     unpaired: "not paired",
   },
+  inTerminal: (words) => words.replace("Type: ", "In a terminal on the computer of the console, type: "),
   hubLost: "The console has lost the bus. What the cards show is old, and a STOP may not arrive: look at the cars.",
   unrecorded: (why) => `Nothing is recorded: ${why}`,
   stopUnsent: "STOP has not reached the console. Go to the cars, or type `fleet stop` in a terminal.",
