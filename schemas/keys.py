@@ -17,6 +17,8 @@ BY: Final = "@by"
 """Part of a command's key before the identity that the rules of the hub have checked."""
 HUB_RULES: Final = "@hub/rules"
 """Where the first hub of several sites answers with the rules for the others."""
+HUB_RENEWAL: Final = "@hub/@renew"
+"""`@hub/@renew/<identity>` is where the first hub answers that identity with its next certificate."""
 REPLAY: Final = "@replay"
 """`<fleet>/@replay/<session>` is the token of a fleet that is a replay."""
 
@@ -98,6 +100,11 @@ def identity_of(key: str) -> str:
 def car_token(fleet: str, car: str) -> str:
     """Return the liveliness token of a car's gateway."""
     return f"{fleet}/{car}"
+
+
+def renewal_key(identity: str) -> str:
+    """Return where an identity asks for its next certificate. The rules of the hub let nobody else ask there."""
+    return f"{HUB_RENEWAL}/{identity}"
 
 
 def operator_token(fleet: str, sender: str) -> str:

@@ -100,7 +100,7 @@ class FoxgloveServer:
     def close(self) -> None:
         """End the connections of all clients."""
         for subscriber in self._subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+            subscriber.undeclare()
         self._server.stop()
 
     def _log(self, sample: Sample) -> None:

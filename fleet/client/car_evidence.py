@@ -102,7 +102,7 @@ def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]
 
     subscriber = client.bus.subscribe(keys.topic_key(client.name, "*", "state/*"), on_state)
     complete.wait(_CLOCK_LISTEN_S)
-    subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+    subscriber.undeclare()
     with lock:
         found = {car: each.off_s for car, each in clocks.items()}
     return {car: off_s for car, off_s in found.items() if off_s is not None and abs(off_s) > MAX_CLOCK_OFF_S}

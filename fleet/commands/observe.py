@@ -353,7 +353,7 @@ def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[KeyInfo
 
         def end() -> None:
             for subscriber in subscribers:
-                subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+                subscriber.undeclare()
 
         return end
 

@@ -11,18 +11,15 @@ from datetime import datetime, timedelta
 from typing import Any, Final
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from fleet.hub.x509_parts import LIFETIME, builder, common_name, end_entity, key_usage, new_key, pem, private_pem
+from fleet.hub.x509_parts import builder, common_name, end_entity, key_usage, new_key, pem, private_pem
+from schemas.bus.certificate_dates import CertificateDates
 
 CA_LIFETIME: Final = timedelta(days=3650)
-RENEWAL_BEFORE: Final = LIFETIME / 3
-"""Time before its end from which a certificate is renewed."""
-
-
 _SERVER: Final = ExtendedKeyUsageOID.SERVER_AUTH
 
 
@@ -87,19 +84,51 @@ def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str]
     return KeyPair(_signed(authority, key.public_key(), name, now, (usage,), names), private_pem(key))
 
 
+def renew(authority: KeyPair, certificate: bytes, request: bytes, name: str, now: datetime) -> bytes:
+    """Return the next certificate for the key of this one, which is in force and due. Raises BadRequestForCertificate.
+
+    The request proves that whoever asks has the key. The names of a hub of another site stay.
+    """
+    ca = x509.load_pem_x509_certificate(authority.certificate)
+    try:
+        old = x509.load_pem_x509_certificate(certificate)
+        old.verify_directly_issued_by(ca)
+        asked = x509.load_pem_x509_csr(request)
+    except (ValueError, TypeError, InvalidSignature):
+        raise BadRequestForCertificate("there is no certificate of this authority, or no request") from None
+    if old.subject != common_name(name):
+        raise BadRequestForCertificate(f"the certificate is not that of {name}")
+    if asked.public_key() != old.public_key():
+        raise BadRequestForCertificate("the request is not for the key of the certificate")
+    if not old.not_valid_before_utc <= now < old.not_valid_after_utc:
+        raise BadRequestForCertificate("the certificate is not in force")
+    if not is_due(certificate, now):
+        raise BadRequestForCertificate("the certificate is renewed in the last third of its life, not before")
+    return sign_request(authority, request, name, now, sorted(_names(old)))
+
+
 def is_due(certificate: bytes, now: datetime, addresses: Iterable[str] = ()) -> bool:
     """Return True if a certificate must be renewed: it ends soon, lacks an address, or is none."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
     except ValueError:
         return True
+    dates = CertificateDates(found.not_valid_before_utc, found.not_valid_after_utc)
+    return dates.is_due(now) or not {*addresses} <= _names(found)
+
+
+def _names(certificate: x509.Certificate) -> set[str]:
+    """Return the IP addresses and host names of a certificate."""
     try:
-        listed = {
-            str(each.value) for each in found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        }
+        listed = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
-        listed = set()
-    return now >= found.not_valid_after_utc - RENEWAL_BEFORE or not {*addresses} <= listed
+        return set()
+    return {str(each.value) for each in listed}
+
+
+def names_of(certificate: bytes) -> list[str]:
+    """Return the IP addresses and host names of a certificate. Raises ValueError if it is none."""
+    return sorted(_names(x509.load_pem_x509_certificate(certificate)))
 
 
 def expires(certificate: bytes) -> datetime:

@@ -177,6 +177,29 @@ class HubStore:
             self._save()
         return certificate
 
+    def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
+        """Return the next certificate of an identity, PEM, for the key that it has. See `authority.renew`.
+
+        Raises BadRequestForCertificate, also if the identity is revoked, and OSError.
+        """
+        with self._changing():
+            entry = self.known.get(identity)
+            if entry is None or entry.revoked:
+                raise BadRequestForCertificate(f"{identity} is revoked, or was never invited")
+            made = authority.renew(self._authority(), certificate, request, entry.common_name(identity), now)
+            entry.until = _until(now)
+            self._save()
+        return made
+
+    def renew_hub(self, now: datetime) -> bool:
+        """Make the next certificate of the hub itself if it is due. Return False if it is not. Raises OSError."""
+        certificate = self._read(HUB)
+        if not authority.is_due(certificate, now):
+            return False
+        with self._changing():
+            self._write_pair(HUB, authority.issue(self._authority(), HUB, now, authority.names_of(certificate)))
+        return True
+
     def revoke(self, identity: str) -> bool:
         """Deny everything to an identity. Return False if it has no certificate. Raises OSError."""
         with self._changing():

@@ -7,6 +7,7 @@ that, an identity speaks only as itself:
 - A service publishes and answers under its own keys, such as `@recorder/**`. The simulator also publishes the true
   state of its cars.
 - A locator publishes where the cars are (`sensor/pose`), and nothing else of them.
+- It asks for its next certificate under a key with its identity.
 - A command has the identity of its sender in its key: `fleet/red/@cmd/@by/person.mia/drive`. Only `person.mia` may send
   under it. What Mia may do is decided by the gateway, from `people:` of the fleet file, as on a hub without rules. So a
   change of `people:` needs no other rules.
@@ -41,6 +42,8 @@ _COMMANDS: Final = (
     *(each for name in _SERVICES for each in (f"*/{name}/@cmd/**", f"*/{name}/@cmd/@by/**")),
 )
 """The keys of all commands. Everyone may see who answers them, and that somebody drives; sending is another matter."""
+_OF_HUBS: Final = (*_PUBLIC, *_COMMANDS, keys.HUB_RULES, keys.renewal_key("*"))
+"""What hubs of sites tell one another."""
 _OWN_SERVICE: Final = {
     Service.SUPERVISOR: keys.SUPERVISOR,
     Service.COORDINATOR: keys.COORDINATOR,
@@ -56,11 +59,11 @@ def access_control(names: Iterable[tuple[str, str]], *, of_site: bool = False) -
     rules, so all of it is allowed to another hub.
     """
     rules = [
-        _rule("passes on", "ingress", _READS + _TELLS, (*_PUBLIC, *_COMMANDS, keys.HUB_RULES)),
-        _rule("gets", "egress", _READS + _TELLS, (*_PUBLIC, *_COMMANDS, keys.HUB_RULES)),
+        _rule("passes on", "ingress", _READS + _TELLS, _OF_HUBS),
+        _rule("gets", "egress", _READS + _TELLS, _OF_HUBS),
         _rule("read", "ingress", _READS, _PUBLIC),
         _rule("see drives", "ingress", ("declare_subscriber",), _COMMANDS),
-        _rule("answers", "egress", _TELLS, (*_PUBLIC, *_COMMANDS)),
+        _rule("answers", "egress", _TELLS, (*_PUBLIC, *_COMMANDS, keys.renewal_key("*"))),
     ]
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -95,6 +98,7 @@ def _speaks(identity: str) -> list[dict[str, Any]]:
     return [
         _rule(f"{identity} commands", "ingress", ("query", "put"), (f"*/*/@cmd/@by/{identity}/*", *services)),
         _rule(f"{identity} is there", "ingress", ("liveliness_token",), (tokens,)),
+        _rule(f"{identity} renews", "ingress", ("query",), (keys.renewal_key(identity),)),
     ]
 
 

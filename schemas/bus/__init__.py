@@ -6,6 +6,7 @@ Read `session` first: `Bus` is one Zenoh session. `endpoint` finds or starts the
 """
 
 from schemas.bus.credentials import Credentials, NoCredentials
+from schemas.bus.declared import Declared, SampleChannel
 from schemas.bus.endpoint import (
     ENDPOINT_VARIABLE,
     accepts,
@@ -48,6 +49,7 @@ __all__ = [
     "Bus",
     "BusError",
     "Credentials",
+    "Declared",
     "Failure",
     "Handover",
     "HubKeeper",
@@ -56,6 +58,7 @@ __all__ = [
     "NoFleet",
     "Publisher",
     "Sample",
+    "SampleChannel",
     "Singleton",
     "accepts",
     "canon",

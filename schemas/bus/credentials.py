@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from schemas.atomic_file import write_atomically
+from schemas.bus.certificate_dates import CertificateDates
 from schemas.bus.errors import BusError
 from schemas.identity import AS_THE_USER, IdentityRole
 from schemas.state_dir import directory_of
@@ -90,17 +91,19 @@ class Credentials:
             )
         raise NoCredentials(f"{words}.")
 
+    def dates(self, identity: str) -> CertificateDates | None:
+        """Return when the certificate of an identity begins and ends; None if there is none."""
+        try:
+            return CertificateDates.of((self.directory / f"{identity}.pem").read_bytes())
+        except OSError:
+            return None
+
     def why_invalid(self, identity: str, now: datetime) -> str:
         """Return why a hub refuses the certificate of an identity here: it has ended, or not begun. Else empty."""
-        try:
-            from cryptography import x509
-
-            found = x509.load_pem_x509_certificate((self.directory / f"{identity}.pem").read_bytes())
-        except (ImportError, OSError, ValueError):
+        dates = self.dates(identity)
+        if dates is None or dates.begins <= now < dates.ends:
             return ""
-        begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
-        if begins <= now < ends:
-            return ""
+        begins, ends = dates.begins, dates.ends
         if now < begins:
             return f"The certificate of {identity} begins on {begins:%Y-%m-%d}: is the clock of this computer right?"
         return (

@@ -18,6 +18,7 @@ from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
 from schemas.bus.credentials import HUB, HUB_FILE, OF_SITES
+from schemas.bus.hub_renewals import HubRenewals
 from schemas.identity import IdentityRole
 from schemas.process import signals
 
@@ -40,7 +41,7 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
     links: _Links | None = None
     while not stop.is_set():
         rules = _rules_changed_at(endpoint)
-        with zenoh.open(router_config(endpoint)) as session:
+        with zenoh.open(router_config(endpoint)) as session, contextlib.closing(HubRenewals(endpoint, session)):
             asked = -RULES_POLL_S
             _answer_sites(endpoint, session)
             while not stop.wait(_POLL_S) and _rules_changed_at(endpoint) == rules:

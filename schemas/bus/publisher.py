@@ -26,21 +26,32 @@ class Publisher:
     """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
-        self._publisher = ext.declare_advanced_publisher(
-            session,
-            key,
-            encoding=zenoh.Encoding(topic.encoding),
-            cache=ext.CacheConfig(topic.cache_size),
-            # Sequence numbers only: heartbeats and a token per publisher would double the load of a hub with 100 cars.
-            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-            **ZENOH_QOS[topic.qos],
-        )
+        self.key = key
+        self.topic = topic
+        self._publisher = self._next = self._declared_in(session)
         self._source = source
         self._boot_id = boot_id
         self._headed = topic.message.startswith("fleet.v1.")
-        self.key = key
-        self.topic = topic
         self.sequence = 0
+
+    def _declared_in(self, session: zenoh.Session) -> Any:
+        return ext.declare_advanced_publisher(
+            session,
+            self.key,
+            encoding=zenoh.Encoding(self.topic.encoding),
+            cache=ext.CacheConfig(self.topic.cache_size),
+            # Sequence numbers only: heartbeats and a token per publisher would double the load of a hub with 100 cars.
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            **ZENOH_QOS[self.topic.qos],
+        )
+
+    def prepare(self, session: zenoh.Session) -> None:
+        """Get ready to publish in another session, as soon as others in it know of the publisher."""
+        self._next = self._declared_in(session)
+
+    def move(self) -> None:
+        """Publish in that session from now on. The cache begins anew there, and Zenoh's number; `seq` goes on."""
+        self._publisher = self._next
 
     def put(self, message: Any, stamp_ns: int) -> bytes:
         """Publish a message and return its payload. stamp_ns: time of its measurement, ns since the epoch."""

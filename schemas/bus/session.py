@@ -1,26 +1,29 @@
 """The only place that opens a Zenoh session: publications, subscriptions, queries and liveliness tokens."""
 
 import atexit
+import itertools
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self
 
 import zenoh
 
+from schemas.bus.certificate_keeper import RENEWAL_QUERY_TIMEOUT_S, CertificateKeeper
 from schemas.bus.credentials import Credentials
+from schemas.bus.declared import Declare, Declared, SampleChannel
 from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_secure, resolve_endpoint
 from schemas.bus.errors import BusError, NoFleet
+from schemas.bus.overlap import Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, unread
+from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
-
-T = TypeVar("T")
 
 # On a busy machine, existing tokens arrive late. A token that disappears at this moment never arrives.
 _TOKEN_HISTORY_TIMEOUT_S: Final = 2.0
@@ -30,6 +33,16 @@ _THREAD_END_TIMEOUT_S: Final = 2.0
 """Timeout for the end of a callback when the session is closed."""
 _DECLARE_LOCK: Final = threading.Lock()
 
+OVERLAP_S: Final = 0.5
+"""Time in which everything comes over both sessions, until also the hubs of other sites know the second one; and once
+more for what is still on its way over the first one."""
+ANSWERS_S: Final = 12.0
+"""Time for which the first session stays open for answers on their way. No query waits for longer than 10 s."""
+REOPEN_TIMEOUT_S: Final = 5.0
+TOKENS_OF_NOBODY: Final = "*/@hub"
+"""Everyone may ask for these tokens, and there are none: the answer only says that the hub has read what came before.
+"""
+
 _MAX_QUEUED_ANSWERS: Final = 1 << 16
 """Maximum number of queued answers of one query. Beyond it, the link stalls and Zenoh drops answers on the way."""
 
@@ -38,10 +51,18 @@ class Bus:
     """One Zenoh session. Close it (`with`). The interpreter closes open ones when it exits, with a ResourceWarning."""
 
     def __init__(self, session: zenoh.Session, endpoint: str, identity: str = "") -> None:
-        self._session = session
+        self._session = self._declaring = session
         self.identity = identity
         """Whose certificate this session has, such as `person.mia`. Empty on a bus without certificates."""
-        self._declarations: list[Any] = []
+        self._declarations: list[Declared] = []
+        self._publishers: list[Publisher] = []
+        self._declared = itertools.count()
+        self._number = 0
+        """Number of the session: each is followed by another one (`reopen`)."""
+        self._overlap: Overlap | None = None
+        """What has come over one of two sessions, while there are two."""
+        self._changing = threading.Lock()
+        """Held while something is declared, and while all of it is declared again."""
         self._lock = threading.Lock()
         self._threads: set[threading.Thread] = set()
         """Threads of Zenoh that run our callbacks."""
@@ -50,6 +71,8 @@ class Bus:
         self.endpoint = endpoint
         self.boot_id = os.urandom(16).hex()
         self._pid = os.getpid()
+        self._closing = threading.Event()
+        self._keeper: CertificateKeeper | None = None
         atexit.register(self._close_at_exit)
 
     @classmethod
@@ -68,7 +91,7 @@ class Bus:
             # A hub that waits for TLS takes the probe of `accepts` for a failed handshake, and takes no link for 0.1 s
             # then. So first try as if there is one.
             with signals.held_back(), suppress(zenoh.ZError):
-                return cls(zenoh.open(client_config(where, 0.0, identity)), where, identity)
+                return cls(zenoh.open(client_config(where, 0.0, identity)), where, identity)._with_keeper()
         else:
             identity = ""
         if start_hub:
@@ -89,7 +112,24 @@ class Bus:
                 raise BusError(
                     f"{where} does not answer, or is no Zenoh router{may_be}. Name the fleet's address with --connect."
                 ) from error
-            return cls(session, where, identity)
+            return cls(session, where, identity)._with_keeper()
+
+    def _with_keeper(self) -> Self:
+        """Renew the certificate from now on, if the session has one."""
+        if self.identity:
+            own, me = Credentials.of(self.endpoint), self.identity
+            keeper = CertificateKeeper(own, me, ask=self._ask_hub, reopen=self.reopen, closing=self._closing)
+            self._keeper = keeper
+            keeper.start()
+        return self
+
+    def _ask_hub(self, request: bytes) -> bytes:
+        """Return the hub's answer to a request for the next certificate; empty if there is none, or it refuses."""
+        key = renewal_key(self.identity)
+        for answer in self.query(key, payload=request, timeout_s=RENEWAL_QUERY_TIMEOUT_S):
+            if isinstance(answer, Sample):
+                return answer.payload
+        return b""
 
     def __enter__(self) -> Self:
         return self
@@ -101,6 +141,9 @@ class Bus:
         """Undeclare everything and close the session."""
         with signals.held_back():
             atexit.unregister(self._close_at_exit)
+            self._closing.set()
+            if self._keeper is not None and self._keeper is not threading.current_thread():
+                self._keeper.join(REOPEN_TIMEOUT_S)
             self._declarations.clear()
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
             # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
@@ -113,19 +156,32 @@ class Bus:
             warnings.warn(words, ResourceWarning, stacklevel=1)
             self.close()
 
-    def _declare(self, declare: Callable[[], T]) -> T:
+    def _declare(self, declare: Declare) -> Declared:
         """Declare something with a callback, and keep it."""
+        declared = Declared(declare)
+        self._keep(declared, self._on_a_daemon)
+        return declared
+
+    def _keep(self, declared: Declared, declare: Callable[[Declared], None]) -> None:
+        with self._changing:
+            self._declarations = [each for each in self._declarations if not each.is_over]
+            declare(declared)
+            self._declarations.append(declared)
+
+    def _on_this_thread(self, declared: Declared) -> None:
+        declared.add(self._declaring, self._number)
+
+    def _on_a_daemon(self, declared: Declared) -> None:
         # Zenoh starts a Python thread for each callback. The interpreter joins such a thread when it exits, before it
         # runs any exit handler: unless the thread is a daemon, which it is if the declaring thread is one.
         # A Future would import logging: 4 ms of a gateway's start.
-        declared: list[T] = []
         errors: list[BaseException] = []
 
         def run() -> None:
             with _DECLARE_LOCK:
                 before = _zenoh_threads()
                 try:
-                    declared.append(declare())
+                    self._on_this_thread(declared)
                 except BaseException as error:  # noqa: BLE001 - raised again after the join
                     errors.append(error)
                 self._threads |= _zenoh_threads() - before
@@ -137,8 +193,67 @@ class Bus:
             thread.join()
             if errors:
                 raise errors[0]
-            self._declarations += declared
-        return declared[0]
+
+    def _is_twin(self, number: int, mark: Callable[[], Hashable]) -> bool:
+        """Return True if this came over another session, too, and was handled. number: of the session it came over."""
+        overlap, is_newest = self._overlap, number == self._number
+        if overlap is None:
+            return not is_newest
+        return overlap.is_twin(mark(), newer=is_newest)
+
+    def reopen(self, overlap_s: float = OVERLAP_S, answers_s: float = ANSWERS_S) -> None:
+        """Go on in a second session, which has the certificate that is in the file now, and close the first one.
+
+        Nothing is lost, and nothing comes twice: tokens last, and what comes over both is handled once. It blocks for
+        the overlap, and for answers on their way; `close` ends that. Raises BusError: the first session goes on then.
+        """
+        first = self._session
+        try:
+            second = zenoh.open(client_config(self.endpoint, REOPEN_TIMEOUT_S, self.identity))
+        except zenoh.ZError as error:
+            raise BusError(f"{self.endpoint} takes no second session of {self.identity}: {error}") from error
+        try:
+            self._declare_again(second)
+            # Declaring does not wait for the hub. Its answer comes after it has passed everything on.
+            for _ in second.liveliness().get(TOKENS_OF_NOBODY, timeout=REOPEN_TIMEOUT_S):
+                pass
+        except zenoh.ZError as error:
+            self._undo(first)
+            second.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+            raise BusError(f"the second session at {self.endpoint} failed: {error}") from error
+        self._closing.wait(overlap_s)
+        with self._changing:
+            for publisher in self._publishers:
+                publisher.move()
+            self._session = second
+            assert self._overlap is not None
+            self._overlap.older_is_deaf = True
+        self._closing.wait(overlap_s)
+        with self._changing:
+            for declared in self._declarations:
+                declared.keep_newest()
+            self._overlap = None
+        self._closing.wait(answers_s)
+        first.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+
+    def _declare_again(self, second: zenoh.Session) -> None:
+        with self._changing:
+            self._declaring = second
+            self._number += 1
+            self._overlap = Overlap()
+            for declared in self._declarations:
+                if not declared.is_over:
+                    self._on_a_daemon(declared)
+            for publisher in self._publishers:
+                publisher.prepare(second)
+
+    def _undo(self, first: zenoh.Session) -> None:
+        with self._changing:
+            self._declaring = first
+            self._number -= 1
+            self._overlap = None
+            for declared in self._declarations:
+                declared.keep_oldest()
 
     @property
     def id(self) -> str:
@@ -152,7 +267,10 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, source: str) -> Publisher:
         """Declare a publisher of `topic` under `key`. source: the `car` of its messages."""
-        return Publisher(self._session, key, topic, source, self.boot_id)
+        with self._changing:
+            made = Publisher(self._declaring, key, topic, source, self.boot_id)
+            self._publishers.append(made)
+        return made
 
     def subscribe(
         self,
@@ -161,25 +279,34 @@ class Bus:
         *,
         largest: int | None = None,
         admits: Callable[[str], bool] | None = None,
-    ) -> zenoh.Subscriber[None]:
+    ) -> Declared:
         """Subscribe. The callback runs on a Zenoh thread: it must hand over and return.
 
         largest: maximum size of a payload in bytes (see `Sample.unread`). admits: asked with the key of each message
         before anything else of it is read. What it refuses is dropped.
         """
+        declaration = next(self._declared)
 
-        def on_sample(sample: zenoh.Sample) -> None:
-            if admits is None or admits(str(sample.key_expr)):
-                callback(sample_of(sample, largest))
+        def declare(session: zenoh.Session, number: int) -> Any:
+            def on_sample(sample: zenoh.Sample) -> None:
+                if admits is not None and not admits(str(sample.key_expr)):
+                    return
+                if not self._is_twin(number, lambda: mark_of_sample(declaration, sample)):
+                    callback(sample_of(sample, largest))
 
-        return self._declare(lambda: self._session.declare_subscriber(expression, on_sample))
+            return session.declare_subscriber(expression, on_sample)
 
-    def subscribe_channel(self, expression: str, capacity: int) -> zenoh.Subscriber[Any]:
+        return self._declare(declare)
+
+    def subscribe_channel(self, expression: str, capacity: int) -> SampleChannel:
         """Subscribe with a channel for `try_recv`. Read it often: a full channel stalls the whole session."""
         # Per message, it costs half as much as a callback. The recorder, which reads everything, needs that.
-        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.FifoChannel(capacity))
-        self._declarations.append(subscriber)
-        return subscriber
+        channel = SampleChannel(
+            lambda session, _: session.declare_subscriber(expression, zenoh.handlers.FifoChannel(capacity)),
+            next(self._declared),
+        )
+        self._keep(channel, self._on_this_thread)
+        return channel
 
     def queryable(
         self,
@@ -187,26 +314,33 @@ class Bus:
         callback: Callable[[zenoh.Query], object],
         *,
         too_large: Callable[[zenoh.Query, str], object] | None = None,
-    ) -> zenoh.Queryable[None]:
+    ) -> Declared:
         """Declare a queryable. The callback runs on a Zenoh thread: it must hand over and return.
 
         If it returns False, the query is answered with BUSY. A query with a part that is too large is passed to
         `too_large` with the reason, or rejected.
         """
+        declaration = next(self._declared)
 
-        def on_query(query: zenoh.Query) -> None:
-            words = unread(query)
-            if words and too_large is None:
-                refuse(query, words)
-            elif (too_large(query, words) if words and too_large is not None else callback(query)) is False:
-                refuse(query, BUSY)
+        def declare(session: zenoh.Session, number: int) -> Any:
+            def on_query(query: zenoh.Query) -> None:
+                words = unread(query)
+                if self._is_twin(number, lambda: mark_of_query(declaration, query)):
+                    with query:  # the other one is answered
+                        return
+                if words and too_large is None:
+                    refuse(query, words)
+                elif (too_large(query, words) if words and too_large is not None else callback(query)) is False:
+                    refuse(query, BUSY)
 
-        return self._declare(lambda: self._session.declare_queryable(expression, on_query, complete=True))
+            return session.declare_queryable(expression, on_query, complete=True)
 
-    def token(self, key: str) -> zenoh.LivelinessToken:
-        """Declare a liveliness token. It lasts until it is undeclared or the session ends."""
-        token = self._session.liveliness().declare_token(key)
-        self._declarations.append(token)
+        return self._declare(declare)
+
+    def token(self, key: str) -> Declared:
+        """Declare a liveliness token. It lasts until it is undeclared or the bus is closed."""
+        token = Declared(lambda session, _: session.liveliness().declare_token(key))
+        self._keep(token, self._on_this_thread)
         return token
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
@@ -227,16 +361,23 @@ class Bus:
         alive: set[str] = set()
         complete = threading.Event()
 
-        def on_token(sample: zenoh.Sample) -> None:
-            key, came = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-            with self._lock:
-                (alive.add if came else alive.discard)(key)
-                awaited.discard(key)
-            callback(key, came)
-            if not awaited:
-                complete.set()
+        def declare(session: zenoh.Session, number: int) -> Any:
+            def on_token(sample: zenoh.Sample) -> None:
+                key, came = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+                with self._lock:
+                    if number != self._number and self._overlap is None:
+                        return
+                    is_twin = self._overlap is not None and (key in alive) is came  # both sessions see it
+                    (alive.add if came else alive.discard)(key)
+                    awaited.discard(key)
+                if not is_twin:
+                    callback(key, came)
+                if not awaited:
+                    complete.set()
 
-        self._declare(lambda: self._session.liveliness().declare_subscriber(expression, on_token, history=True))
+            return session.liveliness().declare_subscriber(expression, on_token, history=True)
+
+        self._declare(declare)
         if awaited:
             complete.wait(_TOKEN_HISTORY_TIMEOUT_S)
         with self._lock:

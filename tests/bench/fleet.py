@@ -115,7 +115,7 @@ class _Fleet:
         # Wait until all stops are over: a stop that joins another one writes nothing. A car may show its stop late.
         wait_for(lambda: all(outcome.ok for outcome in client.stop()), "all cars stand", 60.0)
         wait_for(lambda: len(wires) == self.size, "a stop is on every wire", 30.0)
-        subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        subscriber.undeclare()
         return [(at - asked) / 1e6 for at in wires.values()]
 
 

@@ -46,7 +46,7 @@ def many(stage: ConsoleStage) -> Iterator[ConsoleStage]:
     tokens = [stage.fleet.bus.token(keys.car_token("fleet", name)) for name in names]
     yield stage
     for token in tokens:
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
     stage.console.process.kill()
     stage.console.process.wait()
     stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)  # this one has not known them
@@ -167,7 +167,7 @@ def test_no_tile_moves_when_cars_come(stage: ConsoleStage) -> None:
         assert chips == [f"select-{car}" for car in (*sorted(CARS), "aaa", "middle")]
     finally:
         for token in tokens:
-            token.undeclare()  # type: ignore[no-untyped-call]
+            token.undeclare()
         stage.console.process.kill()
         stage.console.process.wait()
         stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)  # this one has not known them

@@ -95,7 +95,7 @@ def test_tokens_come_and_go(endpoint: str) -> None:
 def test_ctrl_c_does_not_interrupt_a_declaration(endpoint: str) -> None:
     declared: list[bool] = []
 
-    def declare() -> None:
+    def declare(*_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)
         threading.Event().wait(0.2)  # the main thread handles the signal meanwhile
         declared.append(True)

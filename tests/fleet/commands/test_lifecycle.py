@@ -37,7 +37,7 @@ def test_unmeasured_number_is_unknown_and_wrong_type_raises(monkeypatch: pytest.
             token = theirs.token(TOKEN)
             wait_for(lambda: ours.tokens(TOKEN), "the token")
             down.thread.join(3 * lifecycle.FLEET_DOWN_POLL_S)  # the command also queries the token
-            token.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+            token.undeclare()
             down.thread.join(1.0)
             assert down.thread.is_alive()
         ended = pb.Supervision(state="ended")

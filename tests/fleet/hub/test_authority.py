@@ -3,15 +3,18 @@
 import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleet.hub import authority
 from fleet.hub.authority import BadRequestForCertificate
 from fleet.hub.x509_parts import LIFETIME
+from schemas.bus.certificate_dates import CertificateDates
 
 NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
 
@@ -69,8 +72,8 @@ def test_a_request_with_another_ones_signature_is_refused(ca: authority.KeyPair)
     ("after", "names", "is_due"),
     [
         (timedelta(0), ["127.0.0.1"], False),
-        (LIFETIME - authority.RENEWAL_BEFORE - timedelta(days=1), ["127.0.0.1"], False),
-        (LIFETIME - authority.RENEWAL_BEFORE + timedelta(days=1), ["127.0.0.1"], True),
+        (LIFETIME * 2 / 3 - timedelta(days=1), ["127.0.0.1"], False),
+        (LIFETIME * 2 / 3 + timedelta(days=1), ["127.0.0.1"], True),
         (timedelta(0), ["127.0.0.1", "192.0.2.7"], True),
         (timedelta(0), [], False),
     ],
@@ -85,3 +88,48 @@ def test_false_hub_beside_right_authority_gets_nothing(
 def test_none_and_a_damaged_one_are_due() -> None:
     assert authority.is_due(b"", NOW)
     assert authority.is_due(b"junk", NOW)
+
+
+def request_for(key: bytes) -> bytes:
+    """Return a request for a certificate of this key."""
+    private: Any = serialization.load_pem_private_key(key, None)
+    made = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(private, hashes.SHA256())
+    return made.public_bytes(serialization.Encoding.PEM)
+
+
+DUE = LIFETIME * 0.9
+
+
+@pytest.mark.parametrize("names", [[], ["127.0.0.1", "north.local"]])
+def test_the_next_certificate_has_the_same_key_and_names(ca: authority.KeyPair, names: list[str]) -> None:
+    key, request = authority.new_request("x")
+    old = authority.KeyPair(authority.sign_request(ca, request, "person.mia", NOW, names), key)
+    made = authority.renew(ca, old.certificate, request_for(old.key), "person.mia", NOW + DUE)
+    assert authority.belong(made, old.key)
+    assert authority.names_of(made) == names
+    assert authority.expires(made) == authority.expires(old.certificate) + DUE
+    assert not authority.is_due(made, NOW + DUE)
+
+
+@pytest.mark.parametrize("wrong", ["name", "key", "authority", "early", "late", "junk", "no request"])
+def test_no_next_certificate_for(ca: authority.KeyPair, wrong: str) -> None:
+    mine = authority.issue(ca, "person.mia", NOW)
+    other = authority.issue(authority.make_authority(NOW), "person.mia", NOW)
+    held = other if wrong == "authority" else mine
+    after = {"early": LIFETIME / 2, "late": LIFETIME + timedelta(seconds=1)}.get(wrong, DUE)
+    request = {"key": authority.new_request("person.mia")[1], "no request": b""}.get(wrong, request_for(held.key))
+    certificate = b"junk" if wrong == "junk" else held.certificate
+    with pytest.raises(BadRequestForCertificate):
+        authority.renew(ca, certificate, request, "person.eve" if wrong == "name" else "person.mia", NOW + after)
+
+
+def test_the_dates_are_read_as_the_library_reads_them(ca: authority.KeyPair) -> None:
+    for made in (ca.certificate, authority.issue(ca, "hub", NOW, ["127.0.0.1"]).certificate):
+        read = x509.load_pem_x509_certificate(made)
+        assert CertificateDates.of(made) == CertificateDates(read.not_valid_before_utc, read.not_valid_after_utc)
+    late = authority.issue(ca, "person.mia", datetime(2060, 1, 1, tzinfo=UTC)).certificate
+    dates = CertificateDates.of(late)
+    assert dates is not None
+    assert dates.ends == authority.expires(late), "GeneralizedTime"
+    for junk in (b"", b"junk", b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----"):
+        assert CertificateDates.of(junk) is None

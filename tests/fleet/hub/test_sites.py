@@ -2,17 +2,20 @@
 
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 import zenoh
 
+from fleet.hub import authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, join
 from fleet.hub.local_hub import ensure_hub_here, store_joined
 from schemas import identity, keys
-from schemas.bus import Bus, BusError, hub
+from schemas.bus import Bus, BusError, Credentials, hub, hub_renewals
+from schemas.bus.credentials import HUB
 from schemas.bus.hub import serve
 from tests.support.ports import free_port
 from tests.support.processes import wait_for
@@ -152,3 +155,35 @@ def test_unreachable_plan_with_fleet_file_is_refused_with_all_faults(sites: Site
 
 def test_a_site_invites_nobody(sites: Sites) -> None:
     assert not HubStore.of(sites.second).is_hub
+
+
+def test_the_hub_and_the_people_of_the_other_site_are_renewed_by_the_first_one(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hub_renewals, "OWN_CHECK_INTERVAL_S", 0.2)
+    there = Credentials.of(sites.second)
+    ca = authority.KeyPair(*((sites.store.directory / name).read_bytes() for name in ("ca.pem", "ca.key")))
+    now = datetime.now(UTC)
+    for file, name, names in ((HUB, NORTH, ["127.0.0.1", "localhost"]), (EVE, EVE, [])):
+        key, request = authority.new_request(name)
+        made = authority.sign_request(ca, request, name, now - timedelta(days=300), names)
+        (there.directory / f"{file}.key").write_bytes(key)
+        (there.directory / f"{file}.pem").write_bytes(made)
+    sites.start(sites.first)
+    sites.start(sites.second)
+
+    def is_renewed(file: str) -> bool:
+        dates = there.dates(file)
+        return dates is not None and not dates.is_due(now)
+
+    with Bus.open(sites.second, identity=EVE):
+        wait_for(lambda: is_renewed(HUB), "that of the hub")
+    made = (there.directory / f"{HUB}.pem").read_bytes()
+    assert authority.names_of(made) == ["127.0.0.1", "localhost"]
+
+    def eves() -> bool:
+        with suppress(BusError), Bus.open(sites.second, identity=EVE):
+            return is_renewed(EVE)
+        return False
+
+    wait_for(eves, "that of eve, through both hubs")

@@ -1,0 +1,109 @@
+"""Keeps the certificate of a session in force: asks for the next one in time, and lets the session go on with it.
+
+Each program has one for its session, so the next certificate also comes to a computer on which only commands run. If
+another program of the same identity was first, its certificate is taken from the file.
+"""
+
+import sys
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from schemas.bus.certificate_dates import CertificateDates
+from schemas.bus.credentials import Credentials
+from schemas.bus.errors import BusError
+
+CHECK_INTERVAL: Final = timedelta(minutes=10)
+"""Interval at which a program looks at its certificate, and asks again for the next one."""
+SHORTEST_CHECK_INTERVAL: Final = timedelta(seconds=1)
+SHARE_OF_A_CHECK: Final = 0.1
+"""The same as a share of the time that a certificate has left, if that is shorter."""
+WARNED_SHARE: Final = 0.1
+"""Share of a certificate's life before its end in which a program says that nobody renews it."""
+RENEWAL_QUERY_TIMEOUT_S: Final = 10.0
+"""Timeout of a request to the hub, which starts a process to sign the certificate."""
+REOPEN_DELAY_S: Final = 5.0
+"""Time until a session goes on with the next certificate. Most commands have ended by then: no need for them."""
+
+
+class CertificateKeeper(threading.Thread):
+    """A thread beside one session. It ends when `closing` is set."""
+
+    def __init__(
+        self,
+        credentials: Credentials,
+        identity: str,
+        *,
+        ask: Callable[[bytes], bytes],
+        reopen: Callable[[], object],
+        closing: threading.Event,
+        clock: Callable[[], datetime] = lambda: datetime.now(UTC),
+    ) -> None:
+        """Begin with the certificate that is in the file now. ask, reopen: of the session."""
+        super().__init__(name="bus-certificate", daemon=True)
+        self._credentials = credentials
+        self._identity = identity
+        self._ask = ask
+        self._reopen = reopen
+        self._closing = closing
+        self._clock = clock
+        self._used = credentials.dates(identity)
+        self._has_warned = False
+
+    def run(self) -> None:
+        """Look at the certificate until the session is closed."""
+        wait_s = 0.0
+        while not self._closing.wait(wait_s):
+            wait_s = self.check()
+
+    def check(self) -> float:
+        """Do what there is to do now. Return the time until the next check, s."""
+        now = self._clock()
+        found = self._credentials.dates(self._identity)
+        if found is None or self._used is None:
+            return CHECK_INTERVAL.total_seconds()
+        if found.ends > self._used.ends:
+            try:
+                self._reopen()
+                self._used = found
+            except BusError:
+                return REOPEN_DELAY_S
+        elif found.is_due(now):
+            why = self._renew(now)
+            if not why:
+                return min(REOPEN_DELAY_S, (found.ends - now).total_seconds() * SHARE_OF_A_CHECK)
+            self._warn(found, now, why)
+        left = (found.ends - now) * SHARE_OF_A_CHECK
+        return max(SHORTEST_CHECK_INTERVAL, min(CHECK_INTERVAL, left)).total_seconds()
+
+    def _renew(self, now: datetime) -> str:
+        """Store the next certificate. Return why there is none; empty if it is stored."""
+        return renew_file(self._credentials, self._identity, self._identity, now, lambda _, request: self._ask(request))
+
+    def _warn(self, found: CertificateDates, now: datetime, why: str) -> None:
+        if not self._has_warned and found.ends - now < (found.ends - found.begins) * WARNED_SHARE:
+            self._has_warned = True
+            sys.stderr.write(
+                f"The certificate of {self._identity} ends on {found.ends:%Y-%m-%d}, and the hub has not renewed it: "
+                f"{why}. After that it cannot even stop a car. `fleet hub invite` there and `fleet join` here renew "
+                "it, too.\n"
+            )
+
+
+def renew_file(
+    credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[str, bytes], bytes]
+) -> str:
+    """Store the next certificate of an identity. Return why there is none; empty if it is stored.
+
+    identity: empty: as the certificate names it. file: of the certificate. ask: asks the hub for an identity.
+    """
+    try:
+        from schemas.bus import renewal  # cryptography takes a while to load
+
+        name = identity or renewal.identity_in(credentials.directory / f"{file}.pem")
+        return renewal.renew(credentials, name, file, now, lambda request: ask(name, request))
+    except ImportError:
+        return "the package cryptography is missing here: pip install 'zenoh-car-fleet[secure]'"
+    except (OSError, ValueError) as error:
+        return f"it cannot be read or stored: {error}"

@@ -1,0 +1,56 @@
+"""Asks the hub for the next certificate of an identity, with the key that it has: the key never leaves its computer.
+
+The library of cryptography takes a while to load, so programs import this module when a certificate is due.
+"""
+
+import json
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.x509.oid import NameOID
+
+from schemas.atomic_file import write_atomically
+from schemas.bus.certificate_dates import CertificateDates
+from schemas.bus.credentials import Credentials
+
+CERTIFICATE: Final = "certificate"
+REQUEST: Final = "request"
+
+
+def identity_in(path: Path) -> str:
+    """Return the identity of a certificate, without the number of a later invitation. Raises OSError, ValueError."""
+    name = x509.load_pem_x509_certificate(path.read_bytes()).subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0]
+    return ".".join(str(name.value).split(".")[:2])
+
+
+def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[bytes], bytes]) -> str:
+    """Store the next certificate of an identity. Return why there is none; empty if it is stored. Raises OSError.
+
+    file: name of the certificate's file. ask: sends a request to the hub, and returns the answer; empty if there is
+    none.
+    """
+    path = credentials.directory / f"{file}.pem"
+    try:
+        key: Any = serialization.load_pem_private_key((credentials.directory / f"{file}.key").read_bytes(), None)
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity)])
+        request = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
+        old = path.read_text(encoding="ascii")
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        return f"the key of {identity} is damaged: {error}"
+    asked = {CERTIFICATE: old, REQUEST: request.public_bytes(serialization.Encoding.PEM).decode()}
+    answer = ask(json.dumps(asked).encode())
+    dates = CertificateDates.of(answer)
+    if dates is None or dates.is_due(now):
+        return "the hub gives no certificate"
+    try:
+        if x509.load_pem_x509_certificate(answer).public_key() != key.public_key():
+            return "the certificate of the hub is for another key"
+    except ValueError:
+        return "the hub gives no certificate"
+    write_atomically(path, answer, sync=True, private=True)
+    return ""
