@@ -3,13 +3,13 @@
 import json
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.client.client import default_sender
+from fleet.client.client import certified_sender, default_sender
 from fleet.client.services import ask_recorder, why_unrecorded
 from fleet.commands.fleets import the_fleet
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
@@ -26,6 +26,7 @@ from schemas.words import RecorderState, RecorderVerb
 
 if TYPE_CHECKING:
     from fleet.fleetfile.fleet_file import PinRule
+    from schemas.authority import People
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -170,7 +171,8 @@ def run(
     signals.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True, identity=service(Service.RECORDER)) as bus:
-            recorder = Recorder(bus, fleet, place, options, pins=_pins(fleet_file), notify=_warn)
+            pins, people = _of_file(fleet_file)
+            recorder = Recorder(bus, fleet, place, options, pins=pins, people=people, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
                 _say(
@@ -223,17 +225,25 @@ def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FB
     click.echo(json.dumps(values) if as_json else words)
 
 
-def _pins(fleet_file: Path | None) -> "tuple[PinRule, ...]":
-    """Return what a fleet file pins. Recording goes on without the pins of a file with mistakes."""
-    from fleet.fleetfile.fleet_file import read_fleet
+def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[], People | None]]":
+    """Return what a fleet file pins, and what reads its people, as they are then.
+
+    Recording goes on without the pins of a file with mistakes.
+    """
+    from fleet.fleetfile.fleet_file import people_table, read_fleet, read_people
 
     if fleet_file is None:
-        return ()
+        return (), lambda: None
+
+    def people() -> "People | None":
+        listed = read_people(fleet_file)
+        return None if listed is None else people_table(listed)
+
     try:
-        return read_fleet(fleet_file, unbound=True, moved=True).pins
+        return read_fleet(fleet_file, unbound=True, moved=True).pins, people
     except ValueError as error:  # a BadFile
         _warn(f"nothing of pin: in {fleet_file} is pinned: {error}")
-        return ()
+        return (), people
 
 
 def _warn(words: str) -> None:
@@ -252,6 +262,7 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
+        fields["sender"] = certified_sender(bus.identity, person=chosen_person())
         answer = ask_recorder(bus, fleet, verb, **fields)
         if isinstance(answer, Failure):
             raise click.ClickException(f"the recorder says: {answer.words}")

@@ -23,8 +23,7 @@ def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
 def management_refusal(cars: Mapping[str, Authority], sender: str) -> str:
     """Return why this person may not start and stop the recorder and plans. Empty if allowed.
 
-    Both are of the whole fleet. The coordinator decides about the plan by the same rule. The recorder refuses nobody,
-    so the console holds its own pages to the rule.
+    Both are of the whole fleet. The coordinator and the recorder decide by the same rule; a page shows it beforehand.
     """
     return fleet_refusal(People.merged(each.people for each in cars.values()), person_of(sender))
 

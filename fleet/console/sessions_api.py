@@ -81,15 +81,16 @@ class SessionsApi:
         verb = request.path_params["verb"]
         if verb not in tuple(RecorderVerb):
             return refuse(f"the recorder has no command {verb!r}", 404)
-        fields: dict[str, str] = {}
         person = request.scope.get(PERSON)
+        by = self._fleet.sync.sender if person is None else person.name
+        fields = {"sender": by}
         if verb in (RecorderVerb.START, RecorderVerb.STOP) and (words := self._refusal(person)):
             return refuse(words, 403)
         if verb == RecorderVerb.MARK:
             text = await read_body(request)
             if not text.strip():
                 return refuse("A mark needs a text.")
-            fields = {"text": text, "by": self._fleet.sync.sender if person is None else person.name}
+            fields |= {"text": text, "by": by}
         answer = await self._fleet.call(ask_recorder, self._fleet.sync.bus, self._fleet.sync.name, verb, **fields)
         if answer is None:
             return refuse("No recorder is on the bus. `fleet record` starts one; `fleet up` records by itself.")

@@ -14,19 +14,22 @@ import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
 from fleet.fleetfile.fleet_file import PinRule
+from fleet.policy.requests import RequestRefused, check_sender
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.pin_watch import PinWatch
 from fleet.recording.writing.receive_clock import ReceiveClock
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
-from schemas.bus import Bus, messages_of, reply_value, sequence_of
+from schemas.authority import Authority, People
+from schemas.bus import Bus, SampleChannel, messages_of, reply_value, sequence_of
 from schemas.gen import fleet_v1_pb2
+from schemas.identity import NotTheSender, sender_for
 from schemas.topics import TOPICS
 from schemas.words import Level, RecorderState, RecorderVerb
 
@@ -101,6 +104,7 @@ class Recorder:
         options: Options | None = None,
         *,
         pins: Sequence[PinRule] = (),
+        people: Callable[[], People | None] = lambda: None,
         max_messages: int = MAX_QUEUED_MESSAGES,
         max_bytes: int = MAX_QUEUED_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -111,6 +115,8 @@ class Recorder:
         self._root = root
         self._options = options or Options()
         self._pin_rules = pins
+        self._read_people = people
+        """Returns the people of the fleet file, who may start and stop. None: those that the gateways know."""
         self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes
@@ -126,7 +132,7 @@ class Recorder:
         self._closing = threading.Event()
         self._reader_done = threading.Event()
         self._reader_error: Exception | None = None
-        self._subscribers: list[zenoh.Subscriber[Any]] = []
+        self._subscribers: list[SampleChannel] = []
         self._error = ""
         self._recording = True
         self.ended = threading.Event()
@@ -179,7 +185,7 @@ class Recorder:
         self._closing.set()
         self._reader.join()
         for subscriber in self._subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+            subscriber.undeclare()
         self._subscribers.clear()
         self._writer.join()
         if self._error:
@@ -444,8 +450,10 @@ class Recorder:
             raise _CommandRefused("the recorder is ending")
         match verb:
             case RecorderVerb.START:
+                self._check_sender(query, verb)
                 self._start_session()
             case RecorderVerb.STOP:
+                self._check_sender(query, verb)
                 self._stop_session()
             case RecorderVerb.MARK:
                 self._mark(query)
@@ -454,6 +462,28 @@ class Recorder:
                     self._last = self._status()
             case _:
                 raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(RecorderVerb)}.")
+
+    def _check_sender(self, query: zenoh.Query, verb: str) -> None:
+        """Refuse a command that is for leads, by the same rule as the plan. Without `people:` everyone may."""
+        people = self._people()
+        if people.roles is None:
+            return
+        try:
+            fields = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
+            by = str(fields.get("sender", ""))
+        except (ValueError, AttributeError):
+            raise _CommandRefused('A command is JSON, such as {"sender": "ann"}') from None
+        try:
+            check_sender(people, sender_for(keys.identity_of(str(query.key_expr)), by, verb))
+        except (NotTheSender, RequestRefused) as error:
+            raise _CommandRefused(str(error)) from None
+
+    def _people(self) -> People:
+        listed = self._read_people()
+        if listed is not None:
+            return listed
+        states = self._bus.query(f"{self._fleet}/*/state/safety", timeout_s=STATUS_TIMEOUT_S)
+        return People.merged(Authority.of(each).people for each in messages_of(states))
 
     def _start_session(self) -> None:
         if self._recording:
