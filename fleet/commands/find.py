@@ -96,7 +96,8 @@ def find(
     if not found:
         most_s = max((answer.longest_s for _, answer in answers), default=-1.0)
         how_long = "" if most_s < 0 else f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)}"
-        raise click.ClickException(f"{expression} was never true{how_long} in the sessions of {place}.")
+        after = f" since {since}" if since is not None else ""
+        raise click.ClickException(f"{expression} was never true{how_long} in the sessions of {place}{after}.")
 
 
 def _answers(

@@ -16,6 +16,8 @@ _DAY_NS: Final = 86_400 * _NS
 _MAX_DAYS: Final = 3
 """Maximum days that a message proposes."""
 
+_NUMBER: Final = re.compile(r"-?\d+([.,]\d+)?")
+
 
 def at_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> int:
     """Return a time in ns since the epoch: the begin of `span_ns`."""
@@ -84,6 +86,8 @@ def past_ns(text: str, now_s: float) -> int:
     The result is in ns since the epoch. A time of day without a day is the last one that has passed. Raises ValueError
     with the syntax, also for a time that is not over. now_s: the wall clock.
     """
+    if _NUMBER.fullmatch(text):  # 18.21 may be meant for 18:21
+        raise ValueError(f"{text} has no unit: write {text}s for that many seconds ago, or a time such as 14:05.")
     if (duration := duration_s(text.removeprefix("-"))) is not None:
         return round((now_s - duration) * _NS)
     now_ns = round(now_s * _NS)

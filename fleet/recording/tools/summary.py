@@ -1,5 +1,6 @@
 """Summarizes a session without reading its messages, from session.json and the index of each file."""
 
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -235,13 +236,18 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
             return SessionState.RECORDING, ""
         return (
             SessionState.CUT,
-            description.error or "the recorder did not close it: `fleet sessions recover` makes it whole",
+            description.error or f"the recorder did not close it: `{_recover(session)}` makes it whole",
         )
     if damaged := sorted(read.damage.keys() - read.unended):
         return SessionState.DAMAGED, f"{damaged[0].name} {read.damage[damaged[0]]}"
     if read.unended:
-        return SessionState.CUT, f"{min(read.unended).name} has no intact end: `fleet sessions recover` repairs it"
+        return SessionState.CUT, f"{min(read.unended).name} has no intact end: `{_recover(session)}` repairs it"
     return SessionState.WHOLE, ""
+
+
+def _recover(session: Session) -> str:
+    """Return the command that repairs this session, and not the newest one."""
+    return f"fleet sessions recover {shlex.quote(session.name)}"
 
 
 def _is_written_lately(session: Session) -> bool:
