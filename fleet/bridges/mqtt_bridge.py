@@ -20,11 +20,9 @@ import aiomqtt
 from fleet.bridges.home_assistant import OFFLINE, HomeAssistant, Publication
 from fleet.client.car_state import CarState
 from fleet.client.client import Fleet
-from fleet.coordinator.inbox import Inbox, QueriedSample
+from fleet.coordinator.inbox import Inbox
 from fleet.coordinator.observer import FleetObserver
-from schemas import keys
 from schemas.backoff import backoff_s
-from schemas.bus import Sample
 from schemas.process import signals
 
 PLAIN_PORT: Final = 1883
@@ -48,7 +46,7 @@ _REFUSED: Final = frozenset({4, 5, 134, 135})
 """Codes of a broker that knows the user or the password not, MQTT 3.1.1 and 5."""
 
 _SILENT: Final = logging.getLogger(f"{__name__}.paho")
-"""What paho would say is said by `notify`."""
+"""The logger of paho. `notify` tells a person the same."""
 _SILENT.setLevel(logging.CRITICAL + 1)
 
 
@@ -76,14 +74,11 @@ class MqttBridge:
     """Publishes one fleet to one broker. `notify` is called with news for a person: the broker is there, or is away."""
 
     def __init__(self, client: Fleet, broker: Broker, plan: HomeAssistant, notify: Callable[[str], object]) -> None:
-        self._inbox = Inbox(client, lambda: {*_TOPICS})
+        self._inbox = Inbox.listening(client, _TOPICS)
         self._observer = FleetObserver()
         self._broker = broker
         self._plan = plan
         self._notify = notify
-        for topic in _TOPICS:
-            self._inbox.subscribe(keys.topic_key(client.name, "*", topic))
-        self._inbox.watch_gateways()
 
     async def run(self) -> None:
         """Publish until a signal ends the process. Raises BrokerRefused, but only for the first connection."""
@@ -110,18 +105,12 @@ class MqttBridge:
     async def _hear(self, pool: ThreadPoolExecutor) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            heard = await loop.run_in_executor(pool, lambda: list(self._inbox.items(_WAIT_S)))
-            now, wall_s = time.monotonic(), time.time()
-            changes = self._inbox.gateways()
-            for car, alive in changes.items():
-                self._observer.on_token(car, now, alive=alive)
-            for item in heard:
-                if isinstance(item, QueriedSample):
-                    self._observer.on_sample(item.sample, now, wall_s)
-                elif isinstance(item, Sample):
-                    self._observer.on_sample(item, now, None)
-            self._observer.forget(now, ())
-            self._inbox.query_arrived(changes, pool, began=True)
+            heard = await loop.run_in_executor(pool, self._inbox.hear, _WAIT_S, pool)
+            for car, alive in heard.gateways.items():
+                self._observer.on_token(car, heard.now, alive=alive)
+            for sample, wall_s in heard.samples:
+                self._observer.on_sample(sample, heard.now, wall_s)
+            self._observer.forget(heard.now, ())
 
     # ------------------------------------------------------------------ the broker
 
@@ -170,8 +159,8 @@ class MqttBridge:
             for each in tasks:
                 each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-        # What we have not read when we close resets the connection, and the broker takes that for a crash. So hear no
-        # more. A broker that hangs answers nothing. Later it reads all of this, or sends our will.
+        # Unread bytes at the close reset the connection, and the broker takes that for a crash. So hear no more. A
+        # broker that hangs answers nothing. Later it reads all of this, or sends our will.
         qos = 1
         try:
             await client.unsubscribe([self._plan.availabilities, self._plan.birth], timeout=_FAREWELL_TIMEOUT_S)

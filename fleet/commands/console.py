@@ -33,12 +33,12 @@ from fleet.commands.params import Number
 from fleet.console import DEFAULT_PORT
 from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
-from fleet.console.server import HELLO, LOOPBACK, listen, serve
+from fleet.console.server import HELLO, listen, serve
 from fleet.fleetfile.fleet_file import people_table, read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.authority import People
-from schemas.bus import resolve_endpoint
+from schemas.bus import LOOPBACK, resolve_endpoint
 from schemas.identity import Service, service
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import Rank

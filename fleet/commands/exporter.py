@@ -7,10 +7,9 @@ import threading
 import click
 
 from fleet.commands.fleets import open_observer
-from fleet.commands.options import bus_options
-from fleet.commands.params import Number
+from fleet.commands.options import bus_options, serving_options
 from fleet.exporter.dashboard import dashboard
-from fleet.exporter.exporter import DEFAULT_EXPORTER_PORT, LOOPBACK, Exporter
+from fleet.exporter.exporter import DEFAULT_EXPORTER_PORT, Exporter
 from schemas.process import signals
 
 
@@ -24,14 +23,7 @@ examples:
 Prometheus reads http://127.0.0.1:9478/metrics. Everyone who reaches the address may read the metrics, and nobody can
 command a car there."""
 )
-@click.option(
-    "--port",
-    type=Number(int, 0, 65535),
-    default=DEFAULT_EXPORTER_PORT,
-    show_default=True,
-    help="Port, 0 for any.",
-)
-@click.option("--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Address to serve at.")
+@serving_options(DEFAULT_EXPORTER_PORT)
 @click.option("--dashboard", "prints_board", is_flag=True, help="Print a board for Grafana, and exit.")
 @bus_options
 def exporter(*, port: int, address: str, prints_board: bool, connect: str | None, fleet: str) -> None:

@@ -8,14 +8,12 @@ import click
 
 from fleet.bridges.foxglove_server import DEFAULT_FOXGLOVE_PORT, FoxgloveServer, PortInUse, layout_now
 from fleet.commands.fleets import open_observer
-from fleet.commands.options import bus_options
+from fleet.commands.options import bus_options, serving_options
 from fleet.commands.output import echo_safely
-from fleet.commands.params import Number
 from schemas.process import signals
 
 _FOXGLOVE_INTERVAL_S: Final = 0.02
 """Interval at which the bus is read."""
-LOOPBACK: Final = "127.0.0.1"
 
 
 @click.command(
@@ -28,14 +26,7 @@ examples:
 In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. Everyone who reaches the address may look, and
 nobody can command a car there."""
 )
-@click.option(
-    "--port",
-    type=Number(int, 0, 65535),
-    default=DEFAULT_FOXGLOVE_PORT,
-    show_default=True,
-    help="Port, 0 for any.",
-)
-@click.option("--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Address to serve at.")
+@serving_options(DEFAULT_FOXGLOVE_PORT)
 @click.option("--layout", "prints_layout", is_flag=True, help="Print a layout for the cars of now, and exit.")
 @bus_options
 def foxglove(*, port: int, address: str, prints_layout: bool, connect: str | None, fleet: str) -> None:

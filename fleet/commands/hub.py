@@ -23,7 +23,7 @@ from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus import LOOPBACK, Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
 from schemas.identity import Service
 from schemas.printable import printable
@@ -126,8 +126,9 @@ def invite(
             invited = identity.car(name) if car else identity.site(name) if site else identity.person(name)
         endpoint = resolve_endpoint()
         store = _own_store(endpoint)
-        here = host or next(iter(own_addresses()), local_hub.LOOPBACK)
-        if here != local_hub.LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
+        addresses = own_addresses() or [LOOPBACK]
+        here = host or addresses[0]
+        if here != LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
             raise click.ClickException("This hub listens on loopback only: `fleet hub init` opens it to the network.")
         store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed
         store.reserve(invited)
@@ -145,7 +146,7 @@ def invite(
             click.echo(f"In this network `fleet join {invitation.code}` finds this hub, too.")
             if qr:
                 segno.make(line).terminal(sys.stdout, compact=True, border=2)
-        with announced(invitation.port, invitation.code, own_addresses() or [local_hub.LOOPBACK]):
+        with announced(invitation.port, invitation.code, addresses):
             why = invitation.wait(JOIN_CODE_LIFETIME_S)
     finally:
         invitation.close()
@@ -224,12 +225,13 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         host, code = _host_and_code(words)
         parsed = JoinCode.parse(code)
         at, at_port = _address(site, 0) if site else ("", 0)
-        own = (*own_addresses(), *own_names())
+        addresses = own_addresses()
+        own = (*addresses, *own_names())
         if host:
             name, port = _address(host, JOIN_PORT)
             joined = join(name, parsed, port, addresses=own)
         else:
-            name, joined = join_one_of(hubs_found(own_addresses() or [local_hub.LOOPBACK]), parsed, own)
+            name, joined = join_one_of(hubs_found(addresses or [LOOPBACK]), parsed, own)
         endpoint = local_hub.store_joined(name, joined, at, at_port)
         if joined.rules:
             click.echo(

@@ -17,9 +17,9 @@ from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.refused import why_refused
 from fleet.commands.fleets import open_client
 from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
-from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
+from fleet.commands.params import Number, complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
-from schemas.bus import BadEndpoint, BusError, NoFleet, resolve_endpoint
+from schemas.bus import LOOPBACK, BadEndpoint, BusError, NoFleet, resolve_endpoint
 from schemas.words import Reason
 
 _Function = Callable[..., Any]
@@ -47,6 +47,21 @@ def bus_options(function: _Function) -> _Function:
             return function(*args, **options)
 
     return command
+
+
+def serving_options(port: int) -> Callable[[_Function], _Function]:
+    """Add --port and --address of a program that serves others: this port, on this computer only."""
+
+    def add(function: _Function) -> _Function:
+        address = click.option(
+            "--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Address to serve at."
+        )
+        at = click.option(
+            "--port", type=Number(int, 0, 65535), default=port, show_default=True, help="Port, 0 for any."
+        )
+        return at(address(function))
+
+    return add
 
 
 def with_client(function: _Function) -> _Function:

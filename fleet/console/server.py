@@ -37,14 +37,13 @@ from fleet.console.request_body import read_text
 from fleet.console.requests import is_stop
 from fleet.console.worker import TooManyQuestions
 from fleet.examples import EXAMPLES
-from schemas.bus import LARGEST_PAYLOAD, BusError
+from schemas.bus import LARGEST_PAYLOAD, LOOPBACK, BusError
 from schemas.process import signals
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
     from fleet.console.lan import Lan
 
 STATIC: Final = Path(__file__).parent / "static"
-LOOPBACK: Final = "127.0.0.1"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
 HELLO: Final = "fleet console"

@@ -6,10 +6,11 @@ counted.
 
 import queue
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import zenoh
 
@@ -37,8 +38,23 @@ class QueriedSample:
 Item = Sample | QueriedSample | zenoh.Query
 
 
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Messages and changes of one turn of a program that only listens."""
+
+    now: float
+    """When they were taken from the inbox, s, monotonic."""
+    gateways: Mapping[str, bool]
+    """The cars whose gateways arrived (True) or left."""
+    samples: Sequence[tuple[Sample, float | None]]
+    """Each with the wall clock, s, if a query returned it (it may be old); None: just published."""
+
+
 class Inbox:
-    """The inbox of one coordinator. `topics_wanted` returns the topics of which the cars are asked."""
+    """The inbox of a coordinator, or of a program that only listens.
+
+    `topics_wanted` returns the topics of which the cars are asked.
+    """
 
     def __init__(self, client: Fleet, topics_wanted: Callable[[], set[str]]) -> None:
         self._client = client
@@ -54,6 +70,19 @@ class Inbox:
         self._arrived: set[str] = set()
         """Cars whose gateways arrived and whose states were not queried yet."""
         self._state_queries: list[Future[None]] = []
+
+    @classmethod
+    def listening(cls, client: Fleet, topics: Iterable[str], more: Iterable[str] = ()) -> Self:
+        """Return the inbox of a program that only listens, filled from now on.
+
+        topics: of all cars; a car that arrives is asked for them. more: topics that are only heard.
+        """
+        asked = {*topics}
+        inbox = cls(client, lambda: asked)
+        for topic in sorted({*asked, *more}):
+            inbox.subscribe(keys.topic_key(client.name, "*", topic))
+        inbox.watch_gateways()
+        return inbox
 
     # ------------------------------------------------------------------ filling it
 
@@ -107,6 +136,19 @@ class Inbox:
             if isinstance(item, zenoh.Query):
                 self._query_slots.release()
             yield item
+
+    def hear(self, wait_s: float, pool: ThreadPoolExecutor) -> Heard:
+        """Return what has come, and ask the cars that have arrived. Wait at most `wait_s` for the first message."""
+        items = list(self.items(wait_s))
+        now, wall_s, changes = time.monotonic(), time.time(), self.gateways()
+        self.query_arrived(changes, pool, began=True)
+        samples: list[tuple[Sample, float | None]] = []
+        for item in items:
+            if isinstance(item, QueriedSample):
+                samples.append((item.sample, wall_s))
+            elif isinstance(item, Sample):
+                samples.append((item, None))
+        return Heard(now, changes, samples)
 
     def gateways(self) -> Mapping[str, bool]:
         """Return the cars whose gateways arrived (True) or left since the last call."""

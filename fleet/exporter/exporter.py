@@ -11,13 +11,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from fleet.client.client import Fleet
-from fleet.coordinator.inbox import Inbox, QueriedSample
+from fleet.coordinator.inbox import Inbox
 from fleet.exporter.fleet_metrics import EVENTS, STATUS, FleetMetrics
 from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, Metric, MetricKind
-from schemas import keys
-from schemas.bus import Sample
 
-LOOPBACK: Final = "127.0.0.1"
 DEFAULT_EXPORTER_PORT: Final = 9478
 _WAIT_S: Final = 0.25
 """Maximum time until a stop of the exporter is noticed."""
@@ -32,13 +29,10 @@ class Exporter(Collector):
 
     def __init__(self, client: Fleet) -> None:
         self._client = client
-        self._inbox = Inbox(client, lambda: {*_TOPICS})
+        self._inbox = Inbox.listening(client, _TOPICS, (EVENTS,))
         self._metrics = FleetMetrics()
         self._lock = threading.Lock()
-        for topic in (*_TOPICS, EVENTS):
-            self._inbox.subscribe(keys.topic_key(client.name, "*", topic))
         self._inbox.subscribe(f"{client.name}/{STATUS}")
-        self._inbox.watch_gateways()
 
     def serve(self, address: str, port: int) -> tuple[int, Callable[[], None]]:
         """Serve the metrics. Return the port, and a function that ends it. Raises OSError if the port is in use."""
@@ -58,19 +52,13 @@ class Exporter(Collector):
         with ThreadPoolExecutor(max_workers=4) as pool:
             while not has_ended():
                 # Wait without the lock: a scrape must not wait for a message.
-                heard = list(self._inbox.items(_WAIT_S))
-                now, wall_s = time.monotonic(), time.time()
-                changes = self._inbox.gateways()
+                heard = self._inbox.hear(_WAIT_S, pool)
                 with self._lock:
-                    for car, alive in changes.items():
-                        self._metrics.observer.on_token(car, now, alive=alive)
-                    for item in heard:
-                        if isinstance(item, QueriedSample):
-                            self._metrics.on_sample(item.sample, now, wall_s)
-                        elif isinstance(item, Sample):
-                            self._metrics.on_sample(item, now)
-                    self._metrics.forget(now)
-                self._inbox.query_arrived(changes, pool, began=True)
+                    for car, alive in heard.gateways.items():
+                        self._metrics.observer.on_token(car, heard.now, alive=alive)
+                    for sample, wall_s in heard.samples:
+                        self._metrics.on_sample(sample, heard.now, wall_s)
+                    self._metrics.forget(heard.now)
 
     def collect(self) -> Iterator[_Family]:
         """Yield all metrics with their values now."""

@@ -13,13 +13,12 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
-from schemas.bus import Credentials, is_secure
+from schemas.bus import LOOPBACK, Credentials, is_secure
 from schemas.bus.credentials import CA_FILE, HUB, ME_FILE
 from schemas.identity import IdentityRole, Service, role_of
 from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 
-LOOPBACK: Final = "127.0.0.1"
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Where the programs of the hub's own computer find it."""
 SOMEBODY: Final = "operator"

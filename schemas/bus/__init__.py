@@ -9,6 +9,7 @@ from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.bus.declared import Declared, SampleChannel
 from schemas.bus.endpoint import (
     ENDPOINT_VARIABLE,
+    LOOPBACK,
     accepts,
     check_listening,
     ensure_hub,
@@ -44,6 +45,7 @@ __all__ = [
     "ENDPOINT_VARIABLE",
     "LARGEST_PAYLOAD",
     "LONGEST_SELECTOR",
+    "LOOPBACK",
     "Backlog",
     "BadEndpoint",
     "Bus",

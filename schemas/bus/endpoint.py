@@ -20,7 +20,8 @@ ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
 _RETRY: Final = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
-_LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
+LOOPBACK: Final = "127.0.0.1"
+_LOOPBACK_HOSTS: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
 def resolve_endpoint(argument: str | None = None) -> str:
@@ -51,7 +52,7 @@ def _host_and_port(endpoint: str) -> tuple[str, int]:
 def is_loopback(endpoint: str) -> bool:
     """Return True if no other machine can reach the endpoint. Raises BadEndpoint."""
     host, _ = _host_and_port(endpoint)
-    return _LOOPBACK.fullmatch(host) is not None
+    return _LOOPBACK_HOSTS.fullmatch(host) is not None
 
 
 def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
