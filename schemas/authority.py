@@ -45,9 +45,14 @@ class Sender:
         """Return the person: `group_a` of `group_a@host-4711`."""
         return person_of(self.name)
 
+    @property
+    def text_name(self) -> str:
+        """Return the name for a text: the person, without the host and the process (`keys.name_of`)."""
+        return name_of(self.name)
+
     def told_beside(self, other: "Sender") -> str:
-        """Return the person, or the whole name beside another program of the same person."""
-        return self.name if self.person == other.person else name_of(self.name)
+        """Return the name for a text; the whole name beside another program of the same person."""
+        return self.name if self.person == other.person else self.text_name
 
 
 class PersonRole(StrEnum):

@@ -107,6 +107,11 @@ def renewal_key(identity: str) -> str:
     return f"{HUB_RENEWAL}/{identity}"
 
 
+def replay_token(fleet: str, session: str = "*") -> str:
+    """Return the liveliness token of a program that plays a session in a fleet."""
+    return f"{fleet}/{REPLAY}/{session}"
+
+
 def operator_token(fleet: str, sender: str) -> str:
     """Return the liveliness token of a sender. Raises BadKey unless `sender` is one chunk without wildcards."""
     if not sender or set(sender) & set("/*$#?"):

@@ -82,7 +82,7 @@ def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]
     """
     now_s = time.time()
     odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}
-    if not odd or client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
+    if not odd or client.bus.tokens(keys.replay_token(client.name)):
         return {}
     clocks = {car: GatewayClock() for car in odd}
     complete, lock = threading.Event(), threading.Lock()

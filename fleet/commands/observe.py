@@ -103,7 +103,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
         {**row_of(car, values, present=car in cars, clock_off_s=clocks.get(car)), "color": hex_color(colors[car])}
         for car, values in sorted(latest.items())
     ]
-    for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
+    for token in client.bus.tokens(keys.replay_token(client.name)):
         session = token.rpartition("/")[2]
         click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
         rows = [{**row, "replay": session} for row in rows]

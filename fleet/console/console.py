@@ -43,7 +43,7 @@ from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
-from schemas.keys import REPLAY, SIMULATOR, person_of, topic_key
+from schemas.keys import SIMULATOR, person_of, replay_token, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
 from schemas.topics import TOPICS
@@ -158,7 +158,7 @@ class Console:
         for place in ("*/sim/truth", f"{SIMULATOR}/world"):
             bus.subscribe(f"{name}/{place}", self._map.on_sample)
         bus.subscribe(f"{name}/{SUPERVISOR_STATUS.name}", self._statuses)
-        await self._fleet.call(bus.watch_tokens, f"{name}/{REPLAY}/*", self._on_replay)
+        await self._fleet.call(bus.watch_tokens, replay_token(name), self._on_replay)
         await self.plan.begin()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())

@@ -281,7 +281,7 @@ class Controller(Generic[D_co]):
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Rank.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
-        self.driver.halt(f"{command.verb} by {name_of(sender.name)}", now, by=sender.name)
+        self.driver.halt(f"{command.verb} by {sender.text_name}", now, by=sender.name)
         if not self.driver.model.link_open or self.driver.shutting_down:
             words = self._not_stopped("emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped")
             words = f"{words} ({command.note})" if command.note else words
@@ -372,7 +372,7 @@ class Controller(Generic[D_co]):
         loan = self.safety.loan_at(now)
         if loan is None:
             return self._done(pending, "was not lent", now)
-        words = f"the loan to {loan.to} was ended by {name_of(pending.command.sender.name)}"
+        words = f"the loan to {loan.to} was ended by {pending.command.sender.text_name}"
         self._end_loan(words, now)
         return self._done(pending, f"the loan to {loan.to} has ended", now)
 
@@ -436,7 +436,7 @@ class Controller(Generic[D_co]):
 
     def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
         sender = pending.command.sender
-        name = name_of(sender.name)
+        name = sender.text_name
         if not release:
             return self._done(pending, f"reserved for {name} for {LEASE_S:g} s, and while it drives", now)
         if not self.safety.release(sender):
@@ -478,7 +478,7 @@ class Controller(Generic[D_co]):
         sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._prolong_drive(held, pending, drive.duration_s, now)
-        words = f"{drive.motion} by {name_of(sender.name)}"
+        words = f"{drive.motion} by {sender.text_name}"
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.held = HeldMotion(drive.motion, pending, *self._times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
@@ -528,7 +528,7 @@ class Controller(Generic[D_co]):
         return self._queued(pending, now, self._wait(pending, now))
 
     def _release(self, pending: Pending, now: float) -> Answer:
-        sender = name_of(pending.command.sender.name)
+        sender = pending.command.sender.text_name
         self.driver.end_drive(f"released by {sender}", now)
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
         if not self.driver.is_stopping and self.driver.model.at_rest:
@@ -540,14 +540,14 @@ class Controller(Generic[D_co]):
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
-        by = name_of(pending.command.sender.name)
+        by = pending.command.sender.text_name
         self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {by}", now)
         answer = self._queued(pending, now)
         self.driver.stop(FrameOrigin.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
-        words = f"mode {mode} by {name_of(pending.command.sender.name)}"
+        words = f"mode {mode} by {pending.command.sender.text_name}"
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         model = self.driver.model

@@ -24,7 +24,6 @@ from gateway.control.commands import Action
 from gateway.control.events import OutgoingFrame
 from gateway.control.trust import TrustEvent, TrustState
 from schemas.car_profile import CarProfile
-from schemas.keys import name_of
 from schemas.words import (
     Basis,
     BatteryAction,
@@ -527,7 +526,7 @@ class Driver(ABC):
         if held is not None and now >= self.queue.held_until:
             if now < held.expires_at:
                 self.safety.mark_holder(held.sender.name, connected=False)
-                self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {name_of(held.sender.name)} disconnected", now)
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.text_name} disconnected", now)
             elif held.pending.sent:
                 words = ""
                 if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:

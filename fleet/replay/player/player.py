@@ -68,7 +68,7 @@ class Player:
     def begin(self, session: str, cars: Iterable[str]) -> None:
         """Declare the tokens of these cars, and answer queries; raises NameTaken."""
         another = "name this one otherwise with --as"
-        if playing := self.bus.tokens(f"{self.name}/{keys.REPLAY}/*"):
+        if playing := self.bus.tokens(keys.replay_token(self.name)):
             raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {another}")
         if taken := sorted(token.partition("/")[2] for token in self._alive()):
             listed = ", ".join(taken[:_MAX_LISTED_TOKENS])
@@ -76,9 +76,8 @@ class Player:
             raise NameTaken(f"fleet {self.name} is alive ({listed}{more}): {another}{self._or_cars_only(taken)}")
         for expression in ("*/*/*", "*/@cmd/*", "@coordinator/*", "@recorder/*", "@supervisor/*", "@sim/*"):
             self.bus.queryable(f"{self.name}/{expression}", self._on_query)
-        self.bus.token(
-            f"{self.name}/{keys.REPLAY}/{''.join('_' if each in _RESERVED_CHARACTERS else each for each in session)}"
-        )
+        title = "".join("_" if each in _RESERVED_CHARACTERS else each for each in session)
+        self.bus.token(keys.replay_token(self.name, title))
         self._cars = sorted(car for car in cars if is_carried(keys.car_token(self.name, car)))
         for car in self._cars:
             self.bus.token(keys.car_token(self.name, car))

@@ -104,7 +104,7 @@ class UgvCar:
         self._kept_main = 2 if build.is_ros else 1
         """The chassis after a reset. The ROS firmware keeps what it was told."""
         self._kept_module = 1 if "arm" in options else 2 if "gimbal" in options else 0
-        """What is mounted on it, after a reset: 1 an arm, 2 a gimbal."""
+        """The number of the mounted module after a reset: 1 an arm, 2 a gimbal."""
         self._odometer = [0.0, 0.0]
         self._wheels = [0.0, 0.0]
         """The true speed of each wheel, m/s."""
