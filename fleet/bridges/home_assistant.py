@@ -1,4 +1,4 @@
-"""What Home Assistant reads of a fleet by MQTT: which messages are published, and when. Pure: time is an argument.
+"""Decides which MQTT messages Home Assistant gets of a fleet, and when. Pure: time is an argument.
 
 Each car is a device with a few entities. One retained message announces it (device discovery, Home Assistant 2024.11
 and later). Then there are two topics for each car: `state`, one JSON object with a value for each entity, and

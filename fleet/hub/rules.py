@@ -43,7 +43,7 @@ _COMMANDS: Final = (
 )
 """The keys of all commands. Everyone may see who answers them, and that somebody drives; sending is another matter."""
 _OF_HUBS: Final = (*_PUBLIC, *_COMMANDS, keys.HUB_RULES, keys.renewal_key("*"))
-"""What hubs of sites tell one another."""
+"""The keys that hubs of sites use among one another."""
 _OWN_SERVICE: Final = {
     Service.SUPERVISOR: keys.SUPERVISOR,
     Service.COORDINATOR: keys.COORDINATOR,

@@ -195,7 +195,7 @@ class Catalog:
         return found
 
     def nulled(self) -> dict[str, list[str]]:
-        """Return by session the columns asked so far in which values are null: their type was another one, no number.
+        """Return by session the columns asked so far with values that are null because they had another type.
 
         Each in words, with the number of values.
         """

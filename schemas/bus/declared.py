@@ -1,4 +1,4 @@
-"""What a bus has declared. It can be declared once more, in the next session of the bus (`Bus.reopen`)."""
+"""Declarations of a bus, which can be repeated in its next session (`Bus.reopen`)."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +18,7 @@ class Declared:
     def __init__(self, declare: Declare) -> None:
         self._declare = declare
         self.current: list[Any] = []
-        """What Zenoh returned, in each session that is open; the newest is the last."""
+        """The declarations of Zenoh, one for each session that is open; the newest is the last."""
         self.is_over = False
 
     def __enter__(self) -> Self:

@@ -171,11 +171,17 @@ async def _drain(reader: asyncio.StreamReader) -> None:
     raise AssertionError("closed, not reset")
 
 
-async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> None:
-    host, port = where(pair, "blue")
+async def driven(simulation: Simulation, car: str) -> tuple[str, int, asyncio.StreamWriter]:
+    """Connect to a car over TCP and let it drive. Return where it is, and the connection."""
+    host, port = where(simulation, car)
     _, writer = await asyncio.open_connection(host, port)
     writer.write(RUN)
-    await until(lambda: pair.cars["blue"].truth.driving, "drives")
+    await until(lambda: simulation.cars[car].truth.driving, "drives")
+    return host, port, writer
+
+
+async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> None:
+    host, port, writer = await driven(pair, "blue")
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0.1))
     await until(lambda: not pair.cars["blue"].truth.alive, "dies")
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0))
@@ -594,10 +600,7 @@ async def test_the_options_of_a_car_reach_its_program() -> None:
 
 
 async def test_empty_battery_falls_then_car_and_link_are_off(pair: Simulation) -> None:
-    host, port = where(pair, "blue")
-    _, writer = await asyncio.open_connection(host, port)
-    writer.write(RUN)
-    await until(lambda: pair.cars["blue"].truth.driving, "drives")
+    host, port, writer = await driven(pair, "blue")
     await pair.inflict(Fault(FaultKind.EMPTY, "blue", for_s=0.3))
     await until(lambda: not pair.cars["blue"].truth.driving, "is off")
     firmware = pair.cars["blue"].firmware
