@@ -26,7 +26,7 @@ from gateway.bus.publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, sho
 from gateway.bus.service import CarService
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from gateway.learned_file import LearnedFile
 from gateway.link import LinkUrl
 from gateway.link_loop import LinkLoop, at_rate
@@ -34,13 +34,13 @@ from gateway.state_file import SafetyStateFile
 from gateway.wake import Wake
 from gateway.writer import Writer
 from schemas import bus
-from schemas.authority import People
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
 from schemas.process import json_log, signals
 from schemas.process.parent import has_ended
 from schemas.process.service_notifier import ServiceNotifier
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
+from schemas.rights import People
 from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
 

@@ -7,13 +7,13 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from schemas.authority import NO_PEOPLE, People
+from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
-from schemas.limits import CRITICAL_V, LOW_V
 from schemas.links import LINK_HELP, LINK_HELP_OPTIONS
 from schemas.process import startup, stdio
 from schemas.process.parent import watched_pid
+from schemas.rights import NO_PEOPLE, People
 from schemas.suggestion import did_you_mean
 from schemas.words import BatteryAction, BatteryLevel
 
@@ -263,7 +263,7 @@ def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: s
     except BadEndpoint:
         raise
     except BusError as error:
-        from gateway.stop_alone import stop_alone
+        from gateway.stop_without_hub import stop_alone
 
         state_dir = _state_dir(arguments, resolve_endpoint(arguments.connect))
         raise BusError(f"{error} {stop_alone(car, url, platform, fleet, state_dir)}") from error

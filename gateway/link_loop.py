@@ -11,10 +11,10 @@ from typing import Final
 
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.publisher import RAW_PER_S, CarPublisher, shown_state
-from gateway.control.backoff import Attempts
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
 from gateway.control.link_health import LinkHealth
+from gateway.control.reconnect_delay import Attempts
 from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.wake import Wake
 from schemas.links import BAUD, SerialUrl, UsbUrl

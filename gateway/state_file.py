@@ -11,10 +11,10 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from schemas.atomic_file import DAMAGE, write_state
-from schemas.authority import Estop, FleetPause, Hold, Loan
 from schemas.process.stdio import printable
+from schemas.rights import Estop, FleetPause, Hold, Loan
 from schemas.words import Rank
 
 MAX_OTHER_LINKS: Final = 16

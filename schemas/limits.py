@@ -12,10 +12,10 @@ DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_QUEUE_TIME_S: Final = 15.0
 """Maximum time that a command waits for a busy car: longer than the longest stop, that of a connect to a car that sends
-nothing (`stopping.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
+nothing (`stop_in_progress.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
 MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
 """Maximum time for the evidence of a stop, in addition to its announced worst case: four intervals of the slowest car,
-one every 3 s with the longest `MODE00` (`stopping.SLOWEST_S`). A car of 2.5 s or less has time for five."""
+one every 3 s with the longest `MODE00` (`stop_in_progress.SLOWEST_S`). A car of 2.5 s or less has time for five."""
 # Without the pause the next sample of a held joystick would restart the car 50 ms after another person's stop.
 STREAM_PAUSE_S: Final = 0.5
 """Minimum pause of a drive stream after a stop. A release ends the pause at once."""
@@ -23,11 +23,3 @@ SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The gateway cuts off the rest, so that no e-stop fails for its reason."""
-
-# ------------------------------------------------------------------ battery of two cells
-
-EMPTY_V: Final = 6.4  # docs/reference/protocol.md#readings: two Li-ion cells, 6.4 V empty
-FULL_V: Final = 8.4  # to 8.4 V full
-LOW_V: Final = 7.0
-CRITICAL_V: Final = 6.6
-"""Thresholds of the battery's levels, V at rest."""

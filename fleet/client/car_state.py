@@ -28,8 +28,8 @@ from fleet.client.claims import CarClaims, claims_of
 from fleet.client.reading import Reading, age_of_answer_s
 from fleet.conditions.functions import KEPT_READINGS
 from schemas import messages, topics
-from schemas.authority import Authority
 from schemas.messages import Observation
+from schemas.rights import Authority
 from schemas.words import CarTrust, LinkState, Motors, Rank
 
 NO_ANSWER: Final = "its gateway does not answer"

@@ -12,10 +12,10 @@ from fleet.client.claims import describe_end_of_doubt
 from fleet.client.gateway_clock import describe_clock
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
-from schemas.authority import binding_pause
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import name_of
 from schemas.local_time import clock
+from schemas.rights import binding_pause
 from schemas.words import (
     Basis,
     BatteryLevel,

@@ -37,14 +37,14 @@ from fleet.console.server import HELLO, listen, serve
 from fleet.fleetfile.fleet_file import people_table, read_people
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
-from schemas.authority import People
 from schemas.bus import LOOPBACK, resolve_endpoint
 from schemas.identity import Service, service
 from schemas.process.parent import has_ended, watched_pid
+from schemas.rights import People
 from schemas.words import Rank
 
 if TYPE_CHECKING:
-    from fleet.console.lan import Lan
+    from fleet.console.network_console import Lan
 
 DEFAULT_LAN_PORT: Final = 7443
 HEARTBEAT_INTERVAL_S: Final = 1.0
@@ -268,9 +268,9 @@ def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
 
 
 def _network() -> Any:
-    from fleet.console import lan  # its packages cost 0.1 s that only the network needs
+    from fleet.console import network_console  # its packages cost 0.1 s that only the network needs
 
-    return lan
+    return network_console
 
 
 def _people_of(file: Path) -> People:

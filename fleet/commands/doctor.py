@@ -16,7 +16,7 @@ from fleet.commands.output import echo_safely, watched
 from fleet.commands.params import SessionPath, complete_car, no_cars
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import is_session
-from fleet.recording.tools.checkup import SessionCheckup
+from fleet.recording.tools.session_findings import SessionCheckup
 from fleet.recording.tools.summary import growing, total
 from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean

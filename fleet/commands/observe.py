@@ -39,9 +39,9 @@ from fleet.commands.params import (
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
-from schemas.authority import binding_pause
 from schemas.bus import Sample, intersects
 from schemas.colors import car_color, hex_color
+from schemas.rights import binding_pause
 from schemas.suggestion import did_you_mean
 from schemas.words import Shows
 

@@ -21,7 +21,7 @@ from fleet.commands.fleets import open_client
 from fleet.commands.group import CommandGroup, say
 from fleet.commands.options import WrongFile, bus_options, json_option, with_client
 from fleet.commands.params import SessionPath, complete_car
-from fleet.policy.requests import PlanRequest
+from fleet.policy.plan_requests import PlanRequest
 from schemas import keys
 from schemas.bus import Failure
 from schemas.local_time import clock

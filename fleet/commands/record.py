@@ -26,7 +26,7 @@ from schemas.words import RecorderState, RecorderVerb
 
 if TYPE_CHECKING:
     from fleet.fleetfile.fleet_file import PinRule
-    from schemas.authority import People
+    from schemas.rights import People
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -150,8 +150,8 @@ def run(
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
+    from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
-    from fleet.recording.writing.retention import QUOTA_SEGMENT_S, Quota
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}

@@ -13,10 +13,10 @@ from fleet.client.gateway_clock import GatewayClock
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
-from fleet.console.requests import MAX_CARS
+from fleet.console.page_requests import MAX_CARS
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import keys, messages, topics
-from schemas.authority import Authority, People, binding_pause
+from schemas.rights import Authority, People, binding_pause
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0

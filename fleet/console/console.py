@@ -21,6 +21,7 @@ from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
+from fleet.console.hold_to_drive import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.inspections import Inspections
 from fleet.console.lane_feed import LaneFeed
 from fleet.console.map_feed import MapFeed
@@ -28,24 +29,23 @@ from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
+from fleet.console.page_requests import BadPageMessage, PageMessage
 from fleet.console.pairing import MAX_GUESTS, PagePerson
 from fleet.console.past_api import PastApi
-from fleet.console.permissions import GUEST_REFUSAL, guest_rights, management_refusal, rights_of
 from fleet.console.plan_feed import PlanFeed
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
-from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
-from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.rights_in_words import GUEST_REFUSAL, guest_rights, management_refusal, rights_of
 from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
-from schemas.authority import People
 from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
 from schemas.keys import SIMULATOR, person_of, replay_token, topic_key
 from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.suspend import SleepWatch, clock_pair
+from schemas.rights import People
 from schemas.topics import TOPICS
 from schemas.words import MODE_TEXTS, Phase, Rank, Reason, Scope
 

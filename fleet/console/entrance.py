@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from fleet.console.waiting_room import WaitingRoom
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
-    from fleet.console.lan import LimitedListener
+    from fleet.console.network_console import LimitedListener
 
 Address = tuple[str, int]
 ACCEPTS_AT_ONCE: Final = 20

@@ -12,7 +12,7 @@ from fleet.console.car_view import CarView
 from fleet.console.frame_log import FrameLog
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
-from fleet.console.requests import PageMessage
+from fleet.console.page_requests import PageMessage
 from schemas import keys
 from schemas.bus import Handover, Sample
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
-from fleet.console.requests import PageMessage
+from fleet.console.page_requests import PageMessage
 from fleet.recording.tools.lanes import HELD_NS, LANE_TOPICS, Lanes
 from schemas.keys import Key
 

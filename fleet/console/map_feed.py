@@ -9,7 +9,7 @@ from fleet.console.bus_message import message_in
 from fleet.console.map_view import PLACE_TOPICS, MapView
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
-from fleet.console.requests import PageMessage
+from fleet.console.page_requests import PageMessage
 from schemas.bus import Latest, Sample
 from schemas.keys import SIMULATOR, Key
 

@@ -12,7 +12,7 @@ from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import ask_coordinator
-from fleet.console.presses import HeldPress
+from fleet.console.hold_to_drive import HeldPress
 from fleet.console.stop_report import StopReport
 from schemas import keys, messages
 from schemas.bus import Failure

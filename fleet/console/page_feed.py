@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
 from fleet.console.page_link import PageLink
-from fleet.console.requests import PageMessage
+from fleet.console.page_requests import PageMessage
 
 Handler = Callable[[PageLink, PageMessage], None]
 """Handles one message of a page; raises BadPageMessage, and then has changed nothing."""

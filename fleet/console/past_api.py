@@ -14,10 +14,10 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from fleet.console.guard import PERSON
+from fleet.console.page_requests import BadPageMessage, PageMessage
 from fleet.console.plot_buffer import series_of
 from fleet.console.plot_feed import MAX_PLOT_S
-from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.request_filter import PERSON
 from fleet.console.session_files import NotInFolder, session_path
 from fleet.console.sessions_api import read_body, refuse
 from fleet.console.worker import TooManyQuestions, Worker

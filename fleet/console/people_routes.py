@@ -8,14 +8,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from fleet.console.guard import PAIR_PATH, PERSON, Scope
+from fleet.console.page_requests import BadPageMessage, PageMessage
 from fleet.console.pairing import ClassFull, PagePerson
 from fleet.console.request_body import read_text
-from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.request_filter import PAIR_PATH, PERSON, Scope
 from schemas.words import Rank
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
-    from fleet.console.lan import Lan
+    from fleet.console.network_console import Lan
 
 PAIR_PAGE: Final = Path(__file__).parent / "static" / "pair.html"
 _MAX_BODY_BYTES: Final = 1024

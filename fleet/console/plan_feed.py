@@ -14,13 +14,13 @@ from fleet.console.bus_message import is_shown, message_in
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
+from fleet.console.page_requests import PageMessage
 from fleet.console.pairing import PagePerson
 from fleet.console.plan_answer import PlanQuestion
 from fleet.console.plan_checks import PlanChecks
 from fleet.console.plan_process import PlanProcess
 from fleet.console.plan_view import PlanView, coordinator_topic, named
-from fleet.console.requests import PageMessage
-from fleet.policy.requests import PlanRequest
+from fleet.policy.plan_requests import PlanRequest
 from schemas import keys
 from schemas.bus import Handover, Sample
 

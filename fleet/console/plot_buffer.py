@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any, Final
 
 from fleet.conditions import fields_of, value_in
-from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.page_requests import BadPageMessage, PageMessage
 from schemas import messages, topics
 
 MAX_SERIES: Final = 80

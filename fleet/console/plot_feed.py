@@ -11,8 +11,8 @@ from fleet.aio import Fleet
 from fleet.console.bus_message import message_in
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
+from fleet.console.page_requests import PageMessage
 from fleet.console.plot_buffer import PlotBuffer, series_of
-from fleet.console.requests import PageMessage
 from schemas import keys, topics
 from schemas.bus import BusError, Sample
 

@@ -28,20 +28,20 @@ from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
 from fleet.console.entrance import Entrance
 from fleet.console.fair_socket import FairWebSocket
-from fleet.console.guard import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
 from fleet.console.log_rate import LogRate
+from fleet.console.page_requests import is_stop
 from fleet.console.pairing import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.plan_view import plan_name
 from fleet.console.request_body import read_text
-from fleet.console.requests import is_stop
+from fleet.console.request_filter import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
 from fleet.console.worker import TooManyQuestions
 from fleet.examples import EXAMPLES
 from schemas.bus import LARGEST_PAYLOAD, LOOPBACK, BusError
 from schemas.process import signals
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
-    from fleet.console.lan import Lan
+    from fleet.console.network_console import Lan
 
 STATIC: Final = Path(__file__).parent / "static"
 MAX_MESSAGE_BYTES: Final = 16_384

@@ -11,7 +11,7 @@ from typing import Final
 
 from starlette.requests import Request
 
-from fleet.console.guard import PERSON
+from fleet.console.request_filter import PERSON
 from schemas.process.ending import kill
 
 MAX_SESSION_JOBS: Final = 2

@@ -13,8 +13,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from fleet.aio import Fleet
-from fleet.console.guard import PERSON
-from fleet.console.requests import PageMessage
+from fleet.console.page_requests import PageMessage
+from fleet.console.request_filter import PERSON
 from fleet.console.sessions_api import read_body, refuse
 from fleet.fleetfile.editor import set_link
 from fleet.fleetfile.fleet_file import default_color, parse_fleet, read_fleet

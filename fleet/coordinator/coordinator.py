@@ -16,22 +16,22 @@ from fleet.coordinator.inbox import Inbox, Item, QueriedSample
 from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.open_commands import OpenCommands
 from fleet.coordinator.other_coordinators import declare_alone, yield_to_another
+from fleet.coordinator.plan_commands import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
 from fleet.coordinator.publications import Publications, assignment_message, decision_message, in_force
-from fleet.coordinator.requests import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.decide import step
 from fleet.policy.decision import Decision
 from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request
+from fleet.policy.plan_requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages
-from schemas.authority import People
 from schemas.bus import HubKeeper
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
+from schemas.rights import People
 from schemas.words import Level, Phase
 
 STEP_INTERVAL_S: Final = 0.1

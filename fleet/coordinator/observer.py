@@ -10,9 +10,9 @@ from fleet.client.reading import age_of_answer_s
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from schemas import keys, messages, topics
-from schemas.authority import People, binding_pause
 from schemas.bus import Sample
 from schemas.platform_name import AUTO
+from schemas.rights import People, binding_pause
 
 REQUIRED_TOPICS: Final = ("state/link", "state/mode", "state/motion", "state/safety")
 """The states that could forbid a command. A car is confirmed when all of them are known."""

@@ -24,12 +24,13 @@ from fleet.fleetfile.models import (
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from fleet.policy.car_condition import parse_condition
 from gateway import drivers
-from schemas.authority import NO_PEOPLE, People, PersonRole
+from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.duration import parse_duration
-from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, LOW_V
+from schemas.limits import DEFAULT_MAX_DRIVE_S
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, normalize_name
+from schemas.rights import NO_PEOPLE, People, PersonRole
 from schemas.words import BatteryAction, Platform
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest

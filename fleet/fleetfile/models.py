@@ -12,9 +12,10 @@ from pydantic import AfterValidator, Field
 from fleet.links import parse_fleet_link
 from gateway import drivers
 from schemas import bus, keys
+from schemas.battery_levels import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
 from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.duration import DURATION_PATTERN, parse_duration
-from schemas.limits import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V
+from schemas.limits import DEFAULT_MAX_DRIVE_S
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS
 from schemas.words import BatteryAction, Mode

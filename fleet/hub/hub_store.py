@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Self
 
-from fleet.hub import authority
-from fleet.hub.authority import BadRequestForCertificate, KeyPair
-from fleet.hub.rules import access_control
+from fleet.hub import certificate_authority
+from fleet.hub.access_rules import access_control
+from fleet.hub.certificate_authority import BadRequestForCertificate, KeyPair
 from fleet.hub.x509_parts import LIFETIME
 from schemas.atomic_file import write_atomically
 from schemas.bus import BusError, Credentials, NoCredentials
@@ -137,10 +137,10 @@ class HubStore:
             )
         with self._changing():
             if not self.is_hub:
-                self._write_pair("ca", authority.make_authority(now))
+                self._write_pair("ca", certificate_authority.make_authority(now))
             names = tuple(dict.fromkeys(("localhost", "127.0.0.1", *addresses)))
             if self._is_due(HUB, now, names):
-                self._write_pair(HUB, authority.issue(self._authority(), HUB, now, names))
+                self._write_pair(HUB, certificate_authority.issue(self._authority(), HUB, now, names))
             taken = {me, *take}
             for identity in dict.fromkeys((*identities, *take, me)):
                 self._ensure_local(identity, now, take=identity in taken)
@@ -170,7 +170,7 @@ class HubStore:
             entry = self.known.get(identity)
             if entry is None or entry.revoked or entry.generation != reserved.generation:
                 raise BadRequestForCertificate(f"{identity} was revoked, or invited again, meanwhile")
-            certificate = authority.sign_request(
+            certificate = certificate_authority.sign_request(
                 self._authority(), request, entry.common_name(identity), now, addresses
             )
             entry.until = _until(now)
@@ -178,7 +178,7 @@ class HubStore:
         return certificate
 
     def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
-        """Return the next certificate of an identity, PEM, for the key that it has. See `authority.renew`.
+        """Return the next certificate of an identity, PEM, for the key that it has. See `certificate_authority.renew`.
 
         Raises BadRequestForCertificate, also if the identity is revoked, and OSError.
         """
@@ -186,7 +186,9 @@ class HubStore:
             entry = self.known.get(identity)
             if entry is None or entry.revoked:
                 raise BadRequestForCertificate(f"{identity} is revoked, or was never invited")
-            made = authority.renew(self._authority(), certificate, request, entry.common_name(identity), now)
+            made = certificate_authority.renew(
+                self._authority(), certificate, request, entry.common_name(identity), now
+            )
             entry.until = _until(now)
             self._save()
         return made
@@ -194,10 +196,13 @@ class HubStore:
     def renew_hub(self, now: datetime) -> bool:
         """Make the next certificate of the hub itself if it is due. Return False if it is not. Raises OSError."""
         certificate = self._read(HUB)
-        if not authority.is_due(certificate, now):
+        if not certificate_authority.is_due(certificate, now):
             return False
         with self._changing():
-            self._write_pair(HUB, authority.issue(self._authority(), HUB, now, authority.names_of(certificate)))
+            self._write_pair(
+                HUB,
+                certificate_authority.issue(self._authority(), HUB, now, certificate_authority.names_of(certificate)),
+            )
         return True
 
     def revoke(self, identity: str) -> bool:
@@ -225,7 +230,7 @@ class HubStore:
         elif not self._is_due(identity, now):
             return
         entry.local, entry.until = True, _until(now)
-        self._write_pair(identity, authority.issue(self._authority(), entry.common_name(identity), now))
+        self._write_pair(identity, certificate_authority.issue(self._authority(), entry.common_name(identity), now))
         self.known[identity] = entry
 
     def _next(self, identity: str, now: datetime) -> KnownIdentity:
@@ -236,8 +241,8 @@ class HubStore:
     def _is_due(self, name: str, now: datetime, addresses: Iterable[str] = ()) -> bool:
         """Return True if a certificate on this computer must be made: it is missing, damaged, or must be renewed."""
         certificate = self._read(name)
-        is_whole = authority.belong(certificate, self._read(name, "key"))
-        return not is_whole or authority.is_due(certificate, now, addresses)
+        is_whole = certificate_authority.belong(certificate, self._read(name, "key"))
+        return not is_whole or certificate_authority.is_due(certificate, now, addresses)
 
     def _save(self, listens: Iterable[str] = ()) -> None:
         """Write the identities, and the rules if they changed: the hub restarts then."""
@@ -260,7 +265,7 @@ class HubStore:
 
     def _authority(self) -> KeyPair:
         found = KeyPair((self.directory / CA_FILE).read_bytes(), (self.directory / CA_KEY_FILE).read_bytes())
-        if not authority.belong(found.certificate, found.key):
+        if not certificate_authority.belong(found.certificate, found.key):
             raise BrokenHub(
                 f"{self.directory / CA_KEY_FILE} is not the key of {CA_FILE}: restore both from a copy, or move the "
                 "directory away, `fleet hub init`, and let everyone join again."

@@ -17,8 +17,8 @@ from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from fleet.hub import authority
-from fleet.hub.authority import BadRequestForCertificate
+from fleet.hub import certificate_authority
+from fleet.hub.certificate_authority import BadRequestForCertificate
 from fleet.hub.hub_store import HubStore
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
 from schemas.bus import BusError
@@ -73,7 +73,7 @@ class Invitation:
     ) -> None:
         """Listen. Raises OSError if the port is in use."""
         ca = (store.directory / CA_FILE).read_bytes()
-        self.code = JoinCode.new(authority.fingerprint(ca))
+        self.code = JoinCode.new(certificate_authority.fingerprint(ca))
         self.joined_from = ""
         """Address of the computer that has joined; empty before."""
         self._answer = {"port": hub_port, "fleet_file": fleet_file, "identity": identity}
@@ -189,8 +189,8 @@ def join(
     ca, fits = b"", False
     try:
         # Just one: OpenSSL would trust each of several, and the code is about the first.
-        ca = authority.only_certificate(str(found.get("ca")).encode())
-        fits = code.fits(authority.fingerprint(ca))
+        ca = certificate_authority.only_certificate(str(found.get("ca")).encode())
+        fits = code.fits(certificate_authority.fingerprint(ca))
     except ValueError:
         pass
     if not fits:
@@ -199,7 +199,7 @@ def join(
             "right, somebody in this network pretends to be the hub."
         )
     known = ssl.create_default_context(cadata=ca.decode())
-    key, request = authority.new_request("joins")
+    key, request = certificate_authority.new_request("joins")
     own = {"addresses": list(addresses)[:MAX_HUB_NAMES]}
     asked = {"secret": code.secret, "request": base64.b64encode(request).decode(), **own}
     found = _ask(where, known, "POST", json.dumps(asked).encode())
@@ -207,7 +207,7 @@ def join(
         certificate = str(found["certificate"]).encode()
         if role_of(str(found["identity"])) is None:  # it becomes the name of a file
             raise NotJoined(f"{where} gave no identity: {printable(str(found['identity']))}")
-        if authority.expires(certificate).timestamp() <= clock():
+        if certificate_authority.expires(certificate).timestamp() <= clock():
             raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")
         rules, text = dict(found.get("rules", {})), str(found["fleet_file"])
         return Joined(str(found["identity"]), int(found["port"]), ca, certificate, key, text, rules)

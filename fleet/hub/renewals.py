@@ -10,7 +10,7 @@ import json
 import sys
 from datetime import UTC, datetime
 
-from fleet.hub.authority import BadRequestForCertificate
+from fleet.hub.certificate_authority import BadRequestForCertificate
 from fleet.hub.hub_store import HubStore
 from schemas.bus import BusError
 from schemas.bus.hub_renewals import MAX_RENEWAL_BYTES

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from fleet.policy.allocation import Barrier, Candidates, RoleAllocation, allocate, follow_needs
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import Decision, DecisionKind
 from fleet.policy.explain import (
@@ -28,6 +27,7 @@ from fleet.policy.explain import (
     is_reworded,
 )
 from fleet.policy.plan.plan import Effect, Plan, Rule
+from fleet.policy.role_allocation import Barrier, Candidates, RoleAllocation, allocate, follow_needs
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import (

@@ -3,8 +3,8 @@
 The gateway's own words are longer: they say what to type.
 """
 
-from schemas.authority import Bar, Denial, Estop, FleetPause, LeaseState, Loan, People, Sender
 from schemas.keys import person_of
+from schemas.rights import Bar, Denial, Estop, FleetPause, LeaseState, Loan, People, Sender
 from schemas.words import Rank
 
 

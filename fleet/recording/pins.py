@@ -1,6 +1,6 @@
 """Pins of a session: times that the quota takes last, each with its cause. Pure.
 
-`pin_watch.py` finds them live, `session.json` keeps them, `quota_order.py` spares them. A pin may reach beyond its
+`pin_watch.py` finds them live, `session.json` keeps them, `quota_choice.py` spares them. A pin may reach beyond its
 session: what lay before it is in the one before.
 """
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Final
 
 from schemas import keys
-from schemas.limits import CRITICAL_V, LOW_V
+from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.topics import CAR_TOPICS, TOPICS, Topic
 from schemas.words import FrameVerdict, Phase
 

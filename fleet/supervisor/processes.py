@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from fleet.supervisor import cpu_time
-from fleet.supervisor.admission import Admission
 from fleet.supervisor.child import Child, Log
 from fleet.supervisor.hang import Pulse, WatchClock, are_many, longest_hub_silence_s, longest_silence_s
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, HUNG, WRONG_USE_RETRY_S, ProcessState, RestartAction
 from fleet.supervisor.spec import PATIENCE
+from fleet.supervisor.start_limit import Admission
 from schemas.words import ProcessKind, RunState
 
 SUPERVISOR_POLL_INTERVAL_S: Final = 0.1

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from gateway.bus import requests
+from gateway.bus import command_parser
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
 from gateway.bus.service import Request
@@ -17,7 +17,7 @@ from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resu
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
 from gateway.control.events import CommandRecord, LogRecord
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import json_log
@@ -97,9 +97,11 @@ class CommandHandler:
         """Parse a request and pass it to control. Its first record has the original request."""
         now = self._clock()
         try:
-            command = requests.parse(request, time.time_ns(), car=self._car, longest_drive_s=self._longest_drive_s)
+            command = command_parser.parse(
+                request, time.time_ns(), car=self._car, longest_drive_s=self._longest_drive_s
+            )
             answer = self._control.command(command, now)
-        except requests.BadRequest as error:
+        except command_parser.BadRequest as error:
             command = error.command
             answer = self._control.record_rejection(command, error.reason, error.words, now)
         self._publish_records(command.id, request)

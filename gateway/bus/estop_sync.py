@@ -10,13 +10,13 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gateway.bus.requests import MAX_NAME_LENGTH
+from gateway.bus.command_parser import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from schemas import bus, keys, messages
-from schemas.authority import estops_of, pauses_of
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import estops_of, pauses_of
 from schemas.words import Scope
 
 BATCH_DELAY_S: Final = 0.2

@@ -6,7 +6,7 @@ A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from schemas.limits import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
+from schemas.battery_levels import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
 SAG_V: Final = 0.4

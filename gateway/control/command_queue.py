@@ -7,10 +7,10 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from gateway.control.command_log import CommandLog, Pending
-from gateway.control.safety import Safety
-from gateway.control.senders import Senders
-from schemas.authority import Sender
+from gateway.control.holds_and_leases import Safety
+from gateway.control.sender_presence import Senders
 from schemas.limits import MAX_QUEUE_TIME_S
+from schemas.rights import Sender
 from schemas.words import Motion, Phase, Reason
 
 

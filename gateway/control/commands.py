@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from schemas.authority import Sender
 from schemas.commands import Verb
+from schemas.rights import Sender
 from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Final, Generic, TypeVar, assert_never
 
-from gateway.control import arbiter
+from gateway.control import refusals
 from gateway.control.battery import BatteryPolicy
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
@@ -32,11 +32,11 @@ from gateway.control.commands import (
 )
 from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
 from gateway.control.events import Record
-from gateway.control.safety import LEASE_S, PersistedSafety, Safety
-from gateway.control.senders import Senders
-from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
+from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
+from gateway.control.sender_presence import Senders
 from schemas.keys import name_of
 from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
+from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
@@ -168,7 +168,7 @@ class Controller(Generic[D_co]):
             return self._stop(pending, now)
         # Track a drive even if it is refused: after a stop the end of a lease must not start it.
         halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
-        refusal = arbiter.refuse(command, self._context(now, self.driver.refusal(what)))
+        refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what)))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         if halted:
@@ -182,7 +182,7 @@ class Controller(Generic[D_co]):
         if isinstance(what, Pause):
             return self._stop(pending, now)
         self._log.accept(command)
-        if arbiter.needs(what).lease:
+        if refusals.needs(what).lease:
             self._grant_lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
         if moves and command.sender.kind is not Rank.COORDINATOR:  # a release ends no hold
@@ -592,8 +592,8 @@ class Controller(Generic[D_co]):
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)
         )
 
-    def _context(self, now: float, unsupported: str | None = None) -> arbiter.CommandContext:
-        return arbiter.CommandContext(
+    def _context(self, now: float, unsupported: str | None = None) -> refusals.CommandContext:
+        return refusals.CommandContext(
             car=self.car,
             now=now,
             unsupported=unsupported,

@@ -34,9 +34,9 @@ from gateway.control.events import CommandRecord
 from gateway.drivers import Family
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
-from schemas.authority import Sender
 from schemas.commands import COMMANDS
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
+from schemas.rights import Sender
 from schemas.topics import TOPICS
 from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
 from schemas.words import Light as LightWord

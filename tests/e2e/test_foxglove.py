@@ -134,7 +134,7 @@ def test_a_client_reads_a_car_live_with_its_schemas(tmp_path: Path) -> None:
         assert server.stderr == ""
 
 
-def test_remaining_gateway_gets_port_of_yielding_one(tmp_path: Path, fleet: FleetProcesses) -> None:
+def test_odd_messages_and_stalled_client_disturb_nobody(tmp_path: Path, fleet: FleetProcesses) -> None:
     count, payload = 20_000, pb.Range(range_m=1.5, car="x" * 1000).SerializeToString()
     range_key, plan_key, own = "fleet/red/sensor/range", "fleet/@coordinator/plan", "fleet/red/sensor/battery"
 

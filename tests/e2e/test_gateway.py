@@ -382,7 +382,7 @@ cli.main()
 """
 
 
-def test_driver_is_told_at_once_of_killed_gateway(fleet: FleetProcesses) -> None:
+def test_remaining_gateway_gets_port_of_yielding_one(fleet: FleetProcesses) -> None:
     """Neither saw the other in time; the one with the higher id was faster to open the port, and looks again later."""
     _, (link,) = fleet.simulate("red:arduino:pty")
     arguments = ("run", "--car", "red", "--link", link, "--platform", "arduino")
@@ -446,7 +446,7 @@ def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None
     assert wait_for(lambda: not fleet.get(f"fleet/{car}/**"), "nobody answers for it")
 
 
-def test_killed_gateway_leaves_car_driving_until_successor_stops_it(fleet: FleetProcesses) -> None:
+def test_driver_is_told_at_once_of_killed_gateway(fleet: FleetProcesses) -> None:
     """Only a person can stop the car then, and must learn of the kill before the end of the drive."""
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     gateway = fleet.gateway(link)
@@ -482,7 +482,7 @@ def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
     assert taken[-1].count > 1
 
 
-def test_link_that_dies_at_once_is_not_reopened_in_a_loop(fleet: FleetProcesses) -> None:
+def test_killed_gateway_leaves_car_driving_until_successor_stops_it(fleet: FleetProcesses) -> None:
     sim, (link,) = fleet.simulate("red:arduino:pty")
     gateway = fleet.gateway(link)
     fleet.ready()
@@ -537,7 +537,7 @@ def test_a_link_that_drops_comes_back_by_itself(fleet: FleetProcesses, tmp_path:
     assert gateway.end() == 0
 
 
-def test_killed_hub_returns_and_commands_work_again(fleet: FleetProcesses) -> None:
+def test_link_that_dies_at_once_is_not_reopened_in_a_loop(fleet: FleetProcesses) -> None:
     """Each opening of a real port may reset the car's board. A log line for each opening would flood the log."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(PATIENCE_S)
@@ -555,7 +555,7 @@ def test_killed_hub_returns_and_commands_work_again(fleet: FleetProcesses) -> No
     gateway.end()
 
 
-def test_restored_link_stops_car_at_once(fleet: FleetProcesses) -> None:
+def test_killed_hub_returns_and_commands_work_again(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate("red:raspberry_pi:tcp", "blue:raspberry_pi:tcp")
     fleet.gateway(links[0], platform="raspberry_pi")
     fleet.gateway(links[1], platform="raspberry_pi", car="blue")

@@ -15,13 +15,13 @@ from tests.support.processes import FleetProcesses, driving, wait_for
 
 
 @pytest.mark.soak
-def test_raspberry_pi_car_of_killed_gateway_drives_on_and_is_told(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_restored_link_stops_car_at_once(fleet: FleetProcesses, tmp_path: Path) -> None:
     found = cut_links(fleet, tmp_path)
     late = {what: str(took) for what, took in found.items() if took.took_s > took.limit_s + BUSY_S}
     assert not late, late
 
 
-def test_gateway_without_hub_stops_car(fleet: FleetProcesses) -> None:
+def test_raspberry_pi_car_of_killed_gateway_drives_on_and_is_told(fleet: FleetProcesses) -> None:
     """The car's program dies with its client. No gateway can stop the car, and none claims that it stands.
 
     See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
@@ -53,7 +53,7 @@ def test_gateway_without_hub_stops_car(fleet: FleetProcesses) -> None:
     assert judge.driving
 
 
-def test_stop_without_hub_says_not_stopped_until_hub_returns(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_gateway_without_hub_stops_car(fleet: FleetProcesses, tmp_path: Path) -> None:
     """The network is away. The watchdog has ended a gateway whose car drives, and its successor starts."""
     sim, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
     gateway = fleet.gateway(link)

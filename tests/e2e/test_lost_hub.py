@@ -47,7 +47,7 @@ def sim(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> GatewayProces
     return sim
 
 
-def test_each_docs_program_runs_or_compiles(fleet: FleetProcesses, sim: GatewayProcess) -> None:
+def test_stop_without_hub_says_not_stopped_until_hub_returns(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     with without_hub(fleet):
         for words in (["stop"], ["stop", "red"], ["stop", "--json"], ["estop"], ["estop", "red"]):
             done = fleet_command(*words, environment=fleet.environment)

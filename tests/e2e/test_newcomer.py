@@ -185,7 +185,7 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
     assert every - newcomer.typed == set(NOT_RUN), "neither run, nor in the list with a reason"
 
 
-def test_killed_hub_loses_and_duplicates_no_recorded_message() -> None:
+def test_each_docs_program_runs_or_compiles() -> None:
     """Programs with a name run above. Programs without a name are fragments."""
     for page in (README, *(ROOT / "docs").rglob("*.md")):
         for language, title, body in blocks(page):

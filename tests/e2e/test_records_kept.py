@@ -40,7 +40,7 @@ class Records:
         return [log.name.removeprefix("red ") for log in self.logs]
 
 
-def test_events_without_hub_are_published_when_it_returns(fleet: FleetProcesses) -> None:
+def test_gateway_reports_sleep_longer_than_bus_timeout(fleet: FleetProcesses) -> None:
     records, judge = Records(fleet), Judge.follow(fleet.bus)
     _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
     gateway = fleet.gateway(link)
@@ -55,7 +55,7 @@ def test_events_without_hub_are_published_when_it_returns(fleet: FleetProcesses)
     wait_for(lambda: not judge.driving, "it stands")  # the car's own answer does not need the bus
 
 
-def test_hub_hang_at_end_of_recording_loses_no_message(fleet: FleetProcesses) -> None:
+def test_events_without_hub_are_published_when_it_returns(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
     tap = Tap(link)
     try:
@@ -74,7 +74,7 @@ def test_hub_hang_at_end_of_recording_loses_no_message(fleet: FleetProcesses) ->
         tap.close()
 
 
-def test_rover_drives_shows_stop_and_publishes_measurements(
+def test_hub_hang_at_end_of_recording_loses_no_message(
     fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end waits for the hub, too

@@ -9,8 +9,8 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from fleet.client.client import Fleet as Client
-from fleet.hub import authority
-from fleet.hub.authority import BadRequestForCertificate
+from fleet.hub import certificate_authority
+from fleet.hub.certificate_authority import BadRequestForCertificate
 from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
@@ -34,8 +34,8 @@ pytestmark = pytest.mark.xdist_group("renewal")
 def age(store: HubStore, identity: str, by: timedelta) -> None:
     """Make the certificate of an identity older, for the same key."""
     directory = store.directory
-    ca = authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
-    made = authority.issue(ca, identity, datetime.now(UTC) - by)
+    ca = certificate_authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
+    made = certificate_authority.issue(ca, identity, datetime.now(UTC) - by)
     (directory / f"{identity}.key").write_bytes(made.key)
     (directory / f"{identity}.pem").write_bytes(made.certificate)
 
@@ -125,7 +125,7 @@ def test_nobody_gets_the_certificate_of_another_one_and_whoever_is_revoked_gets_
     for ending, data in files.items():
         (store.directory / f"{EVE}{ending}").write_bytes(data)
     wait_for(lambda: ask(keys.renewal_key(EVE)) == [], "she gets nothing any more")
-    _, request = authority.new_request(EVE)
+    _, request = certificate_authority.new_request(EVE)
     now, read = datetime.now(UTC), HubStore.load(store.credentials)
     with pytest.raises(BadRequestForCertificate, match="revoked"):
         read.renew(files[".pem"], request, EVE, now)

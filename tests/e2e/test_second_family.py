@@ -20,7 +20,7 @@ def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
     made.close()
 
 
-def test_command_under_another_name_is_refused_but_stop_holds(fleet: FleetProcesses) -> None:
+def test_rover_drives_shows_stop_and_publishes_measurements(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate("red:ugv_rover:pty", truth=True)
     fleet.gateway(links[0], platform="ugv_rover")
     fleet.ready()

@@ -15,7 +15,7 @@ import zenoh
 
 from fleet.client.client import Fleet as Client
 from fleet.client.refused import why_refused
-from fleet.hub import authority
+from fleet.hub import certificate_authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
@@ -115,7 +115,7 @@ def test_what_the_people_table_says_is_what_happens(identity: str, stage: Secure
     assert wrong == []
 
 
-def test_locator_publishes_poses_and_person_does_not(stage: SecureStage) -> None:
+def test_command_under_another_name_is_refused_but_stop_holds(stage: SecureStage) -> None:
     stage.free()
     with stage.client(MIA) as mia:
         for kind, sender in (("person", sender_of(ANN)), ("coordinator", sender_of(MIA)), ("script", "anonymous")):
@@ -158,7 +158,7 @@ def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -
     assert not [token for token in tokens if "/ann@" in token]
 
 
-def test_stop_during_hub_hang_arrives_after_it(stage: SecureStage) -> None:
+def test_locator_publishes_poses_and_person_does_not(stage: SecureStage) -> None:
     locator = service(Service.LOCATOR)
     with Client(stage.fleet.endpoint, identity=locator) as outside, Client(stage.fleet.endpoint, identity=MIA) as mia:
 
@@ -216,11 +216,11 @@ def foreign(directory: Path) -> dict[str, dict[str, Any]]:
     """Return the settings of clients that the hub must refuse, and why."""
     now = datetime.now(UTC)
     own = {name: (directory / f"{name}.pem").read_bytes() for name in ("ca", EVE)}
-    ca = authority.KeyPair(own["ca"], (directory / "ca.key").read_bytes())
+    ca = certificate_authority.KeyPair(own["ca"], (directory / "ca.key").read_bytes())
     made = {
-        "another authority": authority.issue(authority.make_authority(now), ANN, now),
-        "expired": authority.issue(ca, ANN, now - LIFETIME - timedelta(days=2)),
-        "not yet": authority.issue(ca, ANN, now + timedelta(days=30)),
+        "another authority": certificate_authority.issue(certificate_authority.make_authority(now), ANN, now),
+        "expired": certificate_authority.issue(ca, ANN, now - LIFETIME - timedelta(days=2)),
+        "not yet": certificate_authority.issue(ca, ANN, now + timedelta(days=30)),
     }
     found: dict[str, dict[str, Any]] = {"no certificate": {}}
     for why, pair in made.items():
@@ -245,9 +245,9 @@ def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
 )
 def test_whose_certificate_has_ended_reads_so(begins: timedelta, words: str, stage: SecureStage) -> None:
     directory = stage.store.directory
-    ca = authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
+    ca = certificate_authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
     late = person("late")
-    pair = authority.issue(ca, late, datetime.now(UTC) + begins)
+    pair = certificate_authority.issue(ca, late, datetime.now(UTC) + begins)
     for ending, data in (("pem", pair.certificate), ("key", pair.key)):
         (directory / f"{late}.{ending}").write_bytes(data)
     with pytest.raises(BusError, match=f"{late} {words}"):
@@ -257,8 +257,8 @@ def test_whose_certificate_has_ended_reads_so(begins: timedelta, words: str, sta
 def test_a_certificate_that_no_rule_knows_gets_nothing(stage: SecureStage) -> None:
     """Somebody has the authority's key, or the hub's list was restored from an old copy."""
     directory = stage.store.directory
-    ca = authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
-    pair = authority.issue(ca, "person.zoe", datetime.now(UTC))
+    ca = certificate_authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
+    pair = certificate_authority.issue(ca, "person.zoe", datetime.now(UTC))
     (directory / "person.zoe.pem").write_bytes(pair.certificate)
     (directory / "person.zoe.key").write_bytes(pair.key)
     with stage.client("person.zoe") as zoe:

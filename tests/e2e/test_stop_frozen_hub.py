@@ -51,7 +51,7 @@ def post_stop(port: int, stop_id: str = "") -> int:
     "frozen_s",
     [*(pytest.param(each, marks=pytest.mark.soak) for each in (0.5 * LEASE_S, LEASE_S + 0.5)), 2 * LEASE_S],
 )
-def test_stop_command_at_hung_hub_says_not_stopped(fleet: FleetProcesses, judge: Judge, frozen_s: float) -> None:
+def test_stop_during_hub_hang_arrives_after_it(fleet: FleetProcesses, judge: Judge, frozen_s: float) -> None:
     console = ConsoleProcess(fleet)
     assert post_stop(console.port) == 204
     drive_by_a_mode(fleet, judge)
@@ -68,7 +68,7 @@ def test_stop_command_at_hung_hub_says_not_stopped(fleet: FleetProcesses, judge:
     assert post_stop(console.port, "a") == 204
 
 
-def test_terminated_gateway_stops_car_or_says_not_stopped(fleet: FleetProcesses, judge: Judge) -> None:
+def test_stop_command_at_hung_hub_says_not_stopped(fleet: FleetProcesses, judge: Judge) -> None:
     drive_by_a_mode(fleet, judge)
     freeze(fleet.hub.pid)
     try:

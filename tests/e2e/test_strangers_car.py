@@ -37,7 +37,7 @@ def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: ForeignLot) ->
 
 
 @pytest.mark.timeout(240)
-def test_unreachable_cars_are_named_at_end_and_stopped_until_second_ctrl_c(lot: ForeignLot) -> None:
+def test_terminated_gateway_stops_car_or_says_not_stopped(lot: ForeignLot) -> None:
     """One wire is broken for good, and the others have gaps."""
     wanted = gaps(MODES, 20) | {"light_seeking": ByteGap(GapDirection.BOTH, 3600.0)}
     lot.cars.enter_modes(lot.fleet)
@@ -65,7 +65,9 @@ def test_unreachable_cars_are_named_at_end_and_stopped_until_second_ctrl_c(lot: 
 
 @pytest.mark.soak
 @pytest.mark.timeout(240)
-def test_killed_script_leaves_no_driving_car_and_no_lease(tmp_path: Path, fleet: FleetProcesses) -> None:
+def test_unreachable_cars_are_named_at_end_and_stopped_until_second_ctrl_c(
+    tmp_path: Path, fleet: FleetProcesses
+) -> None:
     """The wires pass the cars' readings and lose all frames to the cars: red's for some seconds, blue's for good.
 
     test_up.py tests that `fleet up` ends by itself when the last car stands.

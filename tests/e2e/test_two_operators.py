@@ -191,7 +191,7 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
     assert taken.endswith("from bot (script)")
 
 
-def test_stop_all_reaches_successor_of_hung_gateway(fleet: FleetProcesses, sim: GatewayProcess) -> None:
+def test_killed_script_leaves_no_driving_car_and_no_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     script = fleet.start("-c", SCRIPT)
     wait_for(lambda: drives(fleet, "bot") and driving(sim), "the script drives")
     script.kill()

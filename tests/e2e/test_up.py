@@ -103,7 +103,7 @@ def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
 
 
 @pytest.mark.parametrize("token_is_gone", [True, False])
-def test_hung_hub_is_replaced(up: Up, token_is_gone: bool) -> None:
+def test_stop_all_reaches_successor_of_hung_gateway(up: Up, token_is_gone: bool) -> None:
     """Its token ends after 2 s, and the supervisor replaces it after 4 s. A stop in between must reach the car."""
     pid = up.running("green")
     freeze(pid)
@@ -121,7 +121,7 @@ def test_hung_hub_is_replaced(up: Up, token_is_gone: bool) -> None:
     assert up.fleet("resume", "red", "green").returncode == 0
 
 
-def test_hold_of_earlier_run_is_told_at_start(tmp_path: Path) -> None:
+def test_hung_hub_is_replaced(tmp_path: Path) -> None:
     with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
         started.ready("red")
         hub, red = started.running("@hub"), started.running("red")
@@ -215,7 +215,7 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         assert "is stopped (confirmed)" in started.fleet("logs", "red").stdout
 
 
-def test_ctrl_c_stops_cars_and_second_one_does_not_hurry(tmp_path: Path) -> None:
+def test_hold_of_earlier_run_is_told_at_start(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state")}
     try:
@@ -238,7 +238,7 @@ def test_ctrl_c_stops_cars_and_second_one_does_not_hurry(tmp_path: Path) -> None
         assert not started.get("red/state/safety").HasField("hold")
 
 
-def test_switched_off_car_delays_nobody_and_is_not_restarted(tmp_path: Path) -> None:
+def test_ctrl_c_stops_cars_and_second_one_does_not_hurry(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state"), "TERM": "xterm"}
     master, slave = pty.openpty()
@@ -291,7 +291,7 @@ def test_switched_off_car_delays_nobody_and_is_not_restarted(tmp_path: Path) -> 
         reader.join()
 
 
-def test_shutdown_stops_cars_of_hung_or_killed_gateways(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_switched_off_car_delays_nobody_and_is_not_restarted(fleet: FleetProcesses, tmp_path: Path) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
     off = f"tcp://127.0.0.1:{free_port()}"
     file = _file(tmp_path, blue=off, red=link)
@@ -325,7 +325,7 @@ def test_killed_its_cars_are_stopped(fleet: FleetProcesses, tmp_path: Path) -> N
         wait_for(lambda: not [pid for pid in theirs if _exists(pid)], "all end")
 
 
-def test_unreachable_car_at_shutdown_is_retried_by_fresh_gateways(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_shutdown_stops_cars_of_hung_or_killed_gateways(fleet: FleetProcesses, tmp_path: Path) -> None:
     sims = {car: fleet.simulate(f"{car}:arduino:tcp") for car in ("red", "green", "blue")}
     file = _file(tmp_path, **{car: link for car, (_, (link,)) in sims.items()})
     with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
@@ -356,7 +356,7 @@ def test_unreachable_car_at_shutdown_is_retried_by_fresh_gateways(fleet: FleetPr
         assert said["@supervisor"] == "NOT STOPPED: blue. They may be moving: go to them."
 
 
-def test_fleet_down_names_unstopped_car_and_fails(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_unreachable_car_at_shutdown_is_retried_by_fresh_gateways(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
         started.ready("red")
@@ -373,7 +373,7 @@ def test_fleet_down_names_unstopped_car_and_fails(fleet: FleetProcesses, tmp_pat
         assert started.process.wait() == 0
 
 
-def test_terminated_during_start_ends_at_once_in_order(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_fleet_down_names_unstopped_car_and_fails(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
         started.ready("red")
@@ -390,7 +390,7 @@ def test_terminated_during_start_ends_at_once_in_order(fleet: FleetProcesses, tm
 
 
 @pytest.mark.parametrize("until", ["@hub", "red", "green"])
-def test_killed_simulator_leaves_no_stale_path(tmp_path: Path, until: str) -> None:
+def test_terminated_during_start_ends_at_once_in_order(tmp_path: Path, until: str) -> None:
     with Up(tmp_path, free_endpoint(), "--sim", "2", "--no-record") as started:
         started.until("process", until, "started")
         assert started.process.end(signal.SIGINT) == 0
@@ -400,7 +400,7 @@ def test_killed_simulator_leaves_no_stale_path(tmp_path: Path, until: str) -> No
         assert not started.left(ours=True)
 
 
-def test_removed_car_is_stopped_though_its_gateway_hangs(tmp_path: Path) -> None:
+def test_killed_simulator_leaves_no_stale_path(tmp_path: Path) -> None:
     with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
         started.ready("red")
         (run,) = (tmp_path / "state" / "buses").glob("*/runs/fleet/*")
@@ -410,7 +410,7 @@ def test_removed_car_is_stopped_though_its_gateway_hangs(tmp_path: Path) -> None
         assert not [each for each in run.glob("*.tty") if each.is_symlink()]
 
 
-def test_reload_applies_what_it_can_and_bad_file_changes_nothing(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_removed_car_is_stopped_though_its_gateway_hangs(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp")
     file = _file(tmp_path, red=links[0], green=links[1])
     with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
@@ -427,7 +427,7 @@ def test_reload_applies_what_it_can_and_bad_file_changes_nothing(fleet: FleetPro
         wait_for(lambda: started.state("green") is None, "its gateway has ended")
 
 
-def test_coordinator_takes_new_plan_and_refuses_bad_one(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_reload_applies_what_it_can_and_bad_file_changes_nothing(fleet: FleetProcesses, tmp_path: Path) -> None:
     _, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp", "blue:arduino:tcp")
     red, green, blue = links
     file = _file(tmp_path, red=red, green=green)
@@ -466,7 +466,7 @@ def test_coordinator_takes_new_plan_and_refuses_bad_one(fleet: FleetProcesses, t
         assert started.running("red") == before["red"]
 
 
-def test_coordinator_keeps_accepted_plan_when_files_change(job: Up) -> None:
+def test_coordinator_takes_new_plan_and_refuses_bad_one(job: Up) -> None:
     plan = job.directory / "plan.yaml"
     pid = job.running("@coordinator")
     plan.write_text("roles: {follow: {mode: trakking}, seek: {mode: light_seeking}}\n")
@@ -483,7 +483,7 @@ def test_coordinator_keeps_accepted_plan_when_files_change(job: Up) -> None:
     assert answer is None or "follow: {mode: light_seeking}" in answer.text, "the one after it has the new plan, too"
 
 
-def test_plan_from_bus_outlives_its_coordinator(job: Up) -> None:
+def test_coordinator_keeps_accepted_plan_when_files_change(job: Up) -> None:
     pid = job.running("@coordinator")
     (job.directory / "fleet.yaml").write_text("cars: [\n")
     (job.directory / "plan.yaml").unlink()
@@ -516,7 +516,7 @@ def test_reload_restores_a_plan_that_was_replaced_over_the_bus(job: Up) -> None:
     assert job.fleet("reload").stdout == "nothing has changed\n"
 
 
-def test_unreachable_plan_is_refused(job: Up) -> None:
+def test_plan_from_bus_outlives_its_coordinator(job: Up) -> None:
     pid = _given_another_job(job)
     job.until("process", "@coordinator", "came over the bus. It is in force until `fleet reload`.")
     job.kill(pid)
@@ -547,7 +547,7 @@ def test_reload_on_a_full_disk_changes_nothing(job: Up) -> None:
     wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the new plan says")
 
 
-def test_unwritable_recording_place_is_refused_at_start(job: Up) -> None:
+def test_unreachable_plan_is_refused(job: Up) -> None:
     bad = "roles: {follow: {mode: tracking, cars: [eve]}, seek: {mode: light_seeking}}\n"
     (job.directory / "plan.yaml").write_text(bad)
     refused = job.fleet("reload")
@@ -582,7 +582,7 @@ def test_wrong_use_starts_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_paused_recording_is_told_by_up_status_doctor_and_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_recording_place_is_refused_at_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     done = fleet_command("up", "--sim", "1", "--sessions", str(tmp_path / "file" / "sessions"), environment={})
@@ -591,7 +591,7 @@ def test_paused_recording_is_told_by_up_status_doctor_and_down(tmp_path: Path, m
     assert "--no-record" in done.stderr
 
 
-def test_temporarily_full_disk_loses_nothing_and_all_agree(tmp_path: Path) -> None:
+def test_paused_recording_is_told_by_up_status_doctor_and_down(tmp_path: Path) -> None:
     """The status is what the recorder of a full disk publishes (tests/fleet/recording/scenarios/test_disk.py)."""
     with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as up:
         up.until("ready", "@supervisor", "red is ready")
@@ -631,7 +631,7 @@ def small_disk(place: Path) -> Iterator[Disk]:
 
 @pytest.mark.xdist_group("disk")
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
-def test_hung_gateway_feeds_no_watchdog_and_successor_stops_car(tmp_path: Path) -> None:
+def test_temporarily_full_disk_loses_nothing_and_all_agree(tmp_path: Path) -> None:
     with small_disk(tmp_path) as there, Up(tmp_path, free_endpoint(), "--sim", "1") as up:
         up.until("ready", "@supervisor", "red is ready")
         session = Path(up.status().session)

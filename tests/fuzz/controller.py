@@ -36,8 +36,8 @@ from gateway.control.events import CommandRecord, OutgoingFrame
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.authority import NO_PEOPLE, Estop, FleetPause, People, Sender
 from schemas.commands import Verb
+from schemas.rights import NO_PEOPLE, Estop, FleetPause, People, Sender
 from schemas.words import Basis, FrameOrigin, Light, Mode, Motion, Phase, Platform, Rank, Reason, ServoAction, SpeedStep
 from tests.support.controls import Control, control
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gateway.control.commands import EmergencyStop, Find, PartAction, Resume, SetMode, Stop
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
-from schemas.authority import Sender
+from schemas.rights import Sender
 from schemas.words import Mode, Phase
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
 from tests.support.stops import WORLDS, state_of
@@ -143,7 +143,7 @@ class Driven:
 
 
 def wedged(pair: Pair) -> bool:
-    """Return True for the one string that no frame of recovery clears (test_stopping.py, "in_one_millisecond")."""
+    """Return True for the one string that no frame of recovery clears ("in_one_millisecond" in the tests of stops)."""
     return isinstance(pair.car, ArduinoCar) and pair.car._string.startswith("4WD")
 
 

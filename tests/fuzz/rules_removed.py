@@ -11,7 +11,7 @@ from gateway.drivers.yahboom.stop_renewal import StopRenewal
 from gateway.drivers.yahboom.stops import cases, evidence
 from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.evidence import StopEvidence
-from gateway.drivers.yahboom.stops.stopping import StopInProgress
+from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.words import Basis
 
 Patch = Callable[[object, str, Any], None]

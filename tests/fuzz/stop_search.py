@@ -20,14 +20,14 @@ from gateway.control.events import CommandRecord
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from gateway.drivers.yahboom.stops.stopping import EVIDENCE_INTERVALS, evidence_s
+from gateway.drivers.yahboom.stops.stop_in_progress import EVIDENCE_INTERVALS, evidence_s
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.factory import build
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import ECHO_RANGING_S, CarTraits
-from schemas.authority import Sender
 from schemas.commands import Verb
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
+from schemas.rights import Sender
 from schemas.words import CarTrust, Mode, Motion, Phase, Reason, Shows, Verdict
 from tests.fuzz.any_car import USABLE_S, draw_car
 from tests.support.controls import control

@@ -20,7 +20,7 @@ from gateway.sim.model.factory import build_ugv
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.ugv import LOOP_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S
 from gateway.sim.model.world import World
-from schemas.authority import Sender
+from schemas.rights import Sender
 from schemas.words import Basis, Light, Motion, Motors, Phase, Rank, Reason, SpeedStep
 
 STEP_S = 0.005

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from gateway.state_file import MAX_OTHER_LINKS, SafetyStateFile
-from schemas.authority import Estop, FleetPause, Hold, Loan
 from schemas.links import car_link, parse_link
+from schemas.rights import Estop, FleetPause, Hold, Loan
 from schemas.state_dir import directory_of
 from schemas.words import Rank
 from tests.support.ports import free_endpoint

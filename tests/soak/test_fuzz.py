@@ -1,4 +1,4 @@
-"""Ten million steps of fuzzing: decoder, controller with its arbiter, and controller with a simulated car.
+"""Ten million steps of fuzzing: decoder, controller with its refusals, and controller with a simulated car.
 
 The seeds change each day, and FUZZ_SEED repeats a run. A failure names its seed and step.
 """

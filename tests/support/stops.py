@@ -38,7 +38,7 @@ LONGEST_S = 4.6
 """Maximum time of a stop outside obstacle avoidance and restored links: the longest opening, behind a ranging."""
 AVOIDING_S = 4.3
 ENDS_S = 18.5
-"""Maximum time from the request of a stop to its last record (gateway/drivers/yahboom/stops/stopping.py)."""
+"""Maximum time from the request of a stop to its last record (gateway/drivers/yahboom/stops/stop_in_progress.py)."""
 OPENS_S = 14.0
 """Maximum time from the request of a mode to its opening. The stop before it ends within 10 s, or control gives up."""
 RATIO = 1.5
@@ -281,7 +281,7 @@ def _cases() -> Iterable[StopTestCase]:
         for name, load in (*EVERY_CAR, *NAMED):
             yield StopTestCase(name, load, world=world)
         for name, load in IN_MODES:
-            # Avoiding without an echo, the car is deaf without an end, with the motors braked (test_stopping.py).
+            # Avoiding without an echo, the car is deaf without an end, with the motors braked (a test of stops).
             if AVOIDANCE not in name or world == "echo":
                 yield StopTestCase(name, load, world=world)
         for name, load in EVERY_CAR:

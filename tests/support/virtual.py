@@ -12,7 +12,7 @@ from gateway.sim.model.firmware import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.authority import Sender
+from schemas.rights import Sender
 from schemas.words import Level, Phase, Reason
 from tests.support.controls import control
 

@@ -33,7 +33,7 @@ FORMS: Final = (
     "gateway.bus.service.Request",
     "gateway.control.commands.Command",
     "gateway.control.command_log.Pending",
-    "gateway.drivers.yahboom.stops.stopping.StopInProgress",
+    "gateway.drivers.yahboom.stops.stop_in_progress.StopInProgress",
     "gateway.control.events.OutgoingFrame",
     "gateway.control.events.CommandRecord",
     "fleet_v1_pb2.CommandEvent",

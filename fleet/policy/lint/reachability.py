@@ -11,9 +11,9 @@ from typing import Final
 from fleet.conditions import Expression, is_contradictory
 from fleet.conditions.expression import And, Compare, Literal, Name, Node, Not, Or
 from fleet.conditions.satisfiability import explain_impossible
-from fleet.policy.allocation import find_barrier
-from fleet.policy.assignment import assign
+from fleet.policy.min_cost_matching import assign
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Role, Rule
+from fleet.policy.role_allocation import find_barrier
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway import drivers
 from schemas.car_profile import CarProfile

@@ -15,8 +15,8 @@ from typing import Any, Final
 
 from fleet.recording.tools.stop_findings import asked_by
 from schemas import keys
-from schemas.authority import binding_pause
 from schemas.commands import STOPPING_VERBS
+from schemas.rights import binding_pause
 from schemas.topics import TOPICS
 from schemas.words import UNKNOWN, LinkState, Motion, Phase, Verdict
 

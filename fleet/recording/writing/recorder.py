@@ -19,17 +19,17 @@ from typing import Final
 import zenoh
 
 from fleet.fleetfile.fleet_file import PinRule
-from fleet.policy.requests import RequestRefused, check_sender
+from fleet.policy.plan_requests import RequestRefused, check_sender
 from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.pin_watch import PinWatch
 from fleet.recording.writing.receive_clock import ReceiveClock
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
-from schemas.authority import Authority, People
 from schemas.bus import Bus, SampleChannel, messages_of, reply_value, sequence_of
 from schemas.gen import fleet_v1_pb2
 from schemas.identity import NotTheSender, sender_for
+from schemas.rights import Authority, People
 from schemas.topics import TOPICS
 from schemas.words import Level, RecorderState, RecorderVerb
 

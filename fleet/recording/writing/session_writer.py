@@ -22,7 +22,7 @@ from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
 from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, free_bytes, shortage
-from fleet.recording.writing.retention import Quota
+from fleet.recording.writing.quota_removal import Quota
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
 from schemas.bus import sequence_of

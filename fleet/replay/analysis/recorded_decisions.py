@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.policy.decision import DecisionKind
-from fleet.policy.requests import EVENTS, PlanRequest
+from fleet.policy.plan_requests import EVENTS, PlanRequest
 from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
 from schemas.topics import TOPICS

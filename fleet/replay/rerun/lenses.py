@@ -14,7 +14,7 @@ import rerun.chunk as rrc
 
 from fleet.replay import panels
 from fleet.replay.panels import Curve, Derivation, StateTrack
-from schemas.limits import CRITICAL_V, LOW_V
+from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.topics import TOPICS
 
 MESSAGE_SUFFIX: Final = ":message"

@@ -20,7 +20,7 @@ from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
-from gateway.drivers.yahboom.stops.stopping import StopInProgress
+from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S

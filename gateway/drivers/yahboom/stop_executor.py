@@ -14,11 +14,11 @@ from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ModeClose
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
-from gateway.drivers.yahboom.stops import cases, sequences, stopping
+from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
 from gateway.drivers.yahboom.stops.cases import StopCase, StopFacts
 from gateway.drivers.yahboom.stops.evidence import EARLY_S, Finding
 from gateway.drivers.yahboom.stops.sequences import StopSequence
-from gateway.drivers.yahboom.stops.stopping import StopInProgress
+from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
@@ -43,11 +43,11 @@ class StopExecutor:
 
     def soft(self, now: float) -> StopSequence:
         """Return the stop that ends a drive."""
-        return stopping.soft(self.model.for_stop(now))
+        return stop_in_progress.soft(self.model.for_stop(now))
 
     def full(self, now: float) -> StopSequence:
         """Return the stop that `stop`, `estop` and a shutdown send."""
-        return stopping.full(self.model.for_stop(now))
+        return stop_in_progress.full(self.model.for_stop(now))
 
     def begin(self, sequence: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
         """Begin a stop, or join the running one if that is no weaker."""
@@ -95,12 +95,14 @@ class StopExecutor:
 
     def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         """Begin the recovery sequence, in place of any running stop."""
-        self._start(stopping.recovery(self.model.for_stop(now)), why, now, commands)
+        self._start(stop_in_progress.recovery(self.model.for_stop(now)), why, now, commands)
 
     def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         model = self.model
-        worst_s = stopping.worst_s(sequence, model.for_stop(now), model.pacing, now)
-        timeout_s = min(worst_s, stopping.MAX_ANNOUNCED_WORST_S) + stopping.evidence_s(model.profile, model.learned)
+        worst_s = stop_in_progress.worst_s(sequence, model.for_stop(now), model.pacing, now)
+        timeout_s = min(worst_s, stop_in_progress.MAX_ANNOUNCED_WORST_S) + stop_in_progress.evidence_s(
+            model.profile, model.learned
+        )
         self.running = StopInProgress(
             sequence,
             why,
@@ -109,7 +111,7 @@ class StopExecutor:
             commands,
             worst_at=now + worst_s,
             timeout_s=timeout_s,
-            reported_s=stopping.reported_s(model.profile, model.learned),
+            reported_s=stop_in_progress.reported_s(model.profile, model.learned),
             case=self._case(sequence),
         )
         model.evidence.begin_stop()
@@ -233,7 +235,9 @@ class StopExecutor:
     def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
         context = self.model.for_stop(now)
-        running.begin_try(stopping.soft(context) if running.at_rest else stopping.recovery(context), now)
+        running.begin_try(
+            stop_in_progress.soft(context) if running.at_rest else stop_in_progress.recovery(context), now
+        )
         self.model.evidence.tried_again()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
@@ -312,9 +316,9 @@ class StopExecutor:
             case _:
                 pass
         if finding is Finding.UNJUDGED:  # let the next interval be undisturbed, so that the rhythm can be learned
-            running.reported_s = stopping.reported_s(self.model.profile, self.model.learned, slowest=True)
+            running.reported_s = stop_in_progress.reported_s(self.model.profile, self.model.learned, slowest=True)
             if self.model.learned.echo.is_known:  # and it is another one now
-                next_s = at - running.last_at + stopping.SLOWEST_S + stopping.REPORT_MARGIN_S
+                next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
                 running.reported_s = max(running.reported_s, next_s)
         if self.running is running and running.frames_sent:
             self._await(running, now)
@@ -412,7 +416,7 @@ class StopExecutor:
         sequence, running = self.full(now), self.running
         if running is not None and running.sequence.rank >= sequence.rank:
             return running.worst_s(now)
-        return stopping.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
+        return stop_in_progress.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
 
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""

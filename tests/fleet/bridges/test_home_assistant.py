@@ -28,7 +28,7 @@ def values(publications: Iterable[Publication]) -> Any:
     return json.loads(by_topic(publications)[f"{RED}/state"])
 
 
-def test_newer_gateway_wins_over_older_answers() -> None:
+def test_car_is_announced_once_with_entity_for_each_value() -> None:
     plan = HomeAssistant("fleet")
     first = list(plan.news({"red": car()}, 0.0))
     assert [(each.topic, each.retain) for each in first] == [
@@ -100,7 +100,7 @@ def test_a_car_that_is_lost_silent_or_gone_is_offline() -> None:
         assert CONFIG not in found, "announced again"
 
 
-def test_overtaken_answer_and_earlier_gateway_do_not_count() -> None:
+def test_state_is_repeated_before_expiry_at_most_once_a_second() -> None:
     assert REPEAT_S < EXPIRE_S
     plan = HomeAssistant("fleet")
     count = 0
@@ -138,7 +138,7 @@ def test_a_broker_that_forgot_everything_gets_it_again() -> None:
     assert again == first | {plan.bridge_availability: "online"}
 
 
-def test_message_of_earlier_gateway_counts_only_if_it_runs() -> None:
+def test_invented_names_are_bounded_and_displace_no_present_car() -> None:
     plan = HomeAssistant("fleet")
     for number in range(2 * MAX_ANNOUNCED_CARS):
         list(plan.adopt(f"car-fleet/fleet/x{number}/availability", b"online"))

@@ -128,7 +128,7 @@ def test_with_one_stale_state_a_car_is_not_ready(old: str) -> None:
     assert state.stale_topics(10.0) == [old]
 
 
-def test_awaited_drive_ends_with_basis_and_not_early() -> None:
+def test_answer_age_counts_from_stamp_and_publication_from_arrival() -> None:
     def answered(ahead_s: float) -> CarState:
         reading = Reading.of("fleet/red/state/link", pb.Link(state="online", stamp=_stamp(NOW + ahead_s)), 0)
         return CarState.of_answers("red", [("state/link", reading)], NOW, present=True)
@@ -144,7 +144,7 @@ def test_awaited_drive_ends_with_basis_and_not_early() -> None:
     assert published.is_stale("state/link", NOW + 3.1)
 
 
-def test_stop_supersedes_drive_and_waits_until_complete() -> None:
+def test_newer_gateway_wins_over_older_answers() -> None:
     said = {
         "state/link": (2.0, pb.Link(state="online", boot_id="b")),
         "state/mode": (1.0, pb.Mode(asked="tracking", boot_id="a")),
@@ -155,7 +155,7 @@ def test_stop_supersedes_drive_and_waits_until_complete() -> None:
     assert (state.link.state, state.mode.asked, state.safety.motors) == ("online", "", "off")
 
 
-def test_person_stop_holds_car_against_coordinator_until_resume() -> None:
+def test_overtaken_answer_and_earlier_gateway_do_not_count() -> None:
     state = CarState("red")
     assert state.take("state/link", pb.Link(state="online", boot_id="a"), 10.0)
     assert state.take("state/safety", pb.Safety(motors="off", boot_id="a"), 10.0)

@@ -61,7 +61,7 @@ def test_stopped_is_said_only_of_what_was_shown(claim: CarClaim, begins: str, ba
     assert is_bad_rest(words) is bad
 
 
-def test_hung_gateway_differs_from_late_answer() -> None:
+def test_message_of_earlier_gateway_counts_only_if_it_runs() -> None:
     starts = GatewayStarts()
     assert starts.take("a", 10)
     assert starts.take("b", 20)

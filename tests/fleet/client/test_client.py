@@ -79,7 +79,7 @@ def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars)
     wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["led"] == "#ff0010", "the LED is so")
 
 
-def test_command_without_further_events_ends_with_last_event(client: Fleet, cars: Cars) -> None:
+def test_awaited_drive_ends_with_basis_and_not_early(client: Fleet, cars: Cars) -> None:
     outcome = asked(lambda: client.car("green").drive("forward", 0.7))
     assert outcome.ok
     assert (outcome.phase, outcome.basis) in (("sent", "sent"), ("complete", "shown"))
@@ -87,7 +87,7 @@ def test_command_without_further_events_ends_with_last_event(client: Fleet, cars
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
 
 
-def test_unreadable_answer_costs_no_other_car_its_outcome(client: Fleet, cars: Cars) -> None:
+def test_stop_supersedes_drive_and_waits_until_complete(client: Fleet, cars: Cars) -> None:
     ended: list[object] = []
     drive = threading.Thread(target=lambda: ended.append(asked(lambda: client.car("blue").drive("forward", LONG_S))))
     drive.start()
@@ -137,7 +137,7 @@ def test_a_refusal_carries_its_reason_and_words(client: Fleet) -> None:
     assert "allowed are white, red" in outcome.words
 
 
-def test_foreign_answer_does_not_end_a_stop(client: Fleet, cars: Cars) -> None:
+def test_person_stop_holds_car_against_coordinator_until_resume(client: Fleet, cars: Cars) -> None:
     client.stop(["green"])
     with Fleet(cars.endpoint, sender="c", kind="coordinator") as coordinator:
         assert coordinator.car("green").mode("manual").reason == "held"
@@ -240,7 +240,7 @@ def _asked(query: zenoh.Query) -> str:
     return command.id
 
 
-def test_query_ended_without_answer_does_not_hang(
+def test_hung_gateway_differs_from_late_answer(
     cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A client once reported six of 50 stopped gateways as hanging, because their answers took over two seconds."""
@@ -313,7 +313,7 @@ async def test_a_stop_waits_for_no_command_that_nobody_answers(
 
 
 @pytest.mark.soak
-def test_reading_a_command_key_is_refused(cars: Cars, gateway: Bus) -> None:
+def test_command_without_further_events_ends_with_last_event(cars: Cars, gateway: Bus) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
             result = pb.Result(id=_asked(query), car="mute", status="queued", worst_case_s=0.1)
@@ -328,7 +328,7 @@ def test_reading_a_command_key_is_refused(cars: Cars, gateway: Bus) -> None:
     assert "(last event: queued, " in outcome.words
 
 
-def test_watch_prints_table_on_terminal_and_plain_text_in_pipe(cars: Cars, gateway: Bus) -> None:
+def test_unreadable_answer_costs_no_other_car_its_outcome(cars: Cars, gateway: Bus) -> None:
     def answer(car: str, payload: bytes, encoding: str) -> None:
         def take(query: zenoh.Query) -> None:
             with query:
@@ -350,7 +350,7 @@ def test_watch_prints_table_on_terminal_and_plain_text_in_pipe(cars: Cars, gatew
 
 
 @pytest.mark.parametrize("kind", ["another message", "an error"])
-def test_watch_filters_and_ends_after_count(cars: Cars, gateway: Bus, kind: str) -> None:
+def test_foreign_answer_does_not_end_a_stop(cars: Cars, gateway: Bus, kind: str) -> None:
     foreign_answered = threading.Event()
 
     def answer_foreign(query: zenoh.Query) -> None:
@@ -377,7 +377,7 @@ def test_watch_filters_and_ends_after_count(cars: Cars, gateway: Bus, kind: str)
     assert (outcome.car, outcome.ok, outcome.phase) == ("twice", True, "sent")
 
 
-def test_watch_loses_no_reading_between_query_and_subscription(cars: Cars, gateway: Bus) -> None:
+def test_query_ended_without_answer_does_not_hang(cars: Cars, gateway: Bus) -> None:
     gateway.queryable("odd/brief/@cmd/*", lambda query: query.drop())  # type: ignore[no-untyped-call]
     gateway.token(keys.car_token("odd", "brief"))
     with Fleet(cars.endpoint, "odd", sender="ann") as client:
@@ -439,7 +439,7 @@ def test_no_fleet_and_bad_names_are_told_apart() -> None:
         Fleet(sender="a/b")
 
 
-def test_wait_holds_per_key_and_stale_value_does_not_count(client: Fleet) -> None:
+def test_reading_a_command_key_is_refused(client: Fleet) -> None:
     events: list[Any] = []
     client.bus.subscribe("fleet/red/event/command", lambda sample: events.append(sample.message()))
     began_ns = time.time_ns()

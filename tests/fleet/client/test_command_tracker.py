@@ -76,7 +76,7 @@ def test_keys_are_those_alive_with_type_unit_rate_and_age(cars: Cars) -> None:
     assert "fleet/blue/sensor/battery" not in rows, "a Raspberry Pi car measures none"
 
 
-def test_doctor_lists_likely_cause_first_without_duplicates(cars: Cars) -> None:
+def test_watch_prints_table_on_terminal_and_plain_text_in_pipe(cars: Cars) -> None:
     plain = run(cars.endpoint, "keys", "red/sensor/range", "--for", "5s").stdout.splitlines()
     assert plain[0].split() == ["KEY", "TYPE", "UNIT", "RATE", "AGE"]
     assert plain[1].split()[:3] == ["fleet/red/sensor/range", "fleet.v1.Range", "m"]
@@ -235,7 +235,7 @@ def test_without_a_fleet_each_says_what_to_do(arguments: list[str]) -> None:
 # ---------------------------------------------------------------------- watch with a condition
 
 
-def test_bytes_without_frame_are_neither_silence_nor_bad_wire(cars: Cars) -> None:
+def test_watch_filters_and_ends_after_count(cars: Cars) -> None:
     done = run(cars.endpoint, "watch", "red", "--when", "voltage_v > 0", "--count", "2", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     assert [json.loads(line)["key"] for line in done.stdout.splitlines()] == ["fleet/red/sensor/battery"] * 2
@@ -295,7 +295,7 @@ def endpoint(tmp_path: Path) -> Iterator[str]:
         fleet.close()
 
 
-async def test_doubted_car_is_finding_and_car_that_cannot_show_is_none(endpoint: str) -> None:
+async def test_watch_loses_no_reading_between_query_and_subscription(endpoint: str) -> None:
     with Bus.open(endpoint) as bus:
         Flicker(bus)
         async with aio.Fleet(endpoint) as fleet:
@@ -346,7 +346,7 @@ def test_how_long_it_must_have_held(for_s: float, seen: list[tuple[float, float 
     assert ends(close(for_s), seen) == found
 
 
-def test_last_claims_of_gone_gateway_are_told_as_past() -> None:
+def test_wait_holds_per_key_and_stale_value_does_not_count() -> None:
     waiting = close(1.0)
     red = reading("sensor/range", 1, 2.0, range_m=0.2)
     blue = Reading("fleet/blue/sensor/range", NOW, pb.Range(range_m=0.2))

@@ -115,7 +115,7 @@ def test_a_refusal_whose_cause_is_gone_is_no_finding(mode: str, later: list[Any]
     assert [each.code for each in diagnose(replace(now, commands=[refused("wrong_mode"), *later]))] == codes
 
 
-def test_csv_has_units_in_header_and_follows_rfc_4180() -> None:
+def test_doctor_lists_likely_cause_first_without_duplicates() -> None:
     lost = with_states(link=pb.Link(state="lost", reason="unplugged"), safety=ODD["held"].state.safety)
     found = diagnose(replace(lost, commands=[refused("link_down")]))
     assert [each.code for each in found] == ["link_down", "held"]
@@ -123,7 +123,7 @@ def test_csv_has_units_in_header_and_follows_rfc_4180() -> None:
     assert [each.code for each in other] == ["link_down", "held", "refused"]
 
 
-def test_csv_columns_do_not_depend_on_measured_fields() -> None:
+def test_bytes_without_frame_are_neither_silence_nor_bad_wire() -> None:
     counts = {"no_start": 40, "no_frames": 1}
     (found,) = diagnose(with_states(link=pb.Link(state="stale", last_rx_s=1, rx_frames=40, rejects=counts)))
     assert found.cause == "Bytes arrive, and never a frame: a wrong baud rate?"
@@ -143,7 +143,7 @@ def test_each_rejected_frame_counts_once() -> None:
     assert diagnose(with_states(link=within)) == []
 
 
-def test_job_error_is_its_result_and_next_job_runs() -> None:
+def test_doubted_car_is_finding_and_car_that_cannot_show_is_none() -> None:
     cannot = pb.Health(platform="arduino", shows_stops="no", shows_stops_words="red's reports do not react to frames")
     sent = pb.Safety(motors="off", motors_basis="sent", trust="stopped")
     lost = pb.Link(state="online", rx_frames=500, rejects={"not_obeyed": 4})
@@ -167,7 +167,7 @@ def test_what_was_learned_of_the_reports_is_a_fact() -> None:
     )
 
 
-def test_shutdown_drops_waiting_jobs_and_waits_for_running_ones() -> None:
+def test_last_claims_of_gone_gateway_are_told_as_past() -> None:
     gone = evidence(present=False, age_s=40.0)
     facts = dict(describe(gone))
     assert facts["motors"].startswith("unknown: its gateway is gone, and said off (shown")

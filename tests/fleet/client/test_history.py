@@ -96,7 +96,7 @@ def test_the_last_so_many_come_oldest_first(remembered: Remembered) -> None:
     assert lines[0].endswith(" s ago"), "of the past nobody expects that it is fresh"
 
 
-def test_second_program_of_same_person_is_told_apart(remembered: Remembered) -> None:
+def test_csv_has_units_in_header_and_follows_rfc_4180(remembered: Remembered) -> None:
     done = get(remembered, "red/sensor/range", "--last", "100", "--csv")
     assert done.returncode == 0
     assert done.stdout.count(b"\r\n") == done.stdout.count(b"\n") == 101
@@ -250,7 +250,7 @@ def test_what_is_said_of_less(count: int, last: int | None, since_s: float | Non
     assert history.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s) == told
 
 
-def test_late_publication_of_old_state_is_no_news() -> None:
+def test_csv_columns_do_not_depend_on_measured_fields() -> None:
     arm = [Reading("fleet/red/sensor/arm", NOW, pb.Arm(car="red", joint_deg=joints)) for joints in ([90, 45.5], [1])]
     lines = table(arm, topics.TOPICS["sensor/arm"]).split("\r\n")
     assert lines == [

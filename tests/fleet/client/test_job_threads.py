@@ -34,7 +34,7 @@ def test_each_job_has_a_thread_that_ends_with_it() -> None:
     assert threads.submit(job, 7).result(30) == 7
 
 
-def test_async_for_yields_readings_until_fleet_closes() -> None:
+def test_job_error_is_its_result_and_next_job_runs() -> None:
     threads = JobThreads(1, "job-b")
 
     def fail() -> None:
@@ -45,7 +45,7 @@ def test_async_for_yields_readings_until_fleet_closes() -> None:
     assert threads.submit(max, 1, 2).result(30) == 2
 
 
-def test_answer_overtaken_by_last_event_keeps_worst_case() -> None:
+def test_shutdown_drops_waiting_jobs_and_waits_for_running_ones() -> None:
     threads, begun, over = JobThreads(1, "job-c"), threading.Event(), threading.Event()
 
     def job() -> None:

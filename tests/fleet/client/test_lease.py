@@ -57,7 +57,7 @@ def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None
     assert ours.lost == lost
 
 
-def test_stop_timeout_is_announced_worst_case_plus_margin() -> None:
+def test_second_program_of_same_person_is_told_apart() -> None:
     ours = LeaseMonitor("red", "bot@laptop-17")
     for holder in ("bot@laptop-17", "bot@laptop-18"):
         ours.on_safety(safety(holder))
@@ -69,7 +69,7 @@ def test_stop_timeout_is_announced_worst_case_plus_margin() -> None:
     assert theirs.lost == "red was taken by mia (person)"
 
 
-def test_timeouts_count_from_late_answer() -> None:
+def test_late_publication_of_old_state_is_no_news() -> None:
     ours, told = LeaseMonitor("red", "bot"), [safety("mia"), safety("bot"), safety("mia")]
     for seq, message in enumerate(told, start=1):
         message.boot_id, message.seq = "a", seq
@@ -266,7 +266,7 @@ async def test_a_cancelled_task_stops_its_car(cars: Cars) -> None:
         assert not await asyncio.to_thread(driving, cars.sim, "blue")
 
 
-async def test_lost_gateway_is_reported_after_grace_second(cars: Cars) -> None:
+async def test_async_for_yields_readings_until_fleet_closes(cars: Cars) -> None:
     async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
         async for reading in fleet.watch("*/state/safety", when="motors == 'off'"):
             assert (reading.car, reading["motors"], reading["hold.by"]) == (reading.key.split("/")[1], "off", None)

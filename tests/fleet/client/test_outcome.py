@@ -79,19 +79,19 @@ def test_an_outcome_has_words_also_where_the_gateway_said_none(verb: str, until:
         assert outcome.words == outcome.effect
 
 
-def test_reason_of_waiting_is_known_until_frame_is_sent() -> None:
+def test_answer_overtaken_by_last_event_keeps_worst_case() -> None:
     outcome = told(Until.STOPPED, [("event", "complete", 0.0), ("answer", "sent", 0.5)]).outcome
     assert outcome is not None
     assert (outcome.phase, outcome.ok, outcome.worst_case_s) == ("complete", True, 0.5)
 
 
-def test_command_without_result_has_own_code() -> None:
+def test_stop_timeout_is_announced_worst_case_plus_margin() -> None:
     assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(
         100 + 7.3 + MAX_EVIDENCE_TIMEOUT_S + 5.0
     )
 
 
-def test_extended_drive_ends_at_its_own_time() -> None:
+def test_timeouts_count_from_late_answer() -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     assert progress.deadline > 110.0, "the query is over before it"
     progress.on_answer("queued", "", "", 0.5, 108.0)
@@ -135,7 +135,7 @@ def test_giving_up_says_what_was_heard_last() -> None:
     )
 
 
-def test_late_events_of_drive_are_no_extension() -> None:
+def test_lost_gateway_is_reported_after_grace_second() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 9.0)
     progress.on_presence(102.0, alive=False)
     assert progress.deadline == 103.0
@@ -218,7 +218,7 @@ def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str,
     assert count_lines(str(progress.outcome)) <= MAX_LINES
 
 
-def test_reading_time_is_stamp_or_bus_time() -> None:
+def test_reason_of_waiting_is_known_until_frame_is_sent() -> None:
     progress = Progress("red", Until.SENT, 100.0, verb="mode")
     progress.on_event("asked", "", "", 0.0, 100.1)
     progress.on_event("queued", "", "opens in 3.6 s at most", 0.0, 100.1)
@@ -255,7 +255,7 @@ def test_each_verb_has_a_text() -> None:
     assert set(EFFECTS) == {*COMMANDS, "release", "estop_fleet", "*"}
 
 
-def test_reading_repr_has_units_and_unmeasured_fields() -> None:
+def test_command_without_result_has_own_code() -> None:
     progress = told(Until.SENT, [("answer", "queued", 0.0)])
     progress.give_up(115.0)
     assert str(progress.outcome).endswith(" ago). Look at the car. [no_result]")
@@ -266,7 +266,7 @@ def test_reading_repr_has_units_and_unmeasured_fields() -> None:
     )
 
 
-def test_reading_staleness_by_topic_and_never_future() -> None:
+def test_extended_drive_ends_at_its_own_time() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 2.0)
     assert progress.deadline == 102.0
     progress.give_up(102.0)
@@ -274,7 +274,7 @@ def test_reading_staleness_by_topic_and_never_future() -> None:
     assert progress.outcome.ok
 
 
-def test_slow_reader_loses_oldest_and_learns_count() -> None:
+def test_late_events_of_drive_are_no_extension() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
     assert progress.deadline == 100.0 + 2.0 + MAX_QUEUE_TIME_S + 5.0, "it may wait for a stop"
     for at, phase in enumerate(("queued", "sent"), start=104):

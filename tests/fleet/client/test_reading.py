@@ -23,7 +23,7 @@ def sample(seq: int, payload: bytes | None = None) -> Sample:
     return Sample(KEY, written, messages.encoding_of(RANGE), 1_700_000_000_000_000_000, seq)
 
 
-def test_wall_clock_step_ends_no_wait() -> None:
+def test_reading_time_is_stamp_or_bus_time() -> None:
     stamped = pb.Range(range_m=0.5)
     stamped.stamp.seconds, stamped.stamp.nanos = 1_600_000_000, 123_456_789
     reading = reading_of(sample(1, stamped.SerializeToString()))
@@ -32,7 +32,7 @@ def test_wall_clock_step_ends_no_wait() -> None:
     assert reading_of(sample(1)).time == datetime.fromtimestamp(1_700_000_000, UTC)
 
 
-def test_hold_duration_restarts_and_ignores_clock_steps() -> None:
+def test_reading_repr_has_units_and_unmeasured_fields() -> None:
     at = datetime(2026, 3, 14, 15, 16, 17, 123_456, UTC)
     measured = Reading(KEY, at, pb.Range(range_m=0.25))
     assert (
@@ -50,7 +50,7 @@ def test_hold_duration_restarts_and_ignores_clock_steps() -> None:
     assert 'rejects={"cut": "2"}' in repr(Reading("fleet/red/state/link", at, pb.Link(rejects={"cut": 2})))
 
 
-def test_stored_reading_from_before_clock_step_is_not_fresh() -> None:
+def test_reading_staleness_by_topic_and_never_future() -> None:
     reading = reading_of(sample(1))
     for age_s, stale in ((-5.0, False), (0.0, False), (2.9, False), (3.1, True)):
         now = reading.time + timedelta(seconds=age_s)
@@ -69,7 +69,7 @@ def test_what_is_no_message_of_ours_is_no_reading(encoding: str) -> None:
         reading_of(Sample(KEY, b"", encoding, 0, 0))
 
 
-def test_published_readings_count_after_stored_one_from_future() -> None:
+def test_slow_reader_loses_oldest_and_learns_count() -> None:
     takes: list[Callable[[Sample], None]] = []
 
     def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:

@@ -41,7 +41,7 @@ class SteppedWait:
 
 
 @pytest.mark.parametrize("step_s", [-HOUR_S, HOUR_S])
-def test_check_of_fleet_file_includes_plan_and_world(step_s: float) -> None:
+def test_wall_clock_step_ends_no_wait(step_s: float) -> None:
     wait = SteppedWait()
     assert not wait.hear(0.5)
     assert not wait.hear(0.5, step_s=step_s)
@@ -50,7 +50,7 @@ def test_check_of_fleet_file_includes_plan_and_world(step_s: float) -> None:
 
 @pytest.mark.parametrize("step_s", [-HOUR_S, HOUR_S])
 @pytest.mark.parametrize(("topic", "when"), [("sensor/range", "range_m < 0.3"), ("event/command", "verb == 'led'")])
-def test_check_of_world_uses_simulated_cars_of_fleet_file(step_s: float, topic: str, when: str) -> None:
+def test_hold_duration_restarts_and_ignores_clock_steps(step_s: float, topic: str, when: str) -> None:
     wait = SteppedWait(topic, when, FOR_S)
     assert [wait.hear() for _ in range(4)] == [False] * 4
     assert not wait.hear(step_s=step_s)
@@ -81,11 +81,11 @@ def test_a_wait_ends_only_after_its_time_and_always_then(seen: list[tuple[bool, 
         (HOUR_S, False),
     ],
 )
-def test_doctor_of_session_names_car_time_and_cause_of_stops(stamp_s: float, *, ends: bool) -> None:
+def test_stored_reading_from_before_clock_step_is_not_fresh(stamp_s: float, *, ends: bool) -> None:
     assert SteppedWait().query(stamp_s) is ends
 
 
-def test_any_name_and_device_make_valid_fleet_file() -> None:
+def test_published_readings_count_after_stored_one_from_future() -> None:
     wait = SteppedWait(for_s=2.0)
     assert not wait.query(HOUR_S)
     assert [wait.hear() for _ in range(3)] == [False, False, True]

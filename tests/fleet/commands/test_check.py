@@ -53,7 +53,7 @@ def test_a_file_is_recognized_by_its_content(text: str, kind: FileKind) -> None:
     assert recognize(text) is kind
 
 
-def test_unknown_links_blink_and_person_names_them(run: object) -> None:
+def test_check_of_fleet_file_includes_plan_and_world(run: object) -> None:
     done = run()  # type: ignore[operator]
     assert done.exit_code == 1, done.output
     assert "never.yaml" in done.stdout
@@ -70,7 +70,7 @@ def test_plans_and_worlds_are_checked_by_themselves(run: object) -> None:
     )
 
 
-def test_ambiguous_yaml_text_is_quoted(run: object) -> None:
+def test_check_of_world_uses_simulated_cars_of_fleet_file(run: object) -> None:
     Path("world.yaml").write_text("room: {width_m: 4.0, depth_m: 3.0}\nlamps: {sun: {carried_by: rad}}\n")
     assert run("world.yaml").exit_code == 0, "any car may exist"  # type: ignore[operator]
     done = run("fleet.yaml", "--json")  # type: ignore[operator]

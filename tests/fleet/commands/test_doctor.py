@@ -127,7 +127,7 @@ def berlin(directory: Path, *arguments: str) -> CompletedProcess[str]:
         return in_process.fleet(*arguments, cwd=directory)
 
 
-def test_wrong_session_or_file_name_suggests_likely_one(session: Path, tmp_path: Path) -> None:
+def test_doctor_of_session_names_car_time_and_cause_of_stops(session: Path, tmp_path: Path) -> None:
     told = json.loads(berlin(tmp_path, "doctor", "latest", "--json").stdout)
     assert [(each["car"], each["code"], each["at"]) for each in told["stops"]] == [
         ("red", "not_shown", "13:01:13 CET"),

@@ -240,7 +240,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     assert list(read_fleet(tmp_path / "fleet.yaml").cars) == ["red"]
 
 
-def test_supervisor_with_token_gap_has_not_ended() -> None:
+def test_any_name_and_device_make_valid_fleet_file() -> None:
     cars = [NewCar(name, "COM1" if name == "red" else f"tcp://pi:{number}", "auto", "#000000", "a # 'car': \"x\"")
             for number, name in enumerate(("red", "10", "null", "true", "0x1", "on", "a-b"), 1)]  # fmt: skip
     fleet = parse_fleet(format_new_file(cars), Path("f.yaml"))
@@ -371,7 +371,9 @@ cars:
 """
 
 
-def test_car_row_has_color_on_terminal(terminal: Callable[..., Terminal], simulate: Any, tmp_path: Path) -> None:
+def test_unknown_links_blink_and_person_names_them(
+    terminal: Callable[..., Terminal], simulate: Any, tmp_path: Path
+) -> None:
     sim = simulate("a", "b", "c")
     (tmp_path / "fleet.yaml").write_text(UNBOUND)
     told = [word for name in "abc" for word in ("--link", f"{tmp_path}/{name}.tty")]
@@ -438,7 +440,7 @@ def test_a_link_that_is_another_cars_is_not_written() -> None:
         set_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
 
 
-def test_row_shows_motors_with_basis_and_ready_or_waiting() -> None:
+def test_ambiguous_yaml_text_is_quoted() -> None:
     text = "cars:\n  red: &both\n    platform: stm32\n  blue: *both\n"
     with pytest.raises(CannotEdit, match=r'write cars\.red\.link: "sim"'):
         set_link(text, Path("f.yaml"), "red", "sim")

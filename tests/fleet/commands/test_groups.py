@@ -105,7 +105,7 @@ def test_the_shell_completes_groups_of_the_fleet_file(client: Fleet) -> None:
     assert complete_cars(context, click.Argument(["cars"]), "@") == ["@lab"]
 
 
-def test_without_gateway_no_link_online_and_no_motors_off(tmp_path: Path, client: Fleet) -> None:
+def test_wrong_session_or_file_name_suggests_likely_one(tmp_path: Path, client: Fleet) -> None:
     assert client.bus.endpoint
     Path("plan.yaml").touch()
     Path("sessions/20260101T000000Z-demo").mkdir(parents=True)

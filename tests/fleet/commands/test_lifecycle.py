@@ -28,7 +28,7 @@ class Down:
         return lifecycle._until_ended(bus, "fleet", self.received)
 
 
-def test_unmeasured_number_is_unknown_and_wrong_type_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_supervisor_with_token_gap_has_not_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lifecycle, "SUPERVISOR_LOST_S", 5.0)
     endpoint = free_endpoint()
     with Bus.open(endpoint, start_hub=True) as ours, Bus.open(endpoint) as theirs:

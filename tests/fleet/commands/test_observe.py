@@ -67,7 +67,7 @@ def test_the_table_of_cars_fits_a_terminal(
 
 
 @pytest.mark.parametrize(("no_color", "dot"), [("", "\x1b[38;5;16m●\x1b[0m "), ("1", "")])
-def test_every_message_has_fields_with_values(
+def test_car_row_has_color_on_terminal(
     no_color: str, dot: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("NO_COLOR", no_color)
@@ -93,7 +93,7 @@ def states(**fields: Any) -> dict[str, Reading]:
     }
 
 
-def test_fields_exclude_times_and_bytes_and_end_with_common_ones() -> None:
+def test_row_shows_motors_with_basis_and_ready_or_waiting() -> None:
     row = row_of("red", states())
     assert (row["motors"], row["motors_basis"], row["ready"], row["shows_stops"]) == ("off", "sent", True, "no")
     assert row["claims"]["motors"]["age_s"] is not None
@@ -112,7 +112,7 @@ def test_of_old_states_no_car_is_ready() -> None:
     assert (row["ready"], shown("ready", row), shown("motors", row)) == (False, "-", "off (sent, stale)")
 
 
-def test_function_has_range_and_needs_measured_field() -> None:
+def test_without_gateway_no_link_online_and_no_motors_off() -> None:
     row = row_of("red", states(), present=False)
     assert (row["link"], row["ready"], row["motors"], row["motors_basis"]) == ("no gateway", False, "unknown", None)
     assert (row["mode"], row["verdict"]) == ("unknown", None)

@@ -147,7 +147,7 @@ def test_names_are_those_it_uses_in_order() -> None:
     assert parse("voltage_v > 7 and (range_m < 1 or voltage_v > range_m)", NAMES).names == ("voltage_v", "range_m")
 
 
-def test_watch_rejects_functions_without_history() -> None:
+def test_unmeasured_number_is_unknown_and_wrong_type_raises() -> None:
     assert parse("range_m != 1", NAMES).value({"range_m": math.nan}.get) is None
     with pytest.raises(TypeError, match="range_m should be a number, and is 'far'"):
         parse("range_m < 1", NAMES).value({"range_m": "far"}.get)
@@ -304,7 +304,7 @@ def test_any_text_is_a_condition_or_a_bad_one(text: str) -> None:
 # ---------------------------------------------------------------------- the fields of messages
 
 
-def test_rate_is_change_per_second_of_two_newest_readings() -> None:
+def test_every_message_has_fields_with_values() -> None:
     for topic in topics.TOPICS.values():
         message = messages.message_class(topic.message)()
         for name, kind in fields_of(type(message)).items():
@@ -326,5 +326,5 @@ def test_what_was_not_measured_is_not_known() -> None:
     assert parse("level == 'WARNING'", fields_of(type(log))).value(value_in(log)) is True
 
 
-def test_flood_closes_own_page_only() -> None:
+def test_fields_exclude_times_and_bytes_and_end_with_common_ones() -> None:
     assert list(fields_of(pb.RxFrame)) == ["verdict", "published", "car", "seq", "boot_id"]

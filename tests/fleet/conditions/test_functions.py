@@ -79,7 +79,7 @@ def test_a_wrong_call_is_an_error(condition: str, words: str) -> None:
     assert found.value.words.startswith(words)
 
 
-def test_commands_in_flight_count_per_device() -> None:
+def test_function_has_range_and_needs_measured_field() -> None:
     expression = parse(needs("size(range_m) > 9.5")).roles["scout"].needs
     assert expression is not None
     assert "0 .. 9" in explain_impossible(expression)
@@ -93,12 +93,12 @@ def test_commands_in_flight_count_per_device() -> None:
     assert list_unmeasured(placed, arduino, Mode.TRACKING) == (), "a program outside of the car may measure it"
 
 
-def test_message_with_unreadable_number_is_left_out() -> None:
+def test_watch_rejects_functions_without_history() -> None:
     with pytest.raises(BadExpression, match="rate is not a value"):
         KeyCondition.of("rate(range_m) < 1", "fleet/red/sensor/range")
 
 
-def test_returning_gateway_does_not_revive_old_claims() -> None:
+def test_rate_is_change_per_second_of_two_newest_readings() -> None:
     assert rate([(1.0, 2.0)]) is None
     assert rate([(0.0, 9.0), (1.0, 2.0), (3.0, 1.0)]) == -0.5
     assert rate([(1.0, 2.0), (1.0, 1.0)]) is None

@@ -34,7 +34,7 @@ def test_ten_times_what_our_page_sends_never_trips_it(slow_s: float) -> None:
         assert budgets.may_send("mia", page, now)
 
 
-def test_stale_card_shows_age_and_no_link() -> None:
+def test_flood_closes_own_page_only() -> None:
     budgets, page = Budgets(), page_budget()
     taken = 0
     while budgets.may_send("mia", page, 1.0):
@@ -72,7 +72,7 @@ def test_checks_of_plans_have_a_budget_of_their_own() -> None:
     assert budgets.may_ask("mia", 0.0)
 
 
-def test_named_car_is_not_added_and_temporary_one_leaves_nothing() -> None:
+def test_commands_in_flight_count_per_device() -> None:
     budgets = Budgets()
     for _ in range(MAX_OPEN_COMMANDS):
         assert budgets.may_open_command("phone")

@@ -15,7 +15,7 @@ ODD = (math.nan, math.inf, -math.inf)
 
 
 @pytest.mark.parametrize("number", ODD)
-def test_longest_silent_car_is_evicted_never_a_heard_one(number: float) -> None:
+def test_message_with_unreadable_number_is_left_out(number: float) -> None:
     assert not is_finite(pb.Battery(voltage_v=number))
     assert not is_finite(pb.Safety(loan=pb.Loan(to="mia", expires_in_s=number))), "also deep inside"
 

@@ -4,8 +4,8 @@ import pytest
 
 from fleet.console.car_view import MAX_LISTED_CARS, MAX_OTHER_CARS, SILENT_AFTER_S, BatteryTrend, FleetView
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.authority import Right, Sender
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import Right, Sender
 from schemas.words import Rank
 
 
@@ -80,7 +80,7 @@ def test_a_link_without_a_gateway_is_not_online() -> None:
     assert view.look_up("red").describe_gateway() == []
 
 
-def test_certificate_is_kept_until_new_address_or_expiry() -> None:
+def test_returning_gateway_does_not_revive_old_claims() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     states = {
@@ -118,7 +118,7 @@ def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
 
 
 @pytest.mark.parametrize(("after_s", "silent_s"), [(SILENT_AFTER_S, None), (SILENT_AFTER_S + 0.1, 3), (90.0, 90)])
-def test_world_readable_key_is_closed_and_damaged_key_named(after_s: float, silent_s: int | None) -> None:
+def test_stale_card_shows_age_and_no_link(after_s: float, silent_s: int | None) -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/link", pb.Link(state="online"), 9.0)
@@ -175,7 +175,7 @@ def test_the_last_event_and_the_ledger() -> None:
     assert len(car.ledger) == 60
 
 
-def test_many_addresses_need_no_new_certificate_each_time() -> None:
+def test_named_car_is_not_added_and_temporary_one_leaves_nothing() -> None:
     view = view_of()
     assert view.look_up("ghost").as_dict(0.0)["gateway"] is False
     assert view.names == ["red"]
@@ -203,7 +203,7 @@ def test_cars_that_nobody_lists_have_places_up_to_a_bound() -> None:
     assert len(view.names) == MAX_OTHER_CARS
 
 
-def test_car_keeps_fleet_color_after_early_event_and_reload() -> None:
+def test_longest_silent_car_is_evicted_never_a_heard_one() -> None:
     view = view_of()
     invent(view, MAX_OTHER_CARS - 1, 1.0)
     now = 1.0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.console import certificate, lan
+from fleet.console import certificate, network_console
 from fleet.console.certificate import BadKeyFile, ensure_certificate, needs_renewal
 from fleet.console.pairing import PagePerson, PeopleBook
 from fleet.console.people_file import PeopleFile
@@ -15,7 +15,7 @@ from fleet.console.people_file import PeopleFile
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
 
-def test_frame_before_event_of_its_command_is_shown(tmp_path: Path) -> None:
+def test_certificate_is_kept_until_new_address_or_expiry(tmp_path: Path) -> None:
     made = ensure_certificate(["192.168.1.5", "laptop.local"], NOW, tmp_path)
     assert made.names == ("192.168.1.5", "laptop.local")
     key = made.key_path.read_bytes()
@@ -32,7 +32,7 @@ def test_frame_before_event_of_its_command_is_shown(tmp_path: Path) -> None:
     assert key == made.key_path.read_bytes(), "the key stays"
 
 
-def test_own_page_is_served_on_both_names_with_cookie(tmp_path: Path) -> None:
+def test_world_readable_key_is_closed_and_damaged_key_named(tmp_path: Path) -> None:
     made = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
     made.key_path.chmod(0o644)
     ensure_certificate(["10.0.0.7"], NOW, tmp_path)
@@ -50,7 +50,7 @@ def test_another_key_makes_another_certificate(tmp_path: Path) -> None:
     assert ensure_certificate(["10.0.0.7"], NOW, tmp_path).fingerprint != made.fingerprint
 
 
-def test_log_rate_is_per_cause_and_counts_omissions(tmp_path: Path) -> None:
+def test_many_addresses_need_no_new_certificate_each_time(tmp_path: Path) -> None:
     many = [f"10.0.{number}.1" for number in range(certificate.MAX_NAMES + 5)]
     assert ensure_certificate(many, NOW, tmp_path) == ensure_certificate(many, NOW, tmp_path)
 
@@ -63,10 +63,10 @@ def test_a_certificate_is_renewed_a_month_before_its_end() -> None:
 def test_a_new_address_is_written_for_fleet_console_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     addresses = ["192.168.1.5"]
-    monkeypatch.setattr(lan, "own_addresses", lambda: list(addresses))
-    people, listener = PeopleFile(tmp_path / "people.json"), lan.LimitedListener.on_port(0)
+    monkeypatch.setattr(network_console, "own_addresses", lambda: list(addresses))
+    people, listener = PeopleFile(tmp_path / "people.json"), network_console.LimitedListener.on_port(0)
     try:
-        served = lan.Lan(listener, people)
+        served = network_console.Lan(listener, people)
         assert people.read().address == f"https://192.168.1.5:{served.port}"
         addresses[:] = ["10.0.0.7", "192.168.1.5"]
         served._renew()

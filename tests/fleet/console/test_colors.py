@@ -22,7 +22,9 @@ from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 KEY = "fleet/@supervisor/status"
 
 
-async def test_map_places_equal_tables_at_100_random_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_car_keeps_fleet_color_after_early_event_and_reload(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(supervision, "COLORS_TIMEOUT_S", PATIENCE_S)
     hub = FleetProcesses(free_endpoint(), tmp_path)
     asked: list[zenoh.Query] = []

@@ -55,7 +55,7 @@ def test_the_panel_has_the_doctors_lines() -> None:
     assert "services" not in facts
 
 
-def test_map_shows_measured_pose_with_error_and_prefers_truth() -> None:
+def test_frame_before_event_of_its_command_is_shown() -> None:
     ledger = CommandLedger()
     for number in range(MAX_COMMANDS):
         ledger.on_frame(pb.TxFrame(command_id=f"no event {number}", data=b"x", written=True))

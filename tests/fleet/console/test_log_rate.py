@@ -11,7 +11,7 @@ def record(line: int, at: float) -> logging.LogRecord:
     return made
 
 
-def test_page_gets_hello_before_first_tick_then_ticks_first() -> None:
+def test_log_rate_is_per_cause_and_counts_omissions() -> None:
     limit, burst = LogRate(), int(LOG_BURST)
     assert sum(limit.filter(record(1, 0.0)) for _ in range(burst + 7)) == burst
     assert limit.filter(record(2, 0.0)), "another cause"

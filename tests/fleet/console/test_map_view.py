@@ -44,7 +44,7 @@ def told_by_tables(tables: dict[str, Any], at_ns: int) -> dict[str, list[Any]]:
     return told
 
 
-def test_pairing_code_is_good_once_within_two_minutes(path: Path) -> None:
+def test_map_places_equal_tables_at_100_random_moments(path: Path) -> None:
     session, chance = Session(path), random.Random(31)
     tables = {topic: session.to_pandas(topic) for topic in (TRUTH, POSE)}
     compared = 0
@@ -61,7 +61,7 @@ def truth(x_m: float) -> pb.Truth:
     return pb.Truth(x_m=x_m, y_m=1.0, heading_rad=math.pi / 2)
 
 
-def test_new_pairing_code_keeps_other_and_old_ones_expire() -> None:
+def test_map_shows_measured_pose_with_error_and_prefers_truth() -> None:
     view = MapView()
     view.on_message("red", POSE, pb.Pose(frame="map", x_m=1.23456, y_m=2, heading_rad=-1, xy_std_m=0.05), 10.0)
     view.on_message("blue", POSE, pb.Pose(x_m=1), 10.0)
@@ -91,7 +91,7 @@ def test_an_old_place_has_its_age_and_is_forgotten() -> None:
     }
 
 
-def test_cookie_is_valid_for_a_month_then_only_stops() -> None:
+def test_map_trail_is_bounded_and_standing_car_adds_nothing() -> None:
     view = MapView()
     for number in range(20_000):
         view.on_message("red", TRUTH, truth(number / 100), number / 100)

@@ -35,7 +35,7 @@ def sent_by(page_does: Any) -> list[str]:
     return asyncio.run(run())
 
 
-def test_class_code_pairs_guests_for_ten_minutes_until_closed() -> None:
+def test_page_gets_hello_before_first_tick_then_ticks_first() -> None:
     def tick_and_answer(page: PageLink) -> None:
         page.show("tick", '{"t": "tick"}')
         page.answer(t="hello")

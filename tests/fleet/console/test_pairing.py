@@ -41,7 +41,7 @@ def paired(code: str = "K7QF3MXP", cookie: str = "cookie", now: float = NOW) -> 
 
 
 @given(CODES, CODES, st.floats(-1e6, 1e6))
-def test_thousand_guests_are_one_class_and_displace_nobody(code: str, other: str, age_s: float) -> None:
+def test_pairing_code_is_good_once_within_two_minutes(code: str, other: str, age_s: float) -> None:
     book = PeopleBook().issue(code, MIA, NOW)
     assert (book.redeem(other, "c", "d1", "", NOW) is not None) is (other == code)
     found = book.redeem(code_words(code).lower(), "c", "d1", "", NOW + age_s)
@@ -51,7 +51,7 @@ def test_thousand_guests_are_one_class_and_displace_nobody(code: str, other: str
         assert found.devices[0].person == MIA
 
 
-def test_guest_becomes_person_once_and_is_listed() -> None:
+def test_new_pairing_code_keeps_other_and_old_ones_expire() -> None:
     book = PeopleBook()
     for number in range(pairing.MAX_CODES + 3):
         book = book.issue(f"CODE{number:04}", MIA, NOW)
@@ -98,7 +98,7 @@ def test_a_lead_is_whom_the_fleet_makes_one_also_later() -> None:
         assert replace(paired_lead, leads=leads).open_devices(NOW) == [device]
 
 
-def test_revoked_device_is_unknown_and_loses_open_code() -> None:
+def test_cookie_is_valid_for_a_month_then_only_stops() -> None:
     book = paired()
     states = [book.device_of("cookie", NOW + days * 86_400)[1] for days in (0, 29.9, 30.1, 119.9, 120.1)]
     assert states == ["valid", "valid", "expired", "expired", "unknown"]
@@ -139,7 +139,7 @@ def join(book: PeopleBook, number: int, now: float = NOW, code: str = CLASS) -> 
     return book.redeem(code, f"cookie{number}", f"id{number}", "Phone", now)
 
 
-def test_full_house_drops_oldest_stranger_never_paired_device() -> None:
+def test_class_code_pairs_guests_for_ten_minutes_until_closed() -> None:
     book = paired().open_class(CLASS, NOW)
     for number in range(3):
         found = join(book, number, NOW + number)
@@ -157,7 +157,7 @@ def test_full_house_drops_oldest_stranger_never_paired_device() -> None:
     assert states == ["valid", "unknown"], "a guest is forgotten after a day of school"
 
 
-def test_connections_are_limited_per_device() -> None:
+def test_thousand_guests_are_one_class_and_displace_nobody() -> None:
     book = PeopleBook()
     for number in range(pairing.MAX_DEVICES - 10):
         book = book.issue(f"CODE{number:04}", MIA, NOW)
@@ -189,7 +189,7 @@ def test_guesses_join_no_class(guesses: list[str]) -> None:
         assert book.is_class_code(guess, NOW) is (guess == CLASS)
 
 
-def test_car_is_gone_after_last_message_then_forgotten() -> None:
+def test_guest_becomes_person_once_and_is_listed() -> None:
     listed = replace(PeopleBook(), people=("mia", "teacher"), leads=("teacher",))
     book = join(listed.open_class(CLASS, NOW), 1)
     assert book is not None
@@ -219,7 +219,7 @@ def test_car_is_gone_after_last_message_then_forgotten() -> None:
 
 
 @pytest.mark.parametrize("name", ["d1", "mia"])
-def test_past_view_lists_commands_and_frames_before_moment(name: str) -> None:
+def test_revoked_device_is_unknown_and_loses_open_code(name: str) -> None:
     book, gone = paired().issue("ABCDEFGH", MIA, NOW).revoke([name])
     assert [each.id for each in gone] == ["d1"]
     assert book.device_of("cookie", NOW) == (None, "unknown")
@@ -304,7 +304,7 @@ def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, 
         assert len(strangers) <= 3 * MAX_STRANGERS_PER_ADDRESS
 
 
-def test_past_plot_values_are_of_their_time_one_per_slot() -> None:
+def test_full_house_drops_oldest_stranger_never_paired_device() -> None:
     limit = ConnectionLimit()
     for number in range(MAX_CONNECTIONS):
         assert limit.admit(number, str(number), float(number)) == (True, None)
@@ -315,7 +315,7 @@ def test_past_plot_values_are_of_their_time_one_per_slot() -> None:
     assert limit.admit("one more", "y", 1001.0) == (False, None)
 
 
-def test_past_map_has_places_trails_and_floor() -> None:
+def test_connections_are_limited_per_device() -> None:
     limit, kept = ConnectionLimit(), 0
     for number in range(100):
         assert limit.admit(number, str(number), 0.0)[0]

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from fleet.console.car_view import SILENT_AFTER_S
+from fleet.console.page_requests import BadPageMessage
 from fleet.console.past_api import moment_question
 from fleet.console.past_view import PLOT_SLOTS, cars_at, lanes_as_dict, samples_of
 from fleet.console.past_worker import answer
 from fleet.console.plot_buffer import Series
-from fleet.console.requests import BadPageMessage
 from fleet.recording.reading.session import Session
 from fleet.recording.tools.lanes import Lanes
 from fleet.recording.tools.moment import Known, known_at
@@ -71,7 +71,7 @@ def test_a_moment_is_shown_as_the_live_page_would(
     )
 
 
-def test_past_plan_is_last_one_put_in_force(session: Path) -> None:
+def test_car_is_gone_after_last_message_then_forgotten(session: Path) -> None:
     # The last states are of second 19.
     shown = {at_s: answer(question(session, at_s))["cars"] for at_s in (21, 30, 60)}
     assert [each["gateway"] for each in shown[21]] == [True] * 3
@@ -80,7 +80,7 @@ def test_past_plan_is_last_one_put_in_force(session: Path) -> None:
     assert shown[60] == []
 
 
-def test_past_lanes_have_times_and_marks(session: Path) -> None:
+def test_past_view_lists_commands_and_frames_before_moment(session: Path) -> None:
     detail = answer(question(session, 4.5, car="red"))["detail"]
     assert [each["requested"] for each in detail["commands"]] == ["led by ann (person)", "drive by ann (person)"]
     assert {each["text"] for each in detail["frames"]} == {"$1,0,0,0,0,0,0,0,0#"}
@@ -91,7 +91,7 @@ def test_past_lanes_have_times_and_marks(session: Path) -> None:
     assert rows["platform"] == "arduino"
 
 
-def test_recorder_and_plan_are_for_leads_if_there_are_any(session: Path) -> None:
+def test_past_plot_values_are_of_their_time_one_per_slot(session: Path) -> None:
     samples = answer(question(session, 4.5, series=[RANGE], span_s=3))["samples"]
     assert [round((at_ms - START_NS // 1_000_000) / 100) for at_ms, _ in samples[0]] == [21, 31, 41]
     many = (known("sensor/range", pb.Range(range_m=number / 10), number / 1000) for number in range(10_000))
@@ -100,7 +100,7 @@ def test_recorder_and_plan_are_for_leads_if_there_are_any(session: Path) -> None
     assert values[-1] == (9999, 999.9)
 
 
-def test_own_cars_are_listed_whatever_else_refuses(session: Path) -> None:
+def test_past_map_has_places_trails_and_floor(session: Path) -> None:
     found = answer(question(session, 10.5, map=True))["map"]
     assert sorted(found["cars"]) == ["blue", "green", "red"]
     assert {place[3] for place in found["cars"].values()} == {""}, "the truth goes before what is measured"
@@ -115,7 +115,7 @@ def test_own_cars_are_listed_whatever_else_refuses(session: Path) -> None:
     assert "map" not in answer(question(session, 10.5))
 
 
-def test_plan_check_returns_roles_changes_and_dry_run(session: Path) -> None:
+def test_past_plan_is_last_one_put_in_force(session: Path) -> None:
     found = {at: answer(question(session, at, plan=True))["plan"] for at in (-1, 15)}
     assert found[-1]["plan"] is None
     assert found[15]["plan"]["text"]
@@ -139,7 +139,7 @@ def test_names_and_numbers_that_are_none_reach_no_page() -> None:
     assert {span[0] for span in lanes_as_dict(lanes, 2 * S)["spans"]} == {"red"}
 
 
-def test_plan_check_finds_fleet_file_faults_and_cuts_long_texts(session: Path) -> None:
+def test_past_lanes_have_times_and_marks(session: Path) -> None:
     found = answer({"path": str(session)})
     assert found["ok"]
     assert found["cars"] == ["blue", "green", "red"]

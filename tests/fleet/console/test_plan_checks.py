@@ -72,7 +72,7 @@ async def test_a_plan_is_checked_as_the_parser_does(checks: PlanChecks) -> None:
     assert len(workers()) == 1
 
 
-async def test_press_without_echo_ends_after_gap_and_stays_over(checks: PlanChecks) -> None:
+async def test_plan_check_returns_roles_changes_and_dry_run(checks: PlanChecks) -> None:
     new = "roles:\n  guide: {mode: following, count: 1}\n  lamp: {mode: color_led, count: 2}\n"
     question = PlanQuestion(new, ("blue", "red"), here("blue", "red"), GOOD, {"red": "guide"})
     found = await checks.check(question, "mia")
@@ -91,7 +91,7 @@ async def test_press_without_echo_ends_after_gap_and_stays_over(checks: PlanChec
     assert [(each["role"], each["decided"]) for each in found["lacking"]] == [("lamp", "1 of 2")]
 
 
-async def test_late_echo_does_not_count_even_before_expiry(checks: PlanChecks, tmp_path: Path) -> None:
+async def test_plan_check_finds_fleet_file_faults_and_cuts_long_texts(checks: PlanChecks, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("cars: {red: {}}\n")
     found = await checks.check(PlanQuestion("roles:\n  guide: {mode: tracking, cars: [rde]}\n"), "mia")
     assert not found["ok"]
@@ -113,7 +113,7 @@ async def test_a_person_has_few_open_checks_and_others_have_theirs(checks: PlanC
     assert not checks.is_busy("mia")
 
 
-async def test_computer_sleep_ends_presses_and_old_ticks_do_not_count(checks: PlanChecks) -> None:
+async def test_abandoned_or_dead_plan_check_spoils_no_other(checks: PlanChecks) -> None:
     assert await is_good(checks, GOOD)
     given_up = asyncio.ensure_future(checks.check(PlanQuestion(PLAN), "mia"))
     await asyncio.sleep(0)

@@ -21,7 +21,7 @@ def test_the_name_is_the_first_comment_or_the_roles(text: str, roles: list[str],
     assert plan_name(text, roles) == name
 
 
-def test_only_lead_takes_car_of_person() -> None:
+def test_plan_hash_in_words_becomes_name() -> None:
     text = "# Two cars patrol.\nroles:\n  guide: {mode: manual}\n"
     assert named(f"plan {parse(text).version} is in force", text) == "plan “Two cars patrol” is in force"
 

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from fleet.console.page_requests import BadPageMessage, PageMessage
 from fleet.console.plot_buffer import MAX_BUFFERED_VALUES, PlotBuffer, Series, plottable, series_of
-from fleet.console.requests import BadPageMessage, PageMessage
 from schemas.gen import fleet_v1_pb2 as pb
 
 

@@ -227,7 +227,7 @@ def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> No
         assert teacher.ask("POST", "/people", json.dumps({"t": "pair", "name": name, "rank": "person"}))[0] == 400
 
 
-def test_stop_has_person_name_without_open_page(stage: ServerStage, tmp_path: Path) -> None:
+def test_pairing_code_needs_person_of_fleet_and_running_console(stage: ServerStage, tmp_path: Path) -> None:
     def pair(name: str, fleet: FleetProcesses = stage.fleet, rank: str = "person") -> tuple[int, str]:
         done = CliRunner().invoke(cli, ["console", "pair", name, "--rank", rank], env=fleet.environment)
         return done.exit_code, done.output
@@ -260,7 +260,7 @@ def told(page: ClientConnection, kind: str) -> dict[str, Any]:
     return dict(found)
 
 
-def test_flooding_page_is_closed_and_costs_nobody_a_stop(stage: ServerStage) -> None:
+def test_class_joins_with_one_code_watches_stops_and_is_assigned(stage: ServerStage) -> None:
     teacher, pupil = stage.device("teacher", "--rank", "lead"), stage.device("mia")
 
     def people(who: NetworkDevice, **message: str) -> tuple[int, Any]:
@@ -375,7 +375,7 @@ def test_a_ping_is_answered_with_its_number(stage: ServerStage) -> None:
         assert next_message(page, "bad")["words"] == "id is not a whole number"
 
 
-def test_stop_behind_message_that_closes_page_is_carried_out(stage: ServerStage) -> None:
+def test_forbidden_command_of_pupil_ends_no_press_of_lead(stage: ServerStage) -> None:
     teacher, pupil = stage.device("teacher", "--rank", "lead"), stage.device("eva")
     with teacher.socket() as page, pupil.socket() as other:
         driving = hold(stage, page)
@@ -389,7 +389,7 @@ def test_stop_behind_message_that_closes_page_is_carried_out(stage: ServerStage)
     wait_for(lambda: not stage.judge.driving, "red stands")
 
 
-def test_inflated_websocket_message_is_refused_by_size(stage: ServerStage) -> None:
+def test_plan_is_set_under_person_name_without_open_page(stage: ServerStage) -> None:
     teacher = stage.device("teacher", "--rank", "lead")
     by: list[str] = []
 
@@ -412,7 +412,7 @@ def test_inflated_websocket_message_is_refused_by_size(stage: ServerStage) -> No
     assert [name.partition("@")[0] for name in by] == ["teacher", "teacher"]
 
 
-def test_bombs_and_large_plans_of_viewer_cost_no_more_than_pages(stage: ServerStage) -> None:
+def test_stop_has_person_name_without_open_page(stage: ServerStage) -> None:
     device = stage.device("eva")
 
     def holder() -> str:
@@ -584,7 +584,7 @@ def close_code(page: ClientConnection) -> int:
 @pytest.mark.parametrize(
     ("name", "text"), [("echo", '{"t":"echo","n":1,"press":1}'), ("stop", '{"t":"stop","id":""}'), ("bad", "{")]
 )
-def test_repeated_stops_of_person_take_no_extra_threads(stage: ServerStage, name: str, text: str) -> None:
+def test_flooding_page_is_closed_and_costs_nobody_a_stop(stage: ServerStage, name: str, text: str) -> None:
     thief, calm = stage.device(name), stage.device("calm")
     with thief.socket() as flooder, calm.socket() as page:
         closed = threading.Event()
@@ -609,7 +609,7 @@ def test_repeated_stops_of_person_take_no_extra_threads(stage: ServerStage, name
     assert "Traceback" not in stage.log()
 
 
-def test_device_with_full_flight_takes_no_slot_of_others(stage: ServerStage) -> None:
+def test_stop_behind_message_that_closes_page_is_carried_out(stage: ServerStage) -> None:
     begun: list[str] = []
     subscribed: Any = stage.fleet.bus.subscribe("fleet/red/event/command", lambda sample: note_stop(sample, begun))
     with stage.device("hasty").socket() as page:
@@ -625,7 +625,7 @@ def test_device_with_full_flight_takes_no_slot_of_others(stage: ServerStage) -> 
 
 
 @pytest.mark.parametrize("parts", [1, 1000])
-def test_plot_flood_keeps_one_question_and_newest_wins(stage: ServerStage, parts: int) -> None:
+def test_inflated_websocket_message_is_refused_by_size(stage: ServerStage, parts: int) -> None:
     bomber, server = stage.device("bomber"), psutil.Process(stage.console.process.pid)
     with bomber.socket() as page:
         assert page.protocol.extensions, "it is compressed"
@@ -644,7 +644,7 @@ def cpu_s(process: psutil.Process) -> float:
     return float(sum(each.user + each.system for each in used) + used[0].children_user + used[0].children_system)
 
 
-def test_command_flood_costs_no_other_device_of_person(stage: ServerStage) -> None:
+def test_bombs_and_large_plans_of_viewer_cost_no_more_than_pages(stage: ServerStage) -> None:
     """A viewer is a person of the lowest rank, who may only watch and stop."""
     viewer, server = stage.device("viewer"), psutil.Process(stage.console.process.pid)
     statuses = Counter[int]()
@@ -756,7 +756,7 @@ def test_invented_cars_on_the_bus_cost_a_real_one_nothing(stage: ServerStage) ->
     assert stage.log().count("further cars") == 1
 
 
-def test_request_flood_costs_no_other_device_nor_local_computer(stage: ServerStage) -> None:
+def test_repeated_stops_of_person_take_no_extra_threads(stage: ServerStage) -> None:
     server = psutil.Process(stage.console.process.pid)
     with stage.device("nervous").socket() as page:
         page.recv(30)
@@ -807,7 +807,7 @@ def test_commands_in_a_flood_reach_gateways_at_a_devices_rate(stage: ServerStage
     assert threads < threads_before + COMMAND_BURST / 2
 
 
-def test_page_that_reads_nothing_is_closed_and_bounded(stage: ServerStage) -> None:
+def test_device_with_full_flight_takes_no_slot_of_others(stage: ServerStage) -> None:
     """Neither from another device of the same person, nor from another person."""
     held: list[Any] = []
     declared: Any = stage.fleet.bus.queryable(command_key("fleet", "holder", "whistle"), held.append)
@@ -883,7 +883,7 @@ def answers_so_far(page: ClientConnection) -> Counter[str]:
     return found
 
 
-def test_stranger_flood_takes_no_stop_behind_same_address(stage: ServerStage) -> None:
+def test_plot_flood_keeps_one_question_and_newest_wins(stage: ServerStage) -> None:
     held: list[Any] = []
     asked: list[str] = []
 
@@ -925,7 +925,7 @@ def test_another_device_of_a_person_who_floods_stays_live(stage: ServerStage) ->
             assert json.loads(again.recv(30))["t"] == "hello"
 
 
-def test_second_console_names_first_and_other_port_works(stage: ServerStage) -> None:
+def test_command_flood_costs_no_other_device_of_person(stage: ServerStage) -> None:
     with stage.device("giver").socket() as flooding, stage.device("giver").socket() as page:
         for number in range(COMMANDS):
             flooding.send(json.dumps({"t": "do", "id": number, "verb": "whistle", "cars": ["red"]}))
@@ -934,7 +934,7 @@ def test_second_console_names_first_and_other_port_works(stage: ServerStage) -> 
         assert answers_until(page, "done")["bad"] == 0
 
 
-def test_download_has_files_as_they_are_and_no_links(stage: ServerStage) -> None:
+def test_request_flood_costs_no_other_device_nor_local_computer(stage: ServerStage) -> None:
     flooder, calm = stage.device("tworeq"), stage.device("tworeq")
     stranger = NetworkDevice(stage.lan_port, source="127.0.0.7")
 
@@ -992,7 +992,7 @@ def test_pings_count_as_messages(stage: ServerStage) -> None:
         assert close_code(page) == SENT_TOO_MUCH
 
 
-def test_sessions_api_lists_verifies_downloads_exports_without_path_escape(stage: ServerStage) -> None:
+def test_page_that_reads_nothing_is_closed_and_bounded(stage: ServerStage) -> None:
     pinger, server = stage.device("pinger", source="127.0.0.61"), psutil.Process(stage.console.process.pid)
     with socket.socket() as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -1063,7 +1063,7 @@ def test_one_device_has_so_many_pages_and_others_still_come(stage: ServerStage) 
         assert json.loads(other.recv(30))["t"] == "hello"
 
 
-def test_past_api_answers_without_path_escape(stage: ServerStage) -> None:
+def test_stranger_flood_takes_no_stop_behind_same_address(stage: ServerStage) -> None:
     """It asks again and again from several threads, beyond the burst of the address."""
     address, over, refused = "127.0.0.50", threading.Event(), Counter[int]()
     calm = stage.device("calm", source=address)
@@ -1152,7 +1152,7 @@ def test_each_port_speaks_its_own_protocol(stage: ServerStage) -> None:
     assert "Traceback" not in stage.log()
 
 
-def test_press_from_before_sleep_is_over(stage: ServerStage) -> None:
+def test_second_console_names_first_and_other_port_works(stage: ServerStage) -> None:
     port = str(stage.console.port)
     done = CliRunner().invoke(cli, ["console", "--port", port], env=stage.fleet.environment)
     assert done.exit_code == 1

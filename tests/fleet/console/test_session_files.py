@@ -51,7 +51,7 @@ def test_no_name_leads_out_of_the_folder(place: Path, name: str) -> None:
         session_path(place / "none", name)
 
 
-def test_complete_stop_without_basis_is_not_shown(place: Path) -> None:
+def test_download_has_files_as_they_are_and_no_links(place: Path) -> None:
     path = session_path(place, "one")
     assert path == place / "one"
     archive = zipfile.ZipFile(io.BytesIO(b"".join(zip_files(files_of(path), "one"))))

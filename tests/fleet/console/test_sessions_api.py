@@ -46,7 +46,9 @@ def cookie_of(port: int) -> str:
     return found.partition(";")[0]
 
 
-def test_older_claim_is_no_result_of_undelivered_stop(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_sessions_api_lists_verifies_downloads_exports_without_path_escape(
+    fleet: FleetProcesses, tmp_path: Path
+) -> None:
     place = tmp_path / "sessions"
     secret = tmp_path / "20260101T000000Z-secret"
     foreign = place / "20260920T141320Z-\u0443\u0440\u043e\u043a"
@@ -86,7 +88,7 @@ def test_older_claim_is_no_result_of_undelivered_stop(fleet: FleetProcesses, tmp
     assert console.process.end() == 0
 
 
-def test_untaken_stop_says_whether_bus_was_lost(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_past_api_answers_without_path_escape(fleet: FleetProcesses, tmp_path: Path) -> None:
     place, secret = tmp_path / "sessions", tmp_path / "20260101T000000Z-secret"
     name = "20260921T141320Z-fleet"
     for path in (place / name, secret):

@@ -13,7 +13,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
 
-async def test_car_that_moves_again_is_not_standing_and_keeps_time(tmp_path: Path) -> None:
+async def test_press_from_before_sleep_is_over(tmp_path: Path) -> None:
     hub = FleetProcesses(free_endpoint(), tmp_path)
     slept_s = [0.0]
     seen: list[dict[str, Any]] = []

@@ -31,7 +31,7 @@ def test_a_car_is_shown_only_by_a_complete_stop() -> None:
     assert report.as_dict()["cars"][2]["took_s"] == 1.4
 
 
-def test_row_of_moved_car_closes_when_it_stands() -> None:
+def test_complete_stop_without_basis_is_not_shown() -> None:
     report = StopReport(1, "stop", "us", ["red", "blue"], 10.0, 0)
     report.on_event("red", event("complete"), 10.1)
     report.on_event("blue", event("sent", basis="sent", words="blue sends no readings"), 10.2)
@@ -86,7 +86,7 @@ def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
         pb.Safety(motors="off", motors_basis="sent"),  # nobody knows since when
     ],
 )
-def test_moved_car_with_lost_gateway_does_not_move_for_ever(old: Any) -> None:
+def test_older_claim_is_no_result_of_undelivered_stop(old: Any) -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
     report.on_outcomes([], 12.0)
     report.on_safety("red", old, 14.0)
@@ -106,7 +106,7 @@ def test_only_events_of_its_own_command_count_also_late() -> None:
 
 
 @pytest.mark.parametrize(("lost_bus", "begins"), [(True, NOT_STOPPED), (False, "its gateway is not on the bus")])
-def test_outcome_without_event_is_as_new_as_last_state(lost_bus: bool, begins: str) -> None:
+def test_untaken_stop_says_whether_bus_was_lost(lost_bus: bool, begins: str) -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_outcomes([], 12.0, lost_bus=lost_bus)
     assert states(report)["red"][1].startswith(begins)
@@ -119,7 +119,7 @@ def safety(motors: str, at_s: int, basis: str = "") -> Any:
 
 
 @pytest.mark.parametrize("basis", ["shown", "sent"])
-def test_each_mode_has_title_and_sentence(basis: str) -> None:
+def test_car_that_moves_again_is_not_standing_and_keeps_time(basis: str) -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 1_000_000)
     done = event("complete", basis=basis)
     done.stamp.seconds = 50
@@ -147,7 +147,7 @@ def moved(*cars: str) -> StopReport:
 
 
 @pytest.mark.parametrize("motors", ["off", "stopping", "unknown"])
-def test_car_with_lost_link_is_left_alone_and_restored_to_mode(motors: str) -> None:
+def test_row_of_moved_car_closes_when_it_stands(motors: str) -> None:
     report = moved("red", "blue")
     report.on_safety("red", safety(motors, 52), 30.1)
     report.on_safety("red", safety("on", 54), 31.0)
@@ -162,7 +162,7 @@ def test_car_with_lost_link_is_left_alone_and_restored_to_mode(motors: str) -> N
     assert states(report) == {"blue": ("shown", "")}
 
 
-def test_unsupported_role_is_explained_and_not_asked_for() -> None:
+def test_moved_car_with_lost_gateway_does_not_move_for_ever() -> None:
     report = moved("red", "blue")
     report.on_presence(["red"])
     assert states(report) == {"red": ("moved", ""), "blue": ("shown", "")}, "that blue stood stays true"
@@ -170,7 +170,7 @@ def test_unsupported_role_is_explained_and_not_asked_for() -> None:
     assert states(report) == {"blue": ("shown", "")}
 
 
-def test_why_explains_decision_and_plan_is_replaced_atomically() -> None:
+def test_outcome_without_event_is_as_new_as_last_state() -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_safety("red", safety("stopping", 60), 10.1)
     report.on_outcomes([Outcome("red", ok=True, phase="complete", basis="shown")], 11.0)

@@ -20,6 +20,6 @@ def test_the_texts_name_every_motion_and_unknown() -> None:
     assert keys_of("motions") == {*Motion, "unknown"}
 
 
-def test_person_steps_phase_stops_and_restarts_plan() -> None:
+def test_each_mode_has_title_and_sentence() -> None:
     assert set(MODE_TEXTS) == set(Mode)
     assert all(name and words.endswith(".") for name, words in MODE_TEXTS.values())

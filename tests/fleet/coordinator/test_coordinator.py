@@ -125,7 +125,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     assert {role.name: list(role.cars) for role in last.roles} == {"manual": ["green"], "tracking": ["red"]}
 
 
-def test_unreachable_plan_is_refused_at_start_and_over_bus(cars: Cars, tmp_path: Path) -> None:
+def test_car_with_lost_link_is_left_alone_and_restored_to_mode(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
     lines = Lines(process)
     lines.until("red", "tracking", "role tracking")
@@ -141,7 +141,7 @@ def test_unreachable_plan_is_refused_at_start_and_over_bus(cars: Cars, tmp_path:
     assert process.end(signal.SIGTERM) == 0
 
 
-def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
+def test_unsupported_role_is_explained_and_not_asked_for(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(
         cars, tmp_path / "plan.yaml", "fixed: {blue: {mode: tracking}, green: {mode: manual}, purple: {mode: manual}}"
     )
@@ -183,7 +183,7 @@ roles:
 """
 
 
-def test_car_is_unheard_until_all_denials_are_known(cars: Cars, tmp_path: Path) -> None:
+def test_why_explains_decision_and_plan_is_replaced_atomically(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     lines = Lines(process)
     lines.until("green", "manual", "role rest")
@@ -225,7 +225,7 @@ phases: {first: {roles: [line], timeout_s: 600, next: second}, second: {roles: [
 """
 
 
-def test_car_is_forgotten_a_minute_after_gateway_unless_named(cars: Cars, tmp_path: Path) -> None:
+def test_person_steps_phase_stops_and_restarts_plan(cars: Cars, tmp_path: Path) -> None:
     events: list[Any] = []
     cars.bus.subscribe("fleet/@coordinator/log", lambda sample: events.append(sample.message()))
 
@@ -283,7 +283,7 @@ cars:
 NEVER = "fixed: {purple: {mode: tracking}}\nroles: {ghost: {mode: tracking, cars: [green]}}"
 
 
-def test_car_back_within_a_minute_is_not_forgotten(cars: Cars, tmp_path: Path) -> None:
+def test_unreachable_plan_is_refused_at_start_and_over_bus(cars: Cars, tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(LISTED, encoding="utf-8")
     listed = ("--fleet-file", str(file))
@@ -320,7 +320,7 @@ def test_car_back_within_a_minute_is_not_forgotten(cars: Cars, tmp_path: Path) -
     assert "the new plan: car red: the fleet file lets it take role scout" in process.stderr
 
 
-def test_ten_thousand_names_are_decided_rarely_and_forgotten(cars: Cars, tmp_path: Path) -> None:
+def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
     # The coordinator of the test before may have requested a mode that red still opens.
     wait_for(lambda: cars.state("safety", "red").trust != "stopping", "red changes no mode")
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)

@@ -11,9 +11,9 @@ from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.state import PolicyState
 from schemas import messages, topics
-from schemas.authority import NO_PEOPLE, People
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import NO_PEOPLE, People
 
 TURN_S = 0.1
 
@@ -30,7 +30,7 @@ def come(observer: FleetObserver, car: str, now: float) -> None:
         observer.on_sample(said(topic, car), now, None)
 
 
-def test_late_hold_of_earlier_gateway_blocks_nobody() -> None:
+def test_car_is_unheard_until_all_denials_are_known() -> None:
     observer = FleetObserver()
     assert observer.unconfirmed == set()
     observer.on_token("red", 99.0, alive=True)
@@ -63,7 +63,7 @@ def test_a_car_is_in_doubt_while_its_gateway_says_so() -> None:
     assert not observer.cars["red"].doubted, "a car that cannot show its stops is used like any other"
 
 
-def test_after_computer_sleep_no_old_reading_is_fresh() -> None:
+def test_car_is_forgotten_a_minute_after_gateway_unless_named() -> None:
     observer = FleetObserver({"blue": CarSnapshot(listed=True)})
     for car in ("red", "green", "blue"):
         come(observer, car, 100.0)
@@ -77,7 +77,7 @@ def test_after_computer_sleep_no_old_reading_is_fresh() -> None:
     assert observer.present == {"green"}
 
 
-def test_each_metric_has_panel_and_panels_do_not_overlap() -> None:
+def test_car_back_within_a_minute_is_not_forgotten() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     observer.on_token("red", 101.0, alive=False)
@@ -86,7 +86,7 @@ def test_each_metric_has_panel_and_panels_do_not_overlap() -> None:
     assert observer.present == {"red"}
 
 
-def test_stale_metric_has_no_value_and_gone_gateway_is_down() -> None:
+def test_ten_thousand_names_are_decided_rarely_and_forgotten() -> None:
     """Most names have only a token, some also a state, and one is not on the bus. All of them disappear."""
     plan = parse("roles: {scout: {mode: manual}}")
     observer, memory, now = FleetObserver(), PolicyState(), 100.0
@@ -143,7 +143,7 @@ def test_the_people_are_those_that_any_gateway_knows() -> None:
     assert observer.people == NO_PEOPLE
 
 
-def test_each_command_phase_counts_once_with_closed_labels() -> None:
+def test_late_hold_of_earlier_gateway_blocks_nobody() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     held = pb.Safety(car="red", boot_id="a", hold=pb.Hold(by="ann"))
@@ -201,7 +201,7 @@ def test_a_token_that_names_no_car_is_ignored() -> None:
     assert observer.present == set()
 
 
-def test_auto_shares_adapters_with_cars_that_name_one() -> None:
+def test_after_computer_sleep_no_old_reading_is_fresh() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     observer.on_sample(said("sensor/range"), 100.0, None)

@@ -14,7 +14,7 @@ def test_the_file_is_what_the_table_makes() -> None:
     assert json.loads(FILE.read_text()) == dashboard(), "fleet exporter --dashboard > deploy/grafana.json"
 
 
-def test_car_without_fields_shows_how_to_write_link() -> None:
+def test_each_metric_has_panel_and_panels_do_not_overlap() -> None:
     panels = dashboard()["panels"]
     expressions = [target["expr"] for panel in panels for target in panel["targets"]]
     shown = [re.findall(r"fleet_[a-z_]+", expression) for expression in expressions]

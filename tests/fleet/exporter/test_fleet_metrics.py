@@ -53,7 +53,7 @@ def test_a_car_has_the_values_of_its_messages() -> None:
     assert ("fleet_car_battery_volts", "red") not in values
 
 
-def test_shared_ports_equal_pairwise_comparison() -> None:
+def test_stale_metric_has_no_value_and_gone_gateway_is_down() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     late = NOW + (topics.TOPICS["state/link"].stale_after_s or 0) + 1
@@ -64,7 +64,7 @@ def test_shared_ports_equal_pairwise_comparison() -> None:
     assert found(metrics, late) == {("fleet_car_up", "red"): 0}
 
 
-def test_large_fleet_file_takes_linear_time() -> None:
+def test_each_command_phase_counts_once_with_closed_labels() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     for event in (

@@ -54,7 +54,7 @@ def test_too_many_are_warned_of_with_the_sum(count: int, crowded: bool, words: s
     assert words in found.words
 
 
-def test_car_without_link_is_allowed_for_finders() -> None:
+def test_auto_shares_adapters_with_cars_that_name_one() -> None:
     eight = links(**{f"car{number}": "?adapter=auto" for number in range(7)}, fixed="?adapter=hci1")
     found = sums(eight, "hci0", "hci1")
     assert found["auto"].connections == 8

@@ -184,7 +184,7 @@ cars:
 
 
 @pytest.mark.parametrize(("value", "example"), [("tcp://h:9", "{link: tcp://h:9}"), ("3", "{link: …}")])
-def test_certificate_is_signed_by_own_authority_only(value: str, example: str) -> None:
+def test_car_without_fields_shows_how_to_write_link(value: str, example: str) -> None:
     assert _faults(f"cars:\n  red: {value}\n") == [
         f"/nowhere/f.yaml:2:8: error: cars.red: needs fields. Write: `red: {example}`"
     ]
@@ -250,7 +250,7 @@ _PORTS = [parse_fleet_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "
 
 
 @given(st.lists(st.sampled_from(_PORTS), max_size=12))
-def test_renewal_is_due_a_third_before_end_or_for_new_address(links: list[FleetLink]) -> None:
+def test_shared_ports_equal_pairwise_comparison(links: list[FleetLink]) -> None:
     named = {f"car{number}": link for number, link in enumerate(links)}
     first: dict[str, str] = {}
     for (one, before), (other, after) in combinations(named.items(), 2):
@@ -260,14 +260,14 @@ def test_renewal_is_due_a_third_before_end_or_for_new_address(links: list[FleetL
 
 
 @pytest.mark.parametrize("link", ["tcp://10.0.{}.{}:8888", "/dev/tty{}.{}", "serial://?vid=1a86&serial={}.{}"])
-def test_revoked_identity_is_in_no_rule_and_returns_under_new_name(link: str) -> None:
+def test_large_fleet_file_takes_linear_time(link: str) -> None:
     lines = "".join(f"  c{n}: {{link: '{link.format(n >> 8, n & 255)}'}}\n" for n in range(4000))
     began = time.process_time()
     assert len(_fleet(f"cars:\n{lines}").cars) == 4000
     assert time.process_time() - began < 4.0, "a comparison of each pair takes 9 to 60 s"
 
 
-def test_program_uses_own_certificate_or_that_of_user() -> None:
+def test_car_without_link_is_allowed_for_finders() -> None:
     fleet = _fleet("cars: {red: {platform: stm32}, green: {link: COM1}}", unbound=True)
     assert (fleet.unbound, list(fleet.cars)) == (("red",), ["green"])
 

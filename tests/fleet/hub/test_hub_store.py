@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.hub import authority
+from fleet.hub import certificate_authority
 from fleet.hub.hub_store import BrokenHub, HubStore
 from fleet.hub.x509_parts import LIFETIME
 from schemas.bus import Credentials, NoCredentials
@@ -55,7 +55,7 @@ def test_due_certificates_are_renewed_and_the_authority_stays(tmp_path: Path) ->
     assert store.credentials.listens == ["tls/0.0.0.0:7447"], "as before"
 
 
-def test_service_invited_elsewhere_is_taken_back(tmp_path: Path) -> None:
+def test_revoked_identity_is_in_no_rule_and_returns_under_new_name(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     store.reserve(person("mia"), NOW)
     assert "person.mia" in common_names(store)
@@ -100,7 +100,7 @@ def test_without_a_certificate_the_way_to_one_is_said(tmp_path: Path) -> None:
         credentials.of_hub()
 
 
-def test_pose_is_allowed_to_own_gateway_and_locator(tmp_path: Path) -> None:
+def test_program_uses_own_certificate_or_that_of_user(tmp_path: Path) -> None:
     credentials = store_in(tmp_path).credentials
     assert credentials.identity("car.red") == "car.red"
     with pytest.raises(NoCredentials, match="fleet hub init --car blue"):
@@ -128,7 +128,7 @@ def test_who_was_revoked_stays_so_if_another_one_joins_meanwhile(tmp_path: Path)
     one.reserve(person("bob"), NOW)
     one.reserve(person("eve"), NOW)
     assert HubStore.load(one.credentials).revoke(person("bob"))
-    _, request = authority.new_request("eve")
+    _, request = certificate_authority.new_request("eve")
     one.sign(request, person("eve"), NOW)
     assert HubStore.load(one.credentials).known[person("bob")].revoked
     assert common_names(one) == {"car.red", ME, "person.eve"}
@@ -139,10 +139,10 @@ def test_who_was_revoked_or_invited_again_meanwhile_gets_no_certificate(
     change: Callable[[HubStore, str], object], tmp_path: Path
 ) -> None:
     one = store_in(tmp_path)
-    _, request = authority.new_request("eve")
+    _, request = certificate_authority.new_request("eve")
     one.reserve(person("eve"), NOW)
     change(HubStore.load(one.credentials), person("eve"))
-    with pytest.raises(authority.BadRequestForCertificate):
+    with pytest.raises(certificate_authority.BadRequestForCertificate):
         one.sign(request, person("eve"), NOW)
 
 
@@ -173,7 +173,9 @@ def test_a_damaged_file_is_made_again(name: str, text: str, tmp_path: Path) -> N
     (tmp_path / name).write_text(text)
     HubStore.load(store.credentials).ensure([car("red")], ME, addresses=["192.0.2.1"], now=NOW)
     for each in (ME, "car.red", "hub"):
-        assert authority.belong((tmp_path / f"{each}.pem").read_bytes(), (tmp_path / f"{each}.key").read_bytes())
+        assert certificate_authority.belong(
+            (tmp_path / f"{each}.pem").read_bytes(), (tmp_path / f"{each}.key").read_bytes()
+        )
     assert common_names(store) == {"car.red", ME}
 
 
@@ -182,12 +184,12 @@ def test_a_damaged_authority_is_named(name: str, tmp_path: Path) -> None:
     store = store_in(tmp_path)
     (tmp_path / name).write_text("junk")
     store.reserve(person("eve"), NOW)
-    _, request = authority.new_request("eve")
+    _, request = certificate_authority.new_request("eve")
     with pytest.raises(BrokenHub, match=r"ca\.key"):
         store.sign(request, person("eve"), NOW)
 
 
-def test_sites_go_on_alone_and_are_one_fleet_when_linked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_store_change_waits_for_lock_but_not_for_killed_holder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_in(tmp_path)
     monkeypatch.setattr("fleet.hub.hub_store.LOCK_TIMEOUT_S", 0.1)
     holder = (

@@ -93,7 +93,7 @@ def test_a_false_hub_gets_nothing(invitation: Invitation, tmp_path: Path) -> Non
         false.close()
 
 
-def test_rules_of_first_hub_apply_at_every_site(invitation: Invitation, tmp_path: Path) -> None:
+def test_false_hub_beside_right_authority_gets_nothing(invitation: Invitation, tmp_path: Path) -> None:
     """Anybody can read the certificate of the authority. OpenSSL trusts each one of a text."""
     false = Invitation(made(tmp_path / "false"), person("mia"), hub_port=7447, address="127.0.0.1", port=free_port())
     try:

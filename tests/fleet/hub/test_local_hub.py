@@ -30,7 +30,7 @@ def test_a_computers_user_is_the_person_who_joined_last(
     assert [credentials.identity(each) for each in joins] == joins
 
 
-def test_need_measured_before_role_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+def test_service_invited_elsewhere_is_taken_back(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     recorder = service(Service.RECORDER)
     assert in_process.fleet("hub", "init", "--local").returncode == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.hub import authority
+from fleet.hub import certificate_authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, join
 from fleet.hub.local_hub import ensure_hub_here, store_joined
@@ -106,7 +106,7 @@ def reached(bus: Bus, key: str) -> list[str]:
     return sorted(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
 
 
-def test_plan_without_conflicts_passes(sites: Sites) -> None:
+def test_sites_go_on_alone_and_are_one_fleet_when_linked(sites: Sites) -> None:
     sites.start(sites.first)
     sites.start(sites.second)
     with ExitStack() as stack:
@@ -131,7 +131,7 @@ def test_plan_without_conflicts_passes(sites: Sites) -> None:
             )
 
 
-def test_unreachable_plan_with_fleet_file_is_refused_with_all_faults(sites: Sites) -> None:
+def test_rules_of_first_hub_apply_at_every_site(sites: Sites) -> None:
     sites.start(sites.first)
     sites.start(sites.second)
     with gateway(sites.second, "blue"), Bus.open(sites.second, identity=EVE) as eve:
@@ -162,11 +162,11 @@ def test_the_hub_and_the_people_of_the_other_site_are_renewed_by_the_first_one(
 ) -> None:
     monkeypatch.setattr(hub_renewals, "OWN_CHECK_INTERVAL_S", 0.2)
     there = Credentials.of(sites.second)
-    ca = authority.KeyPair(*((sites.store.directory / name).read_bytes() for name in ("ca.pem", "ca.key")))
+    ca = certificate_authority.KeyPair(*((sites.store.directory / name).read_bytes() for name in ("ca.pem", "ca.key")))
     now = datetime.now(UTC)
     for file, name, names in ((HUB, NORTH, ["127.0.0.1", "localhost"]), (EVE, EVE, [])):
-        key, request = authority.new_request(name)
-        made = authority.sign_request(ca, request, name, now - timedelta(days=300), names)
+        key, request = certificate_authority.new_request(name)
+        made = certificate_authority.sign_request(ca, request, name, now - timedelta(days=300), names)
         (there.directory / f"{file}.key").write_bytes(key)
         (there.directory / f"{file}.pem").write_bytes(made)
     sites.start(sites.first)
@@ -179,7 +179,7 @@ def test_the_hub_and_the_people_of_the_other_site_are_renewed_by_the_first_one(
     with Bus.open(sites.second, identity=EVE):
         wait_for(lambda: is_renewed(HUB), "that of the hub")
     made = (there.directory / f"{HUB}.pem").read_bytes()
-    assert authority.names_of(made) == ["127.0.0.1", "localhost"]
+    assert certificate_authority.names_of(made) == ["127.0.0.1", "localhost"]
 
     def eves() -> bool:
         with suppress(BusError), Bus.open(sites.second, identity=EVE):

@@ -32,7 +32,7 @@ def test_what_is_so_for_long_enough_counts(
     assert _followed(for_s, course) == counts
 
 
-def test_higher_priority_is_filled_first_at_least_cost() -> None:
+def test_debounce_delays_changes_and_ignores_unknown() -> None:
     settled: Settled | None = None
     found = []
     for now, so in [(0, None), (1, True), (2, False), (3, None), (3.4, False), (3.5, False), (4, True), (4.5, False)]:

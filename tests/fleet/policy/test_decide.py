@@ -62,7 +62,7 @@ def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str 
     assert bool(result.asks) is asks
 
 
-def test_flickering_needs_change_nothing_and_old_values_count() -> None:
+def test_doubted_car_is_left_alone_and_delays_no_phase() -> None:
     run = PolicyRun(ONE, "green", "red")
     run.at(0.0)
     run.change("green", doubted=True, motors="unknown")
@@ -76,7 +76,7 @@ def test_flickering_needs_change_nothing_and_old_values_count() -> None:
     assert "in doubt" not in run.of("green").why, "it is free again"
 
 
-def test_car_with_unknown_need_does_not_take_role() -> None:
+def test_role_moves_after_debounce_and_does_not_return() -> None:
     run = PolicyRun(ONE, "green", "red")
     assert run.at(0.0).roles == {"green": "scout"}
     run.change("green", present=False, mode="")
@@ -111,7 +111,7 @@ def test_a_persons_word_frees_a_role_at_once() -> None:
     assert run.at(0.1).roles == {"red": "scout"}
 
 
-def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
+def test_paused_fleet_leaves_plan_and_continues_after() -> None:
     run = PolicyRun(ONE, "green", "red")
     before = run.at(0.0).roles
     for car in run.cars:
@@ -127,7 +127,7 @@ def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
     assert len(run.asked) == asked + 1
 
 
-def test_leader_sees_lamp_and_keeps_role_during_mode_change() -> None:
+def test_higher_priority_is_filled_first_at_least_cost() -> None:
     run = PolicyRun(TWO, "blue", "green", "red")
     run.change("red", mode="tracking")
     assert run.at(0.0).roles == {"blue": "patrol", "green": "patrol", "red": "scout"}
@@ -138,7 +138,7 @@ def test_leader_sees_lamp_and_keeps_role_during_mode_change() -> None:
     )
 
 
-def test_car_off_the_line_drives_on_unless_stopped() -> None:
+def test_flickering_needs_change_nothing_and_old_values_count() -> None:
     run = PolicyRun(STRONG, "green", "red")
     for car in ("green", "red"):
         run.sees(car, battery={"voltage_v": 7.4})
@@ -157,14 +157,14 @@ def test_car_off_the_line_drives_on_unless_stopped() -> None:
     assert run.of("green").kind == "idle"
 
 
-def test_role_waits_for_last_returning_car_after_hub_outage() -> None:
+def test_car_with_unknown_need_does_not_take_role() -> None:
     run = PolicyRun(STRONG, "red")
     run.at(0.0)
     assert run.roles == {}
     assert "that is not known" in run.of("role scout").why
 
 
-def test_light_effect_is_asked_once_in_mode_that_obeys() -> None:
+def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
     run = PolicyRun(ONE, "green", "red", obey=False)
     run.change("green", mode="tracking", verdict="contradicted", evidence="silent for 3.1 s")
     run.change("red", mode="manual", held_by="ann")
@@ -185,7 +185,7 @@ def test_what_a_car_refuses_another_does() -> None:
     assert run.roles == {"red": "scout"}
 
 
-def test_led_blinks_while_rule_is_in_force() -> None:
+def test_leader_sees_lamp_and_keeps_role_during_mode_change() -> None:
     run = PolicyRun(LAMP, "blue", "green", "red")
     for car in run.cars:
         run.sees(car, light={"left": False, "right": False})
@@ -218,7 +218,7 @@ rules:
     assert run.of("blue").readings == ("red/sensor/range range_m=0.2 (1.0 s old)",)
 
 
-def test_stand_in_takes_no_car_from_its_role_or_higher_priority() -> None:
+def test_car_off_the_line_drives_on_unless_stopped() -> None:
     """The rule ends without `fleet resume`. docs/how-to/write-a-plan.md warns of this."""
     plan = parse("""
 roles: {guide: {mode: tracking}}
@@ -247,7 +247,7 @@ rules:
 @pytest.mark.parametrize(
     ("back_s", "kept"), [(0.3, True), (HUB_RETURN_GRACE_S - 0.2, True), (HUB_RETURN_GRACE_S + 0.2, False)]
 )
-def test_roles_wait_at_start_for_unheard_cars(back_s: float, kept: bool) -> None:
+def test_role_waits_for_last_returning_car_after_hub_outage(back_s: float, kept: bool) -> None:
     """Without a hub, the coordinator decides nothing. A car that was only unreachable then is not lost."""
     run = PolicyRun(ONE, "blue", "green", "red")
     run.until(1.0)
@@ -315,7 +315,7 @@ roles:
     assert run.at(0.2).roles == {"red": "strong"}
 
 
-def test_role_for_all_others_starves_no_other_role() -> None:
+def test_light_effect_is_asked_once_in_mode_that_obeys() -> None:
     plan = parse("""
 fixed: {red: {mode: tracking}, green: {mode: manual}}
 rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led: '#090000'}}]
@@ -342,7 +342,7 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
     assert coloured == [2.1], "nor by a coordinator that takes over"
 
 
-def test_next_phase_takes_cars_from_role_for_all_others() -> None:
+def test_led_blinks_while_rule_is_in_force() -> None:
     plan = parse("""
 fixed: {red: {mode: manual}}
 rules: [{when: {car: red, is: light.left}, then: {who: this_car, led: {color: red, blink_s: 0.5}}}]
@@ -370,7 +370,7 @@ rules: [{when: {car: red, is: light.left}, then: {who: this_car, led: {color: re
 
 
 @pytest.mark.parametrize("priority", [-1, 0, 1])
-def test_failing_car_swaps_role_with_role_for_all_others(
+def test_stand_in_takes_no_car_from_its_role_or_higher_priority(
     priority: int,
 ) -> None:
     plan = parse(f"""
@@ -421,7 +421,7 @@ def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
     assert (run.roles, len(run.asked)) == (before, asked)
 
 
-def test_doubted_car_does_not_block_phase_timeout() -> None:
+def test_roles_wait_at_start_for_unheard_cars() -> None:
     run = PolicyRun(ONE, "green", "red")
     run.change("red", mode="")
     assert run.at(0.0).decisions == ()
@@ -434,7 +434,7 @@ REST = "rest: {mode: manual, count: all}"
 PATROL = "patrol: {mode: tracking, count: 1}"
 
 
-def test_next_steps_through_phases_and_is_refused_at_end() -> None:
+def test_role_for_all_others_starves_no_other_role() -> None:
     run = PolicyRun(parse(f"roles: {{{REST}}}"), "blue", "green", "red")
     run.until(2.0)
     assert set(run.roles.values()) == {"rest"}
@@ -461,7 +461,7 @@ def test_after_all_were_stopped_the_counted_role_is_filled_first() -> None:
     assert [mode for _, _, mode in run.asked] == ["tracking", "tracking"], "and nothing flaps"
 
 
-def test_next_is_refused_without_phases_and_while_stopped() -> None:
+def test_next_phase_takes_cars_from_role_for_all_others() -> None:
     plan = parse("""
 roles: {a: {mode: tracking}, b: {mode: following, count: 2}, c: {mode: manual, count: all}}
 phases: {one: {roles: [a, c], timeout_s: 5, next: two}, two: {roles: [b, c]}}
@@ -473,7 +473,7 @@ phases: {one: {roles: [a, c], timeout_s: 5, next: two}, two: {roles: [b, c]}}
     assert sorted(run.roles.values()) == ["b", "b", "c"]
 
 
-def test_stopped_plan_brings_cars_to_rest_once() -> None:
+def test_failing_car_swaps_role_with_role_for_all_others() -> None:
     run = PolicyRun(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "red", obey=False)
     run.change("blue", mode="tracking")
     run.until(1.0)
@@ -610,7 +610,7 @@ def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
     assert run.roles == {"blue": "patrol"}
 
 
-def test_command_on_its_way_does_not_count_as_rest() -> None:
+def test_doubted_car_does_not_block_phase_timeout() -> None:
     plan = parse(
         """
 roles: {scout: {mode: tracking, count: 1}}

@@ -66,7 +66,7 @@ def test_a_dry_run_is_the_first_decision_of_a_coordinator() -> None:
     assert {each.car: each.is_changed for each in tried.cars} == {"blue": True, "red": True}
 
 
-def test_every_byte_and_length_without_index() -> None:
+def test_dry_run_keeps_roles_in_force_and_tells_lacking_cars() -> None:
     cars = FleetSnapshot(dict.fromkeys(("red", "blue"), HERE))
     for holder, other in (("red", "blue"), ("blue", "red")):
         in_force = PlanInForce(parse(TWO), {holder: "guide", other: "rest"})

@@ -25,7 +25,7 @@ from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import TABLES_PREFIX, SessionInfo
 from fleet.recording.tools import table_cache
 from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
-from fleet.recording.writing.retention import Quota
+from fleet.recording.writing.quota_removal import Quota
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import name_of
@@ -78,7 +78,7 @@ def test_a_question_reaches_every_session_and_says_which(sessions: Path) -> None
     ]
 
 
-def test_damaged_sessions_of_many_are_named_and_rest_counts(sessions: Path) -> None:
+def test_context_is_of_that_moment_and_stale_states_do_not_count(sessions: Path) -> None:
     rows = asked(
         sessions,
         "SELECT range_m, mode, motion, owner, driver FROM sensor_range_context WHERE car = 'red' ORDER BY publish_time",
@@ -123,14 +123,14 @@ def test_a_bad_question_is_one_line(sessions: Path, sql: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_value_null_for_its_type_is_named(sessions: Path) -> None:
+def test_quote_in_session_name_is_no_sql(sessions: Path) -> None:
     make(sessions / "it's; DROP", "green", [7.0])
     assert {"it's; DROP"} == {
         row["session"] for row in asked(sessions, "SELECT session FROM sensor_range WHERE car = 'green'")
     }
 
 
-def test_quota_deletes_session_while_tables_are_made(sessions: Path) -> None:
+def test_tables_are_made_once_and_again_for_grown_session(sessions: Path) -> None:
     first = tables_of(sessions / "one").directory
     assert first.is_dir()
     assert tables_of(sessions / "one").directory == first
@@ -176,7 +176,7 @@ def test_a_session_that_lacks_messages_is_named_as_by_find(sessions: Path, *, as
     assert set(Catalog(sessions).damage) == {"cut"}
 
 
-def test_fleet_file_condition_pins_while_recording(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_session_asked_while_recording_is_named_once_cut(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     describe(sessions / "one", closed=False)
     os.utime(sessions / "one" / "0001.mcap")
     assert not Catalog(sessions).damage
@@ -338,7 +338,7 @@ def no_tables(place: Path) -> bool:
     return not [*place.rglob(f"{TABLES_PREFIX}*")]
 
 
-def test_fleet_file_mistake_costs_pins_not_recording(tmp_path: Path) -> None:
+def test_damaged_sessions_of_many_are_named_and_rest_counts(tmp_path: Path) -> None:
     for number in range(300):
         make(tmp_path / f"s{number:03d}", "red", [1.0])
     for number in range(0, 300, 30):
@@ -419,7 +419,7 @@ def test_a_session_of_another_schema_has_the_columns_of_ours(sessions: Path, *, 
     assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE range_m < 0.6") == [{"n": 2 if others else 0}]
 
 
-def test_gap_is_missing_until_filled_and_duplicates_are_told(sessions: Path) -> None:
+def test_value_null_for_its_type_is_named(sessions: Path) -> None:
     old_schema(sessions / "words", 9, "far away")
     old_schema(sessions / "numbers", 9)
     done = query("SELECT count(*) n FROM sensor_range WHERE range_m IS NULL", "--csv", sessions)
@@ -478,7 +478,7 @@ def test_tables_of_a_file_that_is_gone_go_too(sessions: Path) -> None:
     assert not (sessions / ".lone.mcap").exists()
 
 
-def test_first_message_starts_stream_and_gap_before_is_missing(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quota_deletes_session_while_tables_are_made(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     SessionInfo("fleet", "2026-01-01T00:00:00Z", "h", {}, closed=True).write(sessions / "two")
     rmtree, meanwhile = shutil.rmtree, [sessions / "two" / f"{TABLES_PREFIX}x.part"]
 

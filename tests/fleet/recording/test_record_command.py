@@ -129,7 +129,7 @@ def test_bad_input_is_one_line(arguments: list[str], code: int, words: str, endp
     assert "Traceback" not in errors
 
 
-def test_message_behind_recalled_ones_starts_no_stream(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_fleet_file_condition_pins_while_recording(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     rules = tmp_path / "fleet.yaml"
     rules.write_text(
         "cars: {red: {link: sim, platform: arduino}}\n"
@@ -169,7 +169,7 @@ def test_message_behind_recalled_ones_starts_no_stream(endpoint: str, bus: Bus, 
     assert (info.returncode, json.loads(info.stdout)["pins"]) == (0, [near, other])
 
 
-def test_oldest_senders_are_forgotten_but_not_their_gaps(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_fleet_file_mistake_costs_pins_not_recording(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     rules = tmp_path / "fleet.yaml"
     rules.write_text("cars: {red: {link: sim, platform: arduino}}\npin: [{when: rnage_m < 0.1}]\n")
     place = tmp_path / "sessions"

@@ -20,7 +20,7 @@ def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]
     return found
 
 
-def test_queue_overflow_counts_as_missing_including_last() -> None:
+def test_gap_is_missing_until_filled_and_duplicates_are_told() -> None:
     numbers = SequenceTracker()
     assert all(live(numbers, 5, 6, 10))
     assert numbers.missing == 3
@@ -33,7 +33,7 @@ def test_queue_overflow_counts_as_missing_including_last() -> None:
     assert (numbers.missing, numbers.has_gaps) == (0, False)
 
 
-def test_stop_of_several_cars_counts_once() -> None:
+def test_first_message_starts_stream_and_gap_before_is_missing() -> None:
     numbers = SequenceTracker()
     live(numbers, 5)
     assert numbers.add_backfilled("a", 2, 20)
@@ -51,7 +51,7 @@ def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
     assert numbers.missing == 0
 
 
-def test_wrong_time_names_formats_and_session_range() -> None:
+def test_message_behind_recalled_ones_starts_no_stream() -> None:
     numbers = SequenceTracker()
     live(numbers, 1)
     assert numbers.add_backfilled("a", 5, 50)
@@ -83,7 +83,7 @@ def test_the_wrap_is_no_gap() -> None:
     assert numbers.missing == 3
 
 
-def test_repeated_hour_is_ambiguous_and_missing_hour_refused() -> None:
+def test_oldest_senders_are_forgotten_but_not_their_gaps() -> None:
     numbers = SequenceTracker()
     for sender in range(MAX_TRACKED_SOURCES * 3):
         live(numbers, 1, 3, sender=str(sender))
@@ -106,7 +106,7 @@ def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: 
 
 
 @given(st.sets(st.integers(2, 60)), st.integers(0, 2**32))
-def test_join_takes_latest_fresh_value_of_same_car(dropped: set[int], seed: int) -> None:
+def test_queue_overflow_counts_as_missing_including_last(dropped: set[int], seed: int) -> None:
     """The recorder reports what it dropped now and then, also after later ones came."""
     chance, numbers, count, last, kept = random.Random(seed), SequenceTracker(), 0, 0, 0
     for number in range(1, 61):

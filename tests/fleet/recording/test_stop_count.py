@@ -26,7 +26,7 @@ def event(verb: str, command: str, phase: str = "asked") -> pb.CommandEvent:
     return pb.CommandEvent(verb=verb, id=command, phase=phase)
 
 
-def test_wrong_topic_name_suggests_topic() -> None:
+def test_stop_of_several_cars_counts_once() -> None:
     found = StopCount()
     for verb, command, phase in itertools.product(("stop", "drive", "resume", "mode"), ("a", "b"), PHASES):
         found.add(event(verb, f"{verb} {command}", phase))

@@ -64,13 +64,13 @@ def test_what_is_not_over_is_refused(text: str) -> None:
         time_spec.ago_s(text, NOON)
 
 
-def test_hit_has_mode_last_command_and_opens() -> None:
+def test_wrong_time_names_formats_and_session_range() -> None:
     with pytest.raises(ValueError, match=r"from 2026-11-25 12:00:00 CET to 12:01:00 CET") as refused:
         time_spec.span_ns("noon", NOON * S, (NOON + 60) * S, NOON)
     assert time_spec.RULE in str(refused.value)
 
 
-def test_messages_without_condition_value_are_counted() -> None:
+def test_repeated_hour_is_ambiguous_and_missing_hour_refused() -> None:
     with zone("CET-1CEST,M3.5.0,M10.5.0/3"):
         twice = 1_792_886_400  # 2026-10-25 00:00 UTC: 2:00 CEST. One hour later it is 2:00 CET.
         with pytest.raises(ValueError, match=r"2026-10-25T02:30:00\.000\+02:00, 2026-10-25T02:30:00\.000\+01:00"):

@@ -22,7 +22,7 @@ from fleet.supervisor.spec import (
     recorder_command,
     simulator_command,
 )
-from schemas.authority import NO_PEOPLE, People
+from schemas.rights import NO_PEOPLE, People
 
 FILE = """
 name: lab

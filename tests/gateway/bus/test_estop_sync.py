@@ -7,7 +7,7 @@ from pathlib import Path
 import zenoh
 
 from gateway.bus.estop_sync import MAX_SINGLE_QUERIES, EstopSync
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from schemas.bus import Bus, Handover, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.messages import encoding_of

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.battery import LEVEL_DEBOUNCE_S, Battery, BatteryPolicy, charge
-from schemas.limits import LOW_V
+from schemas.battery_levels import LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
 

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.bus.requests import parse
+from gateway.bus.command_parser import parse
 from gateway.bus.service import Request
 from gateway.control.commands import Answer
-from gateway.control.safety import LEASE_S, PersistedSafety, Safety
+from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
 from schemas import messages
-from schemas.authority import Loan
 from schemas.commands import COMMANDS
+from schemas.rights import Loan
 from schemas.words import Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import Workbench
 

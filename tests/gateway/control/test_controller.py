@@ -25,15 +25,15 @@ from gateway.control.commands import (
     Signal,
     Stop,
 )
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from gateway.drivers.yahboom.protocol.frames import ModeOpen, parse_sent
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.drivers.yahboom.stops import cases
-from gateway.drivers.yahboom.stops.stopping import RETRY_S
+from gateway.drivers.yahboom.stops.stop_in_progress import RETRY_S
 from gateway.sim.model.traits import CarTraits
-from schemas.authority import Hold, Sender
 from schemas.commands import Verb
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
+from schemas.rights import Hold, Sender
 from schemas.words import (
     Basis,
     CarTrust,

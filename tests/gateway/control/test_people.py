@@ -1,4 +1,4 @@
-"""Tests of permissions: each rank, action and state at the arbiter, and pauses and loans through control."""
+"""Tests of permissions: what is refused for each rank, action and state, and pauses and loans through control."""
 
 import itertools
 from collections.abc import Callable
@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.control.arbiter import CommandContext, refuse
 from gateway.control.commands import (
     Action,
     Command,
@@ -23,8 +22,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.safety import PersistedSafety
-from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Sender
+from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.refusals import CommandContext, refuse
+from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
 from tests.support.message_length import MAX_LINES, count_lines

@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.control.arbiter import AFTER_SLEEP_S
 from gateway.control.commands import Drive, EmergencyStop, Fan, Led, Lend, Pause, SetMode, Stop
+from gateway.control.refusals import AFTER_SLEEP_S
 from schemas.limits import STREAM_PAUSE_S
 from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.events import CommandRecord, LogRecord
-from gateway.control.safety import PersistedSafety
+from gateway.control.holds_and_leases import PersistedSafety
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import FRAME_S
 from gateway.drivers.yahboom.stops.evidence import SETTLING_S
-from schemas.authority import NO_PEOPLE, People, Sender
+from schemas.rights import NO_PEOPLE, People, Sender
 from schemas.words import FrameOrigin, Level, Mode, Phase, Platform, Rank, Reason
 from tests.support.controls import control
 from tests.support.virtual import SHORTEST_S

@@ -12,7 +12,7 @@ from fleet.bridges.home_assistant import ENTITIES
 from fleet.conditions.fields import LAST, fields_of
 from fleet.exporter.metrics import METRICS
 from gateway.control.driver import STALL_S
-from gateway.control.senders import SENDER_GONE_S
+from gateway.control.sender_presence import SENDER_GONE_S
 from gateway.control.trust import TRANSITIONS, TrustEvent, TrustState
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform

@@ -197,12 +197,12 @@ def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
         "patrol: {mode: obstacle_avoidance, cars: [green], count: all}",
     ],
 )
-def test_named_absent_car_without_fleet_file_is_warning(others: str) -> None:
+def test_need_measured_before_role_is_accepted(others: str) -> None:
     plan = parse(f"roles: {{{others}, guide: {{mode: tracking, needs: battery_v > 7}}}}")
     assert [each.words for each in check(plan, {**FLEET, "blue": listed("arduino")}) if "never get" in each.words] == []
 
 
-def test_fleet_file_role_missing_in_plan_is_told() -> None:
+def test_good_plan_passes_with_and_without_fleet_file() -> None:
     plan = parse("""
 roles: {scout: {mode: tracking, needs: battery.voltage_v > 7}, rest: {mode: manual, count: all, priority: -1}}
 rules: [{when: {any_car: line.left_outer, with_role: scout, for_s: 1}, then: {who: other_cars, mode: color_led}}]
@@ -235,7 +235,7 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
         "phases: {a: {until: line.left_outer, next: b}, b: {until: not line.left_outer, next: a}}",
     ],
 )
-def test_large_fleet_and_long_plan_are_checked_in_time(more: str) -> None:
+def test_plan_without_conflicts_passes(more: str) -> None:
     plan = parse("roles: {scout: {mode: tracking, count: all}, near: {mode: manual}}\n" + more)
     assert [
         str(each) for each in check(plan, FLEET) if each.severity is Severity.ERROR or "together" in str(each)
@@ -250,7 +250,7 @@ roles:
 """)
 
 
-def test_fixed_mode_of_car_is_own_role() -> None:
+def test_unreachable_plan_with_fleet_file_is_refused_with_all_faults() -> None:
     refusal = find_faults(BROKEN, FLEET).refusal("plan.yaml")
     assert [line.split(": ")[2] for line in refusal.splitlines()] == [
         "car purple",
@@ -260,7 +260,7 @@ def test_fixed_mode_of_car_is_own_role() -> None:
     assert all(line.startswith("plan.yaml:") for line in refusal.splitlines())
 
 
-def test_yaml_1_1_words_stay_words() -> None:
+def test_named_absent_car_without_fleet_file_is_warning() -> None:
     plan = parse("fixed: {purple: {mode: tracking}, red: {mode: manual}}")
     assert find_faults(plan).warnings == ()
     found = find_faults(plan, None, {"red", "green"})
@@ -283,7 +283,7 @@ def test_a_misspelled_word_for_cars_is_an_error_once() -> None:
     assert find_faults(named).errors == ()
 
 
-def test_forbidden_field_hides_no_other_fault() -> None:
+def test_fleet_file_role_missing_in_plan_is_told() -> None:
     fleet = {"red": listed("arduino", "patroll", "patrol"), "blue": listed("arduino")}
     (found,) = check(parse("roles: {patrol: {mode: tracking}}"), fleet)
     assert found.severity is Severity.WARNING

@@ -174,7 +174,7 @@ def test_two_cars_for_two_places_leave_none_that_stands() -> None:
     assert told.startswith("rule 1: it never fires. It waits for light.left from cars")
 
 
-def test_plan_with_little_sound_content_has_a_fault() -> None:
+def test_large_fleet_and_long_plan_are_checked_in_time() -> None:
     """The check handles a hundred cars, each with a role of its own, and the maximum number of rules in time."""
     cars = {f"car{number}": listed("arduino") for number in range(100)}
     roles = "".join(f"  role{number}: {{mode: tracking, count: 5}}\n" for number in range(20))

@@ -19,7 +19,7 @@ def test_the_example_plans_are_plans(path: Path) -> None:
     assert check(plan) == ()
 
 
-def test_condition_of_maximum_length_is_accepted() -> None:
+def test_fixed_mode_of_car_is_own_role() -> None:
     plan = parse(
         "fixed: {red: {mode: tracking}, blue: {mode: tracking}, green: {role: patrol}}\n"
         "roles: {patrol: {mode: following}}"
@@ -32,7 +32,7 @@ def test_condition_of_maximum_length_is_accepted() -> None:
     assert plan.version == parse(plan.text).version != parse(plan.text + "#").version
 
 
-def test_condition_of_maximum_depth_is_accepted() -> None:
+def test_yaml_1_1_words_stay_words() -> None:
     plan = parse("fixed: {on: {mode: manual}, no: {mode: tracking}, 'off': {mode: manual}, y: {mode: manual}}")
     assert list(plan.fixed) == ["on", "no", "off", "y"]
 
@@ -163,7 +163,7 @@ phases:
 """
 
 
-def test_any_plan_text_is_accepted_or_raises_declared_error() -> None:
+def test_forbidden_field_hides_no_other_fault() -> None:
     """Faults in names, types, references and conditions are reported at once, without follow-up errors."""
     with pytest.raises(BadFile) as raised:
         parse(EVERYTHING_WRONG, "p")
@@ -196,6 +196,6 @@ def test_any_plan_text_is_accepted_or_raises_declared_error() -> None:
 
 
 @pytest.mark.parametrize("text", ["7", "[]", "roles: 7", "roles: [a]\nrules: 3", "cars: {red: !!set {}}", "rules: {}"])
-def test_phase_timeout_counts_from_cars_in_modes(text: str) -> None:
+def test_plan_with_little_sound_content_has_a_fault(text: str) -> None:
     with pytest.raises(BadFile):
         parse(text, "p")

@@ -48,7 +48,7 @@ def put_in_force(text: str) -> Plan | None:
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("length", [949, 950, 975, MAX_CONDITION_LENGTH - 1, MAX_CONDITION_LENGTH])
-def test_phase_start_waits_for_recovery_not_for_hold(place: str, length: int) -> None:
+def test_condition_of_maximum_length_is_accepted(place: str, length: int) -> None:
     filler = " or mode.asked == 'manual'"
     count = (length - len(LOW)) // len(filler)
     condition = LOW + " " * (length - len(LOW) - count * len(filler)) + filler * count
@@ -61,7 +61,7 @@ def test_phase_start_waits_for_recovery_not_for_hold(place: str, length: int) ->
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_phase_and_rules_last_one_run_and_roles_longer(place: str) -> None:
+def test_condition_of_maximum_depth_is_accepted(place: str) -> None:
     for depth, allowed in (
         (MAX_PARENTHESES - 1, True),
         (MAX_PARENTHESES, True),
@@ -221,5 +221,5 @@ ODDITIES = st.lists(st.one_of(st.sampled_from(SIGNS), st.text(max_size=4)), max_
         st.text(),
     )
 )
-def test_wall_clock_step_does_not_change_phase_time(text: str) -> None:
+def test_any_plan_text_is_accepted_or_raises_declared_error(text: str) -> None:
     put_in_force(text)

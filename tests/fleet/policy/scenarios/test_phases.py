@@ -6,7 +6,7 @@ import pytest
 
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.plan.parser import parse
-from fleet.policy.requests import PlanRequest, on_request
+from fleet.policy.plan_requests import PlanRequest, on_request
 from fleet.policy.rules import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.snapshot import FleetSnapshot
 from fleet.policy.state import PersistedPolicy, restore, to_persisted
@@ -34,7 +34,7 @@ def ends_at(run: PolicyRun) -> float:
         (HERE, 0.0, 60.0, PHASE_SETTLE_TIMEOUT_S + 5.1),  # never obeys: the wait is limited
     ],
 )
-def test_debounce_delays_changes_and_ignores_unknown(
+def test_phase_timeout_counts_from_cars_in_modes(
     before: object, known_at: float, in_mode_at: float, ends: float
 ) -> None:
     run = PolicyRun(PLAN, "red", obey=False)
@@ -48,7 +48,7 @@ def test_debounce_delays_changes_and_ignores_unknown(
     assert (run.now if run.memory.phase.name == "done" else ends_at(run)) == pytest.approx(ends, abs=0.3)
 
 
-def test_doubted_car_is_left_alone_and_delays_no_phase() -> None:
+def test_phase_start_waits_for_recovery_not_for_hold() -> None:
     for fields, ends in (({"motors": "unknown"}, 12.0), ({"held_by": "ann"}, 5.1)):
         run = PolicyRun(PLAN, "red")
         run.change("red", **fields)
@@ -57,7 +57,7 @@ def test_doubted_car_is_left_alone_and_delays_no_phase() -> None:
         assert ends_at(run) == pytest.approx(ends, abs=0.3), fields
 
 
-def test_role_moves_after_debounce_and_does_not_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_phase_and_rules_last_one_run_and_roles_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
@@ -87,7 +87,7 @@ def test_a_restarted_plan_begins_with_its_first_phase() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 0.0, 3600.0])
-def test_paused_fleet_leaves_plan_and_continues_after(
+def test_wall_clock_step_does_not_change_phase_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: float
 ) -> None:
     """The clock is set while the coordinator runs. The next one must not take the step for time that has passed."""

@@ -81,14 +81,14 @@ def report(path: Path) -> str:
     return salvage.words
 
 
-def test_bad_length_is_told_and_hides_no_whole_chunk(original: Original, tmp_path: Path) -> None:
+def test_bit_flip_is_told_and_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
     for at in sampled(original)[::2]:
         flipped_it_loses_its_own_chunk_at_most(original, at, [at % 8], tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_damaged_magic_is_still_an_mcap_file(original: Original, tmp_path: Path) -> None:
+def test_every_bit_flip_is_told_and_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
     for at in range(len(original.data)):
         flipped_it_loses_its_own_chunk_at_most(original, at, range(8), tmp_path)
 
@@ -119,13 +119,13 @@ def without_an_index_it_loses_its_own_chunk_at_most(original: Original, step: in
             assert [one for one in shown if one in known] == expected, (length, at, report(path))
 
 
-def test_damaged_chunk_is_named_with_place_time_and_cause(original: Original, tmp_path: Path) -> None:
+def test_bit_flip_without_index_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
     """Each byte is flipped in a file of one of the lengths."""
     without_an_index_it_loses_its_own_chunk_at_most(original, 3, tmp_path / "x.mcap")
 
 
 @pytest.mark.soak
-def test_oversized_chunk_is_read_unless_it_is_a_bomb(original: Original, tmp_path: Path) -> None:
+def test_every_byte_and_length_without_index(original: Original, tmp_path: Path) -> None:
     without_an_index_it_loses_its_own_chunk_at_most(original, 1, tmp_path / "x.mcap")
 
 
@@ -134,7 +134,7 @@ def chance(at: int) -> int:
     return random.Random(at).randrange(8)
 
 
-def test_session_without_whole_part_is_refused_with_cause(original: Original, tmp_path: Path) -> None:
+def test_bad_length_is_told_and_hides_no_whole_chunk(original: Original, tmp_path: Path) -> None:
     begin, end = original.chunks[1][0], original.chunks[2][0]
     data = flipped(original.data[: original.chunks[-1][1]], begin + 1 + 5, 3)
     shown = judge(original, data, begin, tmp_path / "x.mcap")
@@ -146,7 +146,7 @@ def test_session_without_whole_part_is_refused_with_cause(original: Original, tm
 
 @pytest.mark.parametrize("at", range(8))
 @pytest.mark.parametrize("cut", [0, 8, 900])
-def test_unknown_session_name_suggests_likely_one(original: Original, tmp_path: Path, at: int, cut: int) -> None:
+def test_damaged_magic_is_still_an_mcap_file(original: Original, tmp_path: Path, at: int, cut: int) -> None:
     path = tmp_path / "x.mcap"
     length = len(original.data) - cut
     put(path, flipped(original.data, at, chance(at))[:length])
@@ -201,7 +201,7 @@ def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
     assert not salvage.damage
 
 
-def test_full_disk_keeps_written_data_and_recording_resumes(original: Original, tmp_path: Path) -> None:
+def test_damaged_chunk_is_named_with_place_time_and_cause(original: Original, tmp_path: Path) -> None:
     begin, end = original.chunks[2]
     shown = judge(original, flipped(original.data, end - 2, 0), end - 2, tmp_path / "x.mcap")
     assert len(shown) == (CHUNKS - 1) * PER_CHUNK
@@ -305,7 +305,7 @@ def test_a_chunk_of_several_frames_is_read(compression: str, tmp_path: Path) -> 
     assert not Session(path).damage
 
 
-def test_stop_on_full_disk_writes_what_fits_and_tells_drops(tmp_path: Path) -> None:
+def test_oversized_chunk_is_read_unless_it_is_a_bomb(tmp_path: Path) -> None:
     count = MAX_RECORD_BYTES // 2**20 + 4
     for name, is_read in (("real", True), ("bomb", False)):
         path = tmp_path / f"{name}.mcap"

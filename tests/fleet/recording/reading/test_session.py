@@ -48,7 +48,7 @@ def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
     assert "0001.mcap" not in words
 
 
-def test_disk_full_at_start_is_waited_for_without_leftovers(tmp_path: Path) -> None:
+def test_session_without_whole_part_is_refused_with_cause(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1)[:40])
     with pytest.raises(NoSession, match=r"has no intact message: .*0001\.mcap is cut .*: byte 8: "):
         Session(tmp_path).rescue(tmp_path / "rescued.mcap")
@@ -107,7 +107,7 @@ def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> No
     assert len([*Session(tmp_path / "0001.mcap").messages()]) == 1
 
 
-def test_stop_on_disk_full_from_start_says_so_without_leftovers(tmp_path: Path) -> None:
+def test_unknown_session_name_suggests_likely_one(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1, 2))
     session = Session(tmp_path / "0001.mcap")
     with pytest.raises(NoTable, match=r"has no messages of sensor/rnge\. Did you mean sensor/range"):

@@ -45,7 +45,7 @@ def status(bus: Bus) -> Any:
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_backlog_is_written_as_room_allows(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_full_disk_keeps_written_data_and_recording_resumes(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         process = record(endpoint, there.root, *there.options)
         session = ready(process)
@@ -106,9 +106,7 @@ def holds(session: Path, key: str) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_context_is_of_that_moment_and_stale_states_do_not_count(
-    kind: str, endpoint: str, bus: Bus, tmp_path: Path
-) -> None:
+def test_stop_on_full_disk_writes_what_fits_and_tells_drops(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         process = record(endpoint, there.root, *there.options)
         session = ready(process)
@@ -153,7 +151,7 @@ def test_context_is_of_that_moment_and_stale_states_do_not_count(
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_quote_in_session_name_is_no_sql(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_disk_full_at_start_is_waited_for_without_leftovers(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         there.fill()
         process = record(endpoint, there.root, *there.options)
@@ -183,7 +181,7 @@ def test_quote_in_session_name_is_no_sql(kind: str, endpoint: str, bus: Bus, tmp
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_tables_are_made_once_and_again_for_grown_session(kind: str, endpoint: str, tmp_path: Path) -> None:
+def test_stop_on_disk_full_from_start_says_so_without_leftovers(kind: str, endpoint: str, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         there.fill()
         process = record(endpoint, there.root, *there.options)
@@ -203,7 +201,7 @@ def test_tables_are_made_once_and_again_for_grown_session(kind: str, endpoint: s
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
-def test_session_asked_while_recording_is_named_once_cut(tmp_path: Path) -> None:
+def test_backlog_is_written_as_room_allows(tmp_path: Path) -> None:
     with disk("really full", tmp_path) as there:
         tape = SessionWriter(there.root, "fleet", Options(reserve=Reserve(0)), BEGUN_NS)
         there.fill()

@@ -70,7 +70,7 @@ def test_what_was_not_measured_is_null(made: Made, tmp_path: Path, name: str) ->
     assert session.to_arrow(name, start_ns=START_NS + 7 * 10**9).num_rows == 2
 
 
-def test_recorded_names_become_no_command_and_no_terminal_flood(made: Made, tmp_path: Path) -> None:
+def test_join_takes_latest_fresh_value_of_same_car(made: Made, tmp_path: Path) -> None:
     modes_and_distances(made)
     session = Session(tmp_path)
     joined = session.joined("sensor/range", "state/mode")
@@ -147,7 +147,7 @@ def test_a_name_that_is_no_table_says_which_are(name: str, words: str) -> None:
         Session(OLD).to_arrow(name)
 
 
-def test_owner_conditions_match_person_names() -> None:
+def test_wrong_topic_name_suggests_topic() -> None:
     with pytest.raises(NoTable) as refused:
         Session(OLD).to_arrow("sensor/distance")
     assert "sensor/range?" in str(refused.value)

@@ -226,7 +226,7 @@ def hits(*arguments: object) -> list[dict[str, Any]]:
     return [json.loads(line) for line in find(*arguments, "--json").stdout.splitlines()]
 
 
-def test_mark_is_added_once_to_closed_session(sessions: Path, tmp_path: Path) -> None:
+def test_hit_has_mode_last_command_and_opens(sessions: Path, tmp_path: Path) -> None:
     (hit,) = hits(NEAR, sessions)
     assert (hit["session"], hit["car"], hit["length_s"]) == ("s 1", "red", 2.0)
     assert (hit["mode"], hit["command"]) == ("tracking", "drive by mia")
@@ -263,7 +263,7 @@ def other_range(value: "FieldDescriptorProto.Type.ValueType") -> FileDescriptorS
         ("protobuf", other_range(FieldDescriptorProto.TYPE_STRING).SerializeToString(), b"\x2a\x010"),
     ],
 )
-def test_unmarkable_session_is_named_and_left_alone(
+def test_messages_without_condition_value_are_counted(
     encoding: str, schema: bytes, payload: bytes, tmp_path: Path
 ) -> None:
     with (tmp_path / "a.mcap").open("wb") as file:
@@ -280,7 +280,7 @@ def test_unmarkable_session_is_named_and_left_alone(
 
 
 @pytest.mark.parametrize("name", ["r; touch x #", "red\n  fleet estop --everything", "\x1b[2J", "r" * 60_000])
-def test_later_span_wins_at_shared_boundary(name: str, tmp_path: Path) -> None:
+def test_recorded_names_become_no_command_and_no_terminal_flood(name: str, tmp_path: Path) -> None:
     made = Made(tmp_path / "a.mcap", Writer)
     made.put(f"fleet/{name}/sensor/range", pb.Range(range_m=0.1), 1)
     made.close()
@@ -309,7 +309,7 @@ def test_a_recorder_whose_clock_differs_has_hits_on_its_clock(tmp_path: Path) ->
     ("condition", "is_found"),
     [("hold", True), ("hold.by == 'teacher'", True), ("hold.by == 'mia'", False), ("safety.estops", False)],
 )
-def test_silent_gateway_ends_mode_span_when_stale(condition: str, is_found: bool, tmp_path: Path) -> None:
+def test_owner_conditions_match_person_names(condition: str, is_found: bool, tmp_path: Path) -> None:
     made = Made(tmp_path / "a.mcap", Writer)
     for second in range(3):
         made.put("fleet/red/state/safety", pb.Safety(hold=pb.Hold(by="teacher@vm-4711")), second)
@@ -372,7 +372,7 @@ def test_csv_has_the_fields_of_json(sessions: Path) -> None:
     assert find(NEAR, sessions, "--csv", "--json").returncode == 2
 
 
-def test_past_state_equals_tables_at_100_random_moments(sessions: Path, tmp_path: Path) -> None:
+def test_mark_is_added_once_to_closed_session(sessions: Path, tmp_path: Path) -> None:
     file = describe(sessions / "s 1", marks=[{"time": "2026-01-01T00:00:00Z", "text": "a cat", "by": "mia@h"}])
     recorded = (sessions / "s 1" / "0001.mcap").read_bytes()
     for _ in range(2):
@@ -398,7 +398,7 @@ def test_past_state_equals_tables_at_100_random_moments(sessions: Path, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["no description", "not closed", "of a later format", "noise", "one file"])
-def test_lanes_equal_tables_at_100_random_moments(sessions: Path, kind: str) -> None:
+def test_unmarkable_session_is_named_and_left_alone(sessions: Path, kind: str) -> None:
     path = sessions / "s 1"
     if kind == "one file":
         path = sessions / "one.mcap"

@@ -106,7 +106,7 @@ def test_a_car_that_is_not_heard_any_more_is_lost_until_now() -> None:
     ]
 
 
-def test_stray_type_has_own_topic_even_if_first() -> None:
+def test_later_span_wins_at_shared_boundary() -> None:
     lanes = Lanes()
     for at_s, word in ((0, "manual"), (2, "tracking"), (3, "tracking")):
         lanes.add("red", MODE, mode(word), at_s * S)

@@ -39,7 +39,7 @@ def test_a_span_lasts_until_the_next_mode() -> None:
     assert spans_without("range", rows) == [ModeSpan("red", Mode.OBSTACLE_AVOIDANCE, S, 3 * S + S // 2)]
 
 
-def test_foxglove_export_writes_file_and_layout() -> None:
+def test_silent_gateway_ends_mode_span_when_stale() -> None:
     rows = states((0, *AVOIDING), (1, *AVOIDING), (10, *AVOIDING), (12, *AVOIDING))
     assert [(span.begin_ns, span.end_ns) for span in mode_spans(rows)] == [(0, 4 * S), (10 * S, 12 * S)]
 

@@ -33,7 +33,7 @@ def written(session: Session, out: Path) -> OneSchema:
     return write(session.rows(), session.extras(), out)
 
 
-def test_undecodable_messages_are_kept_as_bytes(tmp_path: Path) -> None:
+def test_stray_type_has_own_topic_even_if_first(tmp_path: Path) -> None:
     made = Mixed(tmp_path / "one.mcap")
     made.stray(LINK, RANGE)
     made.own(LINK, 25)
@@ -76,7 +76,7 @@ def test_every_message_is_there_under_one_schema(seed: int, tmp_path: Path) -> N
     assert done.strays.total == strays[True]
 
 
-def test_stop_finding_has_car_time_person_cause_once(tmp_path: Path) -> None:
+def test_foxglove_export_writes_file_and_layout(tmp_path: Path) -> None:
     every_type.make(tmp_path / "one.mcap")
     arguments = ["sessions", "export", str(tmp_path / "one.mcap"), "--foxglove", str(tmp_path / "out")]
     assert CliRunner().invoke(cli, arguments).exit_code == 0

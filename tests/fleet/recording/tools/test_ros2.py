@@ -78,7 +78,7 @@ def test_a_distance_that_was_not_measured_is_none(fields: dict[str, Any], metres
     assert message.range == metres or (math.isnan(message.range) and math.isnan(metres))
 
 
-def test_recovered_session_says_how_much_is_missing(tmp_path: Path) -> None:
+def test_ros2_attitude_is_rotation_with_unmeasured_marked(tmp_path: Path) -> None:
     row = ("fleet/red/sensor/attitude", "fleet.v1.Attitude", {"yaw_rad": math.pi / 2})
     write_bag(Session(write(tmp_path / "one.mcap", row)).rows(), tmp_path / "bag")
     ((_, _, _, message),) = read(tmp_path / "bag")
@@ -87,7 +87,7 @@ def test_recovered_session_says_how_much_is_missing(tmp_path: Path) -> None:
     assert message.angular_velocity_covariance[0] == message.linear_acceleration_covariance[0] == -1
 
 
-def test_quota_removal_is_no_damage_and_names_files(tmp_path: Path) -> None:
+def test_ros2_pose_keeps_frame_and_error(tmp_path: Path) -> None:
     fields = {"frame": "map", "x_m": 1.5, "y_m": -2.0, "heading_rad": math.pi / 2, "xy_std_m": 0.1}
     write_bag(
         Session(write(tmp_path / "one.mcap", ("fleet/red/sensor/pose", "fleet.v1.Pose", fields))).rows(),

@@ -258,7 +258,7 @@ def test_a_foreign_recording_is_looked_into_and_exported(tmp_path: Path) -> None
     assert {row["text"] for row in found if row["key"] == "/note"} == {'{"a": "x,\\"y"}'}
 
 
-def test_cut_keeps_marks_inside_and_kept_only_with_mark(session: Path, tmp_path: Path) -> None:
+def test_undecodable_messages_are_kept_as_bytes(session: Path, tmp_path: Path) -> None:
     (session / "0001.mcap").unlink()
     original = written(session / "0001.mcap")
     source = Session(session)

@@ -30,7 +30,7 @@ def logged(at_s: int, code: str, words: str = NOT_REACTED) -> Log:
     return Log(name=f"red {code}", message=words, timestamp=Timestamp(seconds=at_s))
 
 
-def test_gap_is_named_with_publisher_numbers_and_time() -> None:
+def test_stop_finding_has_car_time_person_cause_once() -> None:
     found = StopFindings()
     found.add("red", "state/link", pb.Link(state="lost", reason="unplugged"))
     found.add("red", "state/health", pb.Health(shows_stops="yes", doubted=True, shows_stops_words="red is in doubt"))

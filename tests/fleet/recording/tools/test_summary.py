@@ -41,7 +41,7 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["sessions", *map(str, arguments)])
 
 
-def test_late_message_is_not_missing_and_duplicate_is_told(tmp_path: Path) -> None:
+def test_recovered_session_says_how_much_is_missing(tmp_path: Path) -> None:
     old, new, again = tmp_path / "old", tmp_path / "new", tmp_path / "again"
     write(old, [[1, 2], [3, 4, 5], [6]])
     data = bytearray((old / "0001.mcap").read_bytes())

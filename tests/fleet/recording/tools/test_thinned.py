@@ -12,7 +12,7 @@ from fleet.recording.pins import minute_of
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import REMOVED_FILE, SESSION_FILE
 from fleet.recording.time_spec import iso
-from fleet.recording.writing.retention import QUOTA_SEGMENT_S, Quota
+from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.words import PinCause
 from tests.support import in_process
@@ -68,7 +68,7 @@ def description(path: Path) -> dict[str, Any]:
     return found
 
 
-def test_schema_of_another_version_and_invalid_schema_are_told(thinned: Path) -> None:
+def test_quota_removal_is_no_damage_and_names_files(thinned: Path) -> None:
     code, listed = sessions(thinned.parent)
     assert code == 0
     assert {one["name"]: (one["state"], one["lost"]) for one in listed} == {
@@ -157,7 +157,7 @@ def test_a_cut_says_what_the_quota_had_taken_of_it(thinned: Path) -> None:
     assert made["pins"] == []
 
 
-def test_condition_pins_before_first_and_after_last_reading(tmp_path: Path) -> None:
+def test_cut_keeps_marks_inside_and_kept_only_with_mark(tmp_path: Path) -> None:
     path = record(tmp_path, BEGUN_NS)
     about = description(path)
     about["marks"] = [

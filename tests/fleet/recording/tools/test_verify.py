@@ -77,7 +77,7 @@ def test_a_session_that_lacks_nothing_is_whole(written: Written) -> None:
     ]
 
 
-def test_touching_pins_merge_and_number_is_limited(written: Written) -> None:
+def test_gap_is_named_with_publisher_numbers_and_time(written: Written) -> None:
     for seq in (5, 6, 9, 10):
         written.put(RANGE, seq)
     for seq in (1, 3):
@@ -99,7 +99,7 @@ def test_touching_pins_merge_and_number_is_limited(written: Written) -> None:
     ) in list(verdict.words())
 
 
-def test_pin_json_round_trip_and_invalid_pins_are_left_out(written: Written) -> None:
+def test_late_message_is_not_missing_and_duplicate_is_told(written: Written) -> None:
     for seq in (3, 4, 8, 6, 5, 7, 2, 1, 9, 9, 4):
         written.put(RANGE, seq)
     verdict = written.verdict()
@@ -163,7 +163,7 @@ def changed(fields: int) -> bytes:
     return files.SerializeToString()
 
 
-def test_late_joiner_messages_are_recorded_as_published(written: Written) -> None:
+def test_schema_of_another_version_and_invalid_schema_are_told(written: Written) -> None:
     written.put(RANGE, 1, schema=changed(1))
     verdict = written.verdict()
     assert verdict.schemas == {"fleet.v1.Range": "has more: sonar_c; lacks: no_echo"}

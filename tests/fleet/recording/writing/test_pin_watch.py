@@ -30,7 +30,7 @@ def put(
     return [((pin.begin_ns - START_NS) / S, (pin.end_ns - START_NS) / S, pin.cause, pin.cars) for pin in found]
 
 
-def test_schemas_decode_standalone_one_per_type() -> None:
+def test_condition_pins_before_first_and_after_last_reading() -> None:
     of = watch("range_m < 0.3")
     assert put(of, "red", "sensor/range", pb.Range(range_m=1.0), 0) == []
     assert put(of, "red", "sensor/range", pb.Range(range_m=0.2), 1) == [(-9, 21, PinCause.CONDITION, ("red",))]
@@ -80,7 +80,7 @@ def test_what_came_late_pins_its_time_and_its_coming() -> None:
     assert (pin.begin_ns, pin.end_ns) == (START_NS - 10 * S, came_ns)
 
 
-def test_sequence_gaps_are_counted_and_restart_is_none() -> None:
+def test_touching_pins_merge_and_number_is_limited() -> None:
     pins = PinList()
     assert pins.add(minute_of(START_NS, PinCause.ESTOP, "estop by mia", ["red"]))
     assert pins.add(minute_of(START_NS + 60 * S, PinCause.ESTOP, "estop by lee", ["blue"]))
@@ -93,7 +93,7 @@ def test_sequence_gaps_are_counted_and_restart_is_none() -> None:
     assert max(pin.end_ns for pin in pins.pins) == START_NS + ((2 * MAX_PINS - 1) * 100 + 30) * S
 
 
-def test_messages_of_cut_off_car_are_backfilled() -> None:
+def test_pin_json_round_trip_and_invalid_pins_are_left_out() -> None:
     pin = Pin(START_NS, START_NS + S, PinCause.CONDITION, "range_m < 0.1", ("red",))
     assert Pin.from_dict(pin.to_dict()) == pin
     assert pins_of([pin.to_dict(), {}, {"from": 1, "to": 2, "cause": 3}], [{"time": "nonsense"}]) == [pin]

@@ -37,7 +37,7 @@ def metadata(segment: Path) -> dict[str, dict[str, str]]:
         return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
 
 
-def test_queue_overflow_is_counted_by_key_and_never_blocks(endpoint: str, tmp_path: Path) -> None:
+def test_late_joiner_messages_are_recorded_as_published(endpoint: str, tmp_path: Path) -> None:
     sent: dict[str, list[bytes]] = {}
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)
@@ -69,7 +69,7 @@ def test_queue_overflow_is_counted_by_key_and_never_blocks(endpoint: str, tmp_pa
     assert description["messages"] == len(rows)
 
 
-def test_huge_message_is_recorded_and_oversized_one_counted(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_schemas_decode_standalone_one_per_type(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
@@ -122,7 +122,7 @@ def own_config(endpoint: str) -> zenoh.Config:
     )
 
 
-def test_flush_each_second_reaches_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_sequence_gaps_are_counted_and_restart_is_none(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     key = "fleet/red/sensor/range"
     with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path)
@@ -141,7 +141,7 @@ def test_flush_each_second_reaches_disk(endpoint: str, bus: Bus, tmp_path: Path)
     assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
 
 
-def test_wall_clock_step_keeps_message_order(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     """The recorder stays connected, so it hears of the gap only after it, with the next message of the car."""
     tap = Tap(endpoint.replace("tcp/", "tcp://"))
     with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
@@ -165,7 +165,7 @@ def test_wall_clock_step_keeps_message_order(endpoint: str, bus: Bus, tmp_path: 
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])
-def test_backfilled_message_keeps_published_key(
+def test_queue_overflow_is_counted_by_key_and_never_blocks(
     limits: dict[str, Any], endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
     with Bus.open(endpoint) as own:
@@ -197,7 +197,7 @@ def test_backfilled_message_keeps_published_key(
     assert json.loads(metadata(session / "0001.mcap")["recording"]["drops"]) == dict(outcome.drops)
 
 
-def test_segment_ends_at_size_and_none_is_empty(hub_apart: str, tmp_path: Path) -> None:
+def test_huge_message_is_recorded_and_oversized_one_counted(hub_apart: str, tmp_path: Path) -> None:
     payload = os.urandom(20_000_000)
     with Bus.open(hub_apart) as own, zenoh.open(own_config(hub_apart)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path, max_bytes=30_000_000)
@@ -253,7 +253,7 @@ def test_a_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: 
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_quota_removes_oldest_unmarked_only(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_flush_each_second_reaches_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     from fleet.recording.reading.session import Session
 
     with Bus.open(endpoint) as own:
@@ -286,7 +286,7 @@ def test_topics_that_are_recorded_match_the_subscriptions() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
-def test_quota_broken_by_marks_is_told_and_removes_none(endpoint: str, tmp_path: Path, step_s: int) -> None:
+def test_wall_clock_step_keeps_message_order(endpoint: str, tmp_path: Path, step_s: int) -> None:
     key, step_ns = "fleet/red/sensor/range", [0]
     with Bus.open(endpoint) as own, Bus.open(endpoint) as cars:
         recorder = Recorder(own, "fleet", tmp_path, wall_ns=lambda: time.time_ns() + step_ns[0])
@@ -307,7 +307,7 @@ def test_quota_broken_by_marks_is_told_and_removes_none(endpoint: str, tmp_path:
     assert description["ended"] >= description["started"]
 
 
-def test_redecode_of_verdict_and_dropped_reading(tmp_path: Path) -> None:
+def test_backfilled_message_keeps_published_key(tmp_path: Path) -> None:
     from fleet.recording.reading.session import Session
 
     topics = {

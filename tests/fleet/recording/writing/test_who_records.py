@@ -8,11 +8,11 @@ import pytest
 from fleet.client.services import ask_recorder
 from fleet.recording.writing.recorder import Recorder
 from schemas import keys
-from schemas.authority import NO_PEOPLE, People
 from schemas.bus import Bus, Failure
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.identity import Service as IdentifiedService
 from schemas.identity import car, person, service
+from schemas.rights import NO_PEOPLE, People
 from schemas.topics import TOPICS
 from schemas.words import RecorderVerb
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from fleet.console.guard import Guard, Message, Receive, Scope, Send
+from fleet.console.request_filter import Guard, Message, Receive, Scope, Send
 
 PORT = 7448
 HOSTS = frozenset({f"127.0.0.1:{PORT}", f"localhost:{PORT}"})
@@ -83,7 +83,7 @@ def test_a_stop_of_our_page_needs_no_cookie() -> None:
     assert call("http", "/stop", but(cookie=None), "POST")[0]["status"] == 200
 
 
-def test_map_trail_is_bounded_and_standing_car_adds_nothing() -> None:
+def test_own_page_is_served_on_both_names_with_cookie() -> None:
     assert call("websocket", "/ws", OURS)[0]["type"] == "websocket.accept"
     for host in HOSTS:
         start = call("http", "/", {"host": host})[0]

@@ -1,4 +1,4 @@
-"""Tests of the arbiter on all combinations of its inputs. Stop always wins. Nobody moves a car without permission."""
+"""Tests of refusals on all combinations of their inputs. Stop always wins. Nobody moves a car without permission."""
 
 import functools
 import itertools
@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.control.arbiter import MAX_QUEUED_COMMANDS, TABLE, CommandContext, Refusal, needs, refuse
 from gateway.control.commands import (
     Action,
     AimServo,
@@ -32,8 +31,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from schemas.authority import Authority, Estop, Hold, LeaseState, Sender
+from gateway.control.refusals import MAX_QUEUED_COMMANDS, TABLE, CommandContext, Refusal, needs, refuse
 from schemas.commands import Verb
+from schemas.rights import Authority, Estop, Hold, LeaseState, Sender
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 from tests.support.message_length import MAX_LINES, count_lines
 
@@ -149,7 +149,7 @@ def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
 
 
 def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
-    """Require the rules of the arbiter, written in another way."""
+    """Require the rules of refusals, written in another way."""
     what, kind = command.what, command.sender.kind
     if isinstance(what, Stop | EmergencyStop):
         assert reason is None, "stop wins from every state"

@@ -1,6 +1,6 @@
 """The quota of a recorder: how large all sessions may be together, and the removal of what is too much.
 
-quota_order.py decides what goes. What is gone is listed: the segments of a session in its session.json, whole sessions
+quota_choice.py decides what goes. What is gone is listed: the segments of a session in its session.json, whole sessions
 in `removed.json` beside them.
 """
 
@@ -19,7 +19,7 @@ from fleet.recording.reading.mcap_reader import McapReader, NotMcap
 from fleet.recording.session_dir import SESSION_FILE, SessionInfo
 from fleet.recording.time_spec import iso, iso_ns
 from fleet.recording.writing.disk_space import MB
-from fleet.recording.writing.quota_order import Spans, StoredSegment, StoredSession, Taking, choose
+from fleet.recording.writing.quota_choice import Spans, StoredSegment, StoredSession, Taking, choose
 
 SESSIONS_PER_QUOTA: Final = 10
 """Minimum sessions in a quota. The quota spares the session that is being written, so each is at most a tenth of it."""

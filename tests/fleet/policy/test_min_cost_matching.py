@@ -5,7 +5,7 @@ from itertools import product
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.policy.assignment import assign
+from fleet.policy.min_cost_matching import assign
 
 ROLES = ("a", "b", "c")
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.bus import requests
-from gateway.bus.requests import BadRequest, parse
+from gateway.bus import command_parser
+from gateway.bus.command_parser import BadRequest, parse
 from gateway.bus.service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
@@ -34,9 +34,9 @@ from gateway.control.commands import (
     TakeLease,
 )
 from schemas import messages
-from schemas.authority import Sender
 from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import Sender
 from schemas.topics import PROTOBUF
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
 
@@ -117,7 +117,7 @@ def test_every_verb_of_the_table_is_known_here() -> None:
     for verb in COMMANDS:
         assert (verb, parsed(Request(verb, b"{}", messages.JSON))[0].verb) == (verb, verb)
     signals = [verb for verb, row in COMMANDS.items() if row.signal]
-    assert sorted([*requests._WHAT, *PLAIN_ACTIONS, *signals, "drive"]) == sorted(COMMANDS), "each verb once"
+    assert sorted([*command_parser._WHAT, *PLAIN_ACTIONS, *signals, "drive"]) == sorted(COMMANDS), "each verb once"
 
 
 def test_the_fields_of_a_plain_action_are_flags() -> None:
@@ -135,8 +135,8 @@ def test_the_message_of_a_signal_has_its_duration_at_most() -> None:
 
 def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """Made from `lend`, whose message has a duration."""
-    monkeypatch.setattr(requests, "COMMANDS", {**COMMANDS, "lend": replace(COMMANDS["lend"], signal=True)})
-    monkeypatch.delitem(requests._WHAT, "lend")
+    monkeypatch.setattr(command_parser, "COMMANDS", {**COMMANDS, "lend": replace(COMMANDS["lend"], signal=True)})
+    monkeypatch.delitem(command_parser._WHAT, "lend")
     assert ask("lend", {"duration_s": 86_400}).what == Signal(Verb.LEND, 86_400.0)
     for wrong in (86_401, 0, -1, "NaN", "Infinity"):
         assert "duration_s" in refused("lend", {"duration_s": wrong}).words

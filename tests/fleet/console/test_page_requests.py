@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.console.requests import BadPageMessage, PageMessage
+from fleet.console.page_requests import BadPageMessage, PageMessage
 
 
 def message(**fields: Any) -> PageMessage:

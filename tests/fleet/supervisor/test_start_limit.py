@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.supervisor.admission import (
+from fleet.supervisor.start_limit import (
     KILL_INTERVAL_S,
     KILLS_AT_ONCE,
     RESTART_INTERVAL_S,

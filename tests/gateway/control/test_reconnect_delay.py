@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.backoff import FIRST_DELAY_S, MAX_LOGGED_CAUSES, MAX_RECONNECT_DELAY_S, PROVEN_S, Attempts, delay_s
+from gateway.control.reconnect_delay import (
+    FIRST_DELAY_S,
+    MAX_LOGGED_CAUSES,
+    MAX_RECONNECT_DELAY_S,
+    PROVEN_S,
+    Attempts,
+    delay_s,
+)
 
 
 @pytest.mark.parametrize(("failures", "longest_s"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 1.0), (10**9, 1.0)])

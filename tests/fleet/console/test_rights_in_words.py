@@ -3,9 +3,10 @@
 import itertools
 from collections.abc import Iterator
 
-from fleet.console.permissions import management_refusal, refusals, rights_of
+from fleet.console.rights_in_words import management_refusal, rights_of
+from fleet.console.rights_in_words import refusals as refusals_shown
 from gateway.bus.publisher import _fill_safety
-from gateway.control import arbiter
+from gateway.control import refusals
 from gateway.control.commands import (
     Action,
     AimServo,
@@ -22,9 +23,9 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.safety import Safety
-from schemas.authority import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Right, Sender
+from gateway.control.holds_and_leases import Safety
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Right, Sender
 from schemas.words import Light, Mode, Motion, Rank, SpeedStep
 from tests.gateway.control.workbench import Workbench
 from tests.support.console import LEADS_ONLY
@@ -69,7 +70,7 @@ RULES = {"leased", "lent", "not_allowed", "paused", "held", "estopped"}
 """Reasons about rights. All others are about the car."""
 
 
-def cars() -> Iterator[tuple[arbiter.CommandContext, Authority]]:
+def cars() -> Iterator[tuple[refusals.CommandContext, Authority]]:
     """Yield each state of a car: the gateway's own, and what its state/safety says."""
     control = Workbench().control
     for people, estops, hold, pause, lease, loan in itertools.product(TABLES, ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
@@ -90,9 +91,9 @@ def cars() -> Iterator[tuple[arbiter.CommandContext, Authority]]:
         yield control._context(NOW), Authority.of(message)
 
 
-def decided(context: arbiter.CommandContext, sender: Sender, action: Action) -> str | None:
+def decided(context: refusals.CommandContext, sender: Sender, action: Action) -> str | None:
     """Return the rule of RULES by which the gateway rejects an action, None if it has another reason or accepts."""
-    refusal = arbiter.refuse(Command("1", "any", sender, action, take=isinstance(action, TakeLease)), context)
+    refusal = refusals.refuse(Command("1", "any", sender, action, take=isinstance(action, TakeLease)), context)
     return str(refusal[0]) if refusal is not None and str(refusal[0]) in RULES else None
 
 
@@ -103,7 +104,7 @@ def test_the_page_shows_what_the_gateway_decides() -> None:
         asked = ASKED | {Right.END_ESTOPS: (Resume(tuple(each.id for each in estops)),) if estops else ()}
         for name in SENDERS:
             sender = authority.people.ranked(Sender(name, PERSON))
-            refused = refusals("red", authority, name)
+            refused = refusals_shown("red", authority, name)
             for right, actions in asked.items():
                 denial = authority.may(sender, right)
                 code = None if denial is None else str(denial.reason)
@@ -117,13 +118,13 @@ def test_the_page_shows_what_the_gateway_decides() -> None:
 
 def test_the_words_name_the_person_the_car_and_the_rule() -> None:
     red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
-    assert refusals("red", red, EVE)[Right.MOVE] == "eve drives other cars, not red."
-    assert refusals("red", red, ZED)[Right.ACT] == "zed watches and stops: the fleet file does not list zed."
-    assert refusals("red", red, ANN)[Right.PAUSE] == LEADS_ONLY
-    assert refusals("red", red, TEACHER) == {}
+    assert refusals_shown("red", red, EVE)[Right.MOVE] == "eve drives other cars, not red."
+    assert refusals_shown("red", red, ZED)[Right.ACT] == "zed watches and stops: the fleet file does not list zed."
+    assert refusals_shown("red", red, ANN)[Right.PAUSE] == LEADS_ONLY
+    assert refusals_shown("red", red, TEACHER) == {}
 
 
-def test_abandoned_or_dead_plan_check_spoils_no_other() -> None:
+def test_recorder_and_plan_are_for_leads_if_there_are_any() -> None:
     red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
     blue = Authority(People.parse(["teacher:lead", "eve", "ann:other"]))
     assert [management_refusal({"red": red, "blue": blue}, each) for each in (TEACHER, ANN, EVE, ZED)] == [
@@ -147,7 +148,7 @@ def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
     assert rights_of(ANN, {})["pause"] == ""
 
 
-def test_plan_hash_in_words_becomes_name() -> None:
+def test_own_cars_are_listed_whatever_else_refuses() -> None:
     people = People.parse(["teacher:lead", "ann", "bob:other"])
     paused = (FleetPause("p1", TEACHER, "lunch", 0, LEAD),)
     cars = {

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.console.presses import AFTER_STOP_S, MAX_ECHO_GAP_S, MAX_TICK_AGE_S, PressBook, PressRefused
+from fleet.console.hold_to_drive import AFTER_STOP_S, MAX_ECHO_GAP_S, MAX_TICK_AGE_S, PressBook, PressRefused
 
 RED = ("red",)
 
@@ -25,7 +25,7 @@ def test_a_press_lives_while_new_ticks_are_echoed() -> None:
         assert book.expire(now + 0.05) == []
 
 
-def test_mode_or_release_ends_no_press_of_higher_rank() -> None:
+def test_press_without_echo_ends_after_gap_and_stays_over() -> None:
     book, _ = book_with_press()
     assert book.expire(9.99 + MAX_ECHO_GAP_S) == []
     (over,) = book.expire(10.01 + MAX_ECHO_GAP_S)
@@ -37,7 +37,7 @@ def test_mode_or_release_ends_no_press_of_higher_rank() -> None:
     assert book.begin(1, 2, RED, "forward", tick, 10.4)[0].id == 2
 
 
-def test_pairing_code_needs_person_of_fleet_and_running_console() -> None:
+def test_late_echo_does_not_count_even_before_expiry() -> None:
     """If our own loop was blocked, it handles the pending echoes before `expire`."""
     book, _ = book_with_press()
     late = book.tick(10.0 + MAX_ECHO_GAP_S + 0.1)
@@ -124,7 +124,7 @@ def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
             assert not (over and book.alive)
 
 
-def test_class_joins_with_one_code_watches_stops_and_is_assigned() -> None:
+def test_computer_sleep_ends_presses_and_old_ticks_do_not_count() -> None:
     """The clock of the server stood still, so that neither the tick nor the echo looks old."""
     book, tick = book_with_press()
     (over,) = book.on_sleep()
@@ -140,7 +140,7 @@ def test_class_joins_with_one_code_watches_stops_and_is_assigned() -> None:
     ("person", "holder", "takes"),
     [("teacher", "pupil", True), ("pupil", "teacher", False), ("teacher", "head", False), ("pupil", "other", False)],
 )
-def test_forbidden_command_of_pupil_ends_no_press_of_lead(person: str, holder: str, *, takes: bool) -> None:
+def test_only_lead_takes_car_of_person(person: str, holder: str, *, takes: bool) -> None:
     book, leads = PressBook(), ("head", "teacher")
     tick = book.tick(10.0)
     book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, leads=leads)
@@ -165,7 +165,7 @@ def test_forbidden_command_of_pupil_ends_no_press_of_lead(person: str, holder: s
         ("pupil", "pupil", True),
     ],
 )
-def test_plan_is_set_under_person_name_without_open_page(person: str, holder: str, *, ends: bool) -> None:
+def test_mode_or_release_ends_no_press_of_higher_rank(person: str, holder: str, *, ends: bool) -> None:
     book, leads = PressBook(), ("head", "teacher")
     book.begin(1, 1, RED, "forward", book.tick(10.0), 10.0, person=holder, leads=leads)
     assert not book.drop_cars_of({"blue"}, person, leads)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from fleet.recording.tools.checkup import SessionCheckup
+from fleet.recording.tools.session_findings import SessionCheckup
 from fleet.recording.tools.verify import Clock, SessionVerdict
 from schemas.gen import fleet_v1_pb2 as pb
 

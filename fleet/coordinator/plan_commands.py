@@ -4,7 +4,7 @@ from typing import Any, Final
 
 import zenoh
 
-from fleet.policy.requests import RequestRefused
+from fleet.policy.plan_requests import RequestRefused
 from schemas import keys, messages, topics
 from schemas.bus import reply_message
 from schemas.gen import fleet_v1_pb2 as pb

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from fleet.conditions import Expression
-from fleet.policy.assignment import assign
 from fleet.policy.debounce import Settled, settle
+from fleet.policy.min_cost_matching import assign
 from fleet.policy.plan.plan import Plan, Role
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from schemas.platform_name import kind_of

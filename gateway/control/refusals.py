@@ -22,8 +22,8 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from schemas.authority import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
 from schemas.keys import name_of
+from schemas.rights import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
 from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Rank, Reason
 

@@ -1,4 +1,4 @@
-"""Decides what the quota takes when the sessions are too large together. Pure; retention.py removes it.
+"""Decides what the quota takes when the sessions are too large together. Pure; quota_removal.py removes it.
 
 The unit is a segment: a file, with a quota of one minute. A segment is pinned if a pin of any session of its fleet
 touches its time, because the time before a pin may be in another session.

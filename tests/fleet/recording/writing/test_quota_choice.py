@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.recording.writing.quota_order import PINNED_SHARE, Spans, StoredSegment, StoredSession, choose
+from fleet.recording.writing.quota_choice import PINNED_SHARE, Spans, StoredSegment, StoredSession, choose
 
 
 def stored(name: str, *segments: tuple[int, int, bool], tables: int = 0, other: int = 0) -> StoredSession:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from schemas.authority import Estop, FleetPause, Hold, LeaseState, Loan, Sender, strength
+from schemas.rights import Estop, FleetPause, Hold, LeaseState, Loan, Sender, strength
 from schemas.words import Rank
 
 LEASE_S: Final = 2.0

@@ -5,8 +5,8 @@ from functools import lru_cache
 from typing import Any, Final
 
 from fleet.policy.denials import describe, fleet_refusal
-from schemas.authority import Authority, People, Right, Sender
 from schemas.keys import person_of
+from schemas.rights import Authority, People, Right, Sender
 from schemas.words import Rank
 
 GUEST_REFUSAL: Final = "You watch, and you can STOP. A lead assigns this device on the page Board."

@@ -15,7 +15,7 @@ from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from gateway.drivers.yahboom.stops import cases, sequences, stopping
+from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
 from schemas.words import Basis, Mode, Motion, Phase, Platform
@@ -168,10 +168,10 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 FLAGS = (True, False)
 
 
-def situations() -> list[stopping.StopContext]:
+def situations() -> list[stop_in_progress.StopContext]:
     """Return all combinations of the inputs of the choice."""
     return [
-        stopping.StopContext(
+        stop_in_progress.StopContext(
             parse_platform(platform), known, mode, contradicted, clear, blocked, doubted=doubted, open_mode=open_mode
         )
         for platform, known, mode, contradicted, clear, blocked, doubted, open_mode in product(
@@ -180,23 +180,23 @@ def situations() -> list[stopping.StopContext]:
     ]
 
 
-def certain(situation: stopping.StopContext) -> bool:
+def certain(situation: stop_in_progress.StopContext) -> bool:
     """Return True if the car is known to be in mode 0, where it obeys general frames."""
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
-def knows_modes(situation: stopping.StopContext) -> bool:
+def knows_modes(situation: stop_in_progress.StopContext) -> bool:
     """Return True if the car may get a named frame: its platform knows it, or its readings show an open mode."""
     return situation.open_mode or situation.profile.kind in (Platform.ARDUINO, Platform.STM32)
 
 
-def is_doubtful(situation: stopping.StopContext) -> bool:
+def is_doubtful(situation: stop_in_progress.StopContext) -> bool:
     """Return True if the car gets both kinds of stops."""
     return situation.doubted or situation.profile.kind in (Platform.RASPBERRY_PI, Platform.UNKNOWN)
 
 
 # The first matching row counts (docs/reference/protocol.md#stops).
-FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence], ...] = (
+FULL: tuple[tuple[Callable[[stop_in_progress.StopContext], bool], sequences.StopSequence], ...] = (
     (lambda it: not knows_modes(it), sequences.GENERAL),
     (lambda it: is_doubtful(it) and not it.known, sequences.BOTH),
     (lambda it: is_doubtful(it) and certain(it), sequences.BOTH_MANUAL),
@@ -214,19 +214,23 @@ def test_stop_case_over_whole_input_product() -> None:
     assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2 * 2
     for situation in everything:
         full = next(recipe for fits, recipe in FULL if fits(situation))
-        assert stopping.full(situation) is full, situation
+        assert stop_in_progress.full(situation) is full, situation
         if not knows_modes(situation):
             soft = sequences.GENERAL_SOFT
         else:
             soft = sequences.SOFT if certain(situation) and not is_doubtful(situation) else full
-        assert stopping.soft(situation) is soft, situation
-        assert stopping.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
+        assert stop_in_progress.soft(situation) is soft, situation
+        assert stop_in_progress.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
 
 
 def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
     for situation in situations():
         profile = parse_platform("arduino") if situation.open_mode else situation.profile
-        for recipe in (stopping.full(situation), stopping.soft(situation), stopping.recovery(situation)):
+        for recipe in (
+            stop_in_progress.full(situation),
+            stop_in_progress.soft(situation),
+            stop_in_progress.recovery(situation),
+        ):
             for step in recipe.steps:
                 assert profile.refusal(step.frame) is None, (situation, recipe)
 
@@ -234,7 +238,7 @@ def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
 def test_every_recipe_ends_alone_in_the_buffer() -> None:
     """The last frame comes 1.1 s after the frame before it, or waits until the car has read that frame."""
     for situation in situations():
-        for recipe in (stopping.full(situation), stopping.soft(situation)):
+        for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
             last = recipe.steps[-1]
             assert last.after_s >= REPEAT_INTERVAL_S - 1e-9 or last.gate is Gate.ALONE, recipe
 
@@ -245,9 +249,9 @@ def test_announced_time_is_never_less_than_waited() -> None:
             pacing = Pacing(each.profile, Learned())
             pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
             situation = replace(each, clear=pacing.clear_at(100.0), blocked=False)
-            for recipe in (stopping.full(situation), stopping.soft(situation)):
-                worst_s = stopping.worst_s(recipe, situation, pacing, 100.0)
-                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stopping.WIRE_S
+            for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
+                worst_s = stop_in_progress.worst_s(recipe, situation, pacing, 100.0)
+                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop_in_progress.WIRE_S
                 sure = situation.known and not (situation.contradicted or situation.doubted)
                 possible = sure and situation.mode in situation.profile.modes
                 assert worst_s <= LONGEST_S or situation.turn_s > 1.0 or not possible, (situation, recipe)

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 
 from fleet.policy.plan.parser import parse
-from fleet.policy.requests import PlanRequest, RequestRefused, check_sender, on_request
+from fleet.policy.plan_requests import PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import FleetSnapshot, Refusal
 from fleet.policy.state import PersistedPolicy, carry_over, restore, to_persisted
-from schemas.authority import People
+from schemas.rights import People
 from tests.fleet.policy.cars import PolicyRun
 
 PHASES = parse(
@@ -34,7 +34,7 @@ def started(plan: Any = PHASES, *cars: str, obey: bool = True) -> PolicyRun:
     return run
 
 
-def test_lost_car_is_brought_to_rest_on_return_and_refusal_is_no_rest() -> None:
+def test_next_steps_through_phases_and_is_refused_at_end() -> None:
     run = started()
     assert ask(run, "next") == "phase first is over: second"
     run.until(4.0)
@@ -50,7 +50,7 @@ def test_lost_car_is_brought_to_rest_on_return_and_refusal_is_no_rest() -> None:
     assert (run.memory.phase.name, run.of("red").mode) == ("first", "tracking")
 
 
-def test_dry_run_keeps_roles_in_force_and_tells_lacking_cars() -> None:
+def test_next_is_refused_without_phases_and_while_stopped() -> None:
     with pytest.raises(RequestRefused, match="has no phases"):
         ask(started(FLAT), "next")
     run = started()
@@ -59,7 +59,7 @@ def test_dry_run_keeps_roles_in_force_and_tells_lacking_cars() -> None:
         ask(run, "next")
 
 
-def test_bit_flip_is_told_and_loses_one_chunk_at_most() -> None:
+def test_stopped_plan_brings_cars_to_rest_once() -> None:
     run = started(FLAT)
     assert "blue, red brought to rest" in ask(run, "stop")
     run.asked.clear()
@@ -76,7 +76,7 @@ def test_bit_flip_is_told_and_loses_one_chunk_at_most() -> None:
     assert "already" in ask(run, "stop")
 
 
-def test_every_bit_flip_is_told_and_loses_one_chunk_at_most() -> None:
+def test_command_on_its_way_does_not_count_as_rest() -> None:
     """The car still reports manual, because the mode command before the stop has no outcome yet."""
     run = started(FLAT, "red", obey=False)
     ask(run, "stop")
@@ -111,7 +111,7 @@ def test_what_a_person_has_taken_is_left_to_that_person(fields: dict[str, str]) 
     assert (run.asked, run.memory.to_rest) == ([], frozenset())
 
 
-def test_bit_flip_without_index_loses_one_chunk_at_most() -> None:
+def test_lost_car_is_brought_to_rest_on_return_and_refusal_is_no_rest() -> None:
     run = started(FLAT, "red")
     run.change("red", link="lost")
     run.at(3.1)

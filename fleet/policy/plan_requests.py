@@ -9,7 +9,7 @@ from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState
 from schemas import keys
-from schemas.authority import People
+from schemas.rights import People
 from schemas.words import Reason
 
 GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from fleet.hub.rules import access_control
+from fleet.hub.access_rules import access_control
 from schemas import keys
 from schemas.commands import COMMANDS
 from schemas.identity import Service, car, may_locate, person, service
@@ -80,7 +80,7 @@ def test_everyone_speaks_for_itself_only(identity: str) -> None:
         assert allows(identity, "ingress", "declare_queryable", caches) == may_locate(identity, of)
 
 
-def test_good_plan_passes_with_and_without_fleet_file() -> None:
+def test_pose_is_allowed_to_own_gateway_and_locator() -> None:
     assert {each for each in EVERYONE if may_locate(each, "red")} == {car("red"), service(Service.LOCATOR)}
     assert may_locate("", "red"), "on a hub without certificates everyone may"
     locator = service(Service.LOCATOR)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from schemas.codes import EVENTS, REASONS
+from schemas.reason_codes import EVENTS, REASONS
 from schemas.words import BatteryLevel, Level, Reason
 
 ROOT: Final = Path(__file__).parent.parent.parent

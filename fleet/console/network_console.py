@@ -17,7 +17,6 @@ import segno
 
 from fleet.console.certificate import Certificate, ensure_certificate
 from fleet.console.connection_limit import ConnectionLimit, LogLimit
-from fleet.console.guard import DEVICE, PAIR_PATH, Scope
 from fleet.console.pairing import (
     CLASS_LIFETIME_S,
     CODE_LIFETIME_S,
@@ -32,8 +31,9 @@ from fleet.console.pairing import (
     new_code,
 )
 from fleet.console.people_file import PeopleFile
+from fleet.console.request_filter import DEVICE, PAIR_PATH, Scope
 from fleet.hub.addresses import own_addresses, own_names
-from schemas.authority import NO_PEOPLE, People
+from schemas.rights import NO_PEOPLE, People
 
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""

@@ -1,6 +1,6 @@
 """Assigns cars to roles at the lowest total cost: the Hungarian method with several places per role. Pure.
 
-allocation.py sets the costs.
+role_allocation.py sets the costs.
 """
 
 from collections import deque

@@ -5,8 +5,15 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.safety import MAX_ENDED_ESTOPS, MAX_ENDED_PAUSES, MAX_ESTOPS, MAX_PAUSES, PersistedSafety, Safety
-from schemas.authority import Estop, FleetPause, Hold, LeaseState, Loan, Sender
+from gateway.control.holds_and_leases import (
+    MAX_ENDED_ESTOPS,
+    MAX_ENDED_PAUSES,
+    MAX_ESTOPS,
+    MAX_PAUSES,
+    PersistedSafety,
+    Safety,
+)
+from schemas.rights import Estop, FleetPause, Hold, LeaseState, Loan, Sender
 from schemas.words import Rank
 
 ANN, BOB = Sender("ann", Rank.PERSON), Sender("bob", Rank.PERSON)

@@ -1,6 +1,6 @@
 """Parses a command query or publication into a `Command`, or raises an error that names the mistake.
 
-It checks ranges. The arbiter decides whether the car may carry out the command now.
+It checks ranges. `gateway.control.refusals` decides whether the car may carry out the command now.
 """
 
 import hashlib
@@ -34,11 +34,11 @@ from gateway.control.commands import (
     Stop,
 )
 from schemas import messages
-from schemas.authority import Sender
 from schemas.commands import COMMANDS, STOPS, Verb
 from schemas.identity import speaks_for
 from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
+from schemas.rights import Sender
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
 from schemas.words import FanState, Light, Mode, Motion, Rank, Reason, Scope, Servo, ServoAction, SpeedStep
