@@ -1,8 +1,9 @@
 """Identities: whose certificate a program has on a hub with rules, and for whom it may speak. Pure.
 
-An identity is `person.mia`, `car.red` or `service.recorder`. It is the common name of a certificate, and a part of the
-keys of its commands (`keys.command_key`). The hub's rules let nobody use another's. The name of a sender in a command
-is only text, so whoever carries out a command asks `speaks_for`, and a service `sender_for`.
+An identity is `person.mia`, `car.red`, `service.recorder` or, at another site, `service.recorder@north`. It is the
+common name of a certificate, and a part of the keys of its commands (`keys.command_key`). The hub's rules let nobody
+use another's. The name of a sender in a command is only text, so whoever carries out a command asks `speaks_for`, and a
+service `sender_for`.
 """
 
 from enum import StrEnum
@@ -38,6 +39,8 @@ class Service(StrEnum):
 
 ANONYMOUS: Final = "anonymous"
 """The sender of a command that names none, on a hub without certificates."""
+_AT: Final = "@"
+"""Between a service and the site where it runs."""
 _FORWARDED: Final = frozenset({Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE})
 """What gateways tell one another in the name of whoever told one of them."""
 
@@ -52,9 +55,9 @@ def car(name: str) -> str:
     return f"{IdentityRole.CAR}.{name}"
 
 
-def service(name: Service) -> str:
-    """Return the identity of a service."""
-    return f"{IdentityRole.SERVICE}.{name}"
+def service(name: Service, at_site: str = "") -> str:
+    """Return the identity of a service. at_site: the name of the other site where it runs; empty at the first hub."""
+    return f"{IdentityRole.SERVICE}.{name}{_AT}{at_site}" if at_site else f"{IdentityRole.SERVICE}.{name}"
 
 
 def site(name: str) -> str:
@@ -71,11 +74,13 @@ class NotTheSender(Exception):
 
 
 def parse(identity: str) -> tuple[IdentityRole, str] | None:
-    """Return the role and the name of an identity; None if it is none."""
+    """Return the role and the name of an identity; None if it is none. A service has its name at every site."""
     role, _, name = identity.partition(".")
+    if role == IdentityRole.SERVICE:
+        name, at, site = name.partition(_AT)
+        if name not in tuple(Service) or (at and not is_name(site)):
+            return None
     if role not in tuple(IdentityRole) or not is_name(name):
-        return None
-    if role == IdentityRole.SERVICE and name not in tuple(Service):
         return None
     return IdentityRole(role), name
 
@@ -116,7 +121,7 @@ def may_locate(identity: str, of: str) -> bool:
 
     identity: empty on a hub without certificates; everyone may there.
     """
-    return identity in ("", car(of), service(Service.LOCATOR))
+    return identity in ("", car(of)) or parse(identity) == (IdentityRole.SERVICE, Service.LOCATOR)
 
 
 def sender_for(identity: str, sender: str, verb: str) -> str:

@@ -102,6 +102,20 @@ def car_token(fleet: str, car: str) -> str:
     return f"{fleet}/{car}"
 
 
+def recorder_token(fleet: str, site: str = "") -> str:
+    """Return the liveliness token of the recorder of a fleet, or of that at another site. Its status is below it."""
+    return f"{fleet}/{RECORDER}/{site}" if site else f"{fleet}/{RECORDER}"
+
+
+def recorder_site(fleet: str, token: str) -> str | None:
+    """Return the site of a recorder's token, empty for the recorder of the fleet; None if the key is no such token."""
+    start, _, site = token.partition(f"{fleet}/{RECORDER}")
+    if start or not (site == "" or site.startswith("/")):
+        return None
+    site = site[1:]
+    return site if not site or is_name(site) else None
+
+
 def renewal_key(identity: str) -> str:
     """Return where an identity asks for its next certificate. The rules of the hub let nobody else ask there."""
     return f"{HUB_RENEWAL}/{identity}"

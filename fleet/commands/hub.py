@@ -86,14 +86,19 @@ examples:
   fleet hub invite mia
   fleet hub invite --car red
   fleet hub invite --car red --qr
-  fleet hub invite --site north"""
+  fleet hub invite --site north
+  fleet hub invite --service recorder --site north"""
 )
 @click.argument("person", required=False)
 @click.option("--car", metavar="CAR", help="Invite a computer that runs the gateway of this car.")
 @click.option(
     "--service", type=click.Choice([each.value for each in Service]), help="Invite a computer that runs this service."
 )
-@click.option("--site", metavar="SITE", help="Invite the computer that is the hub of another site.")
+@click.option(
+    "--site",
+    metavar="SITE",
+    help="Invite the computer that is the hub of another site; with --service, a service there.",
+)
 @click.option("--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen here (default: {JOIN_PORT}).")
 @click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
 @click.option("--qr", is_flag=True, help="Also draw the line to type as a QR code, for a camera and `fleet join -`.")
@@ -113,15 +118,16 @@ def invite(
 
     The hub restarts first, since it gets another rule: drives may end, modes go on, and all are back after a second.
     """
-    if [person, car, service, site].count(None) != 3:
+    if [person, car, service, None if service else site].count(None) != 3:
         raise click.UsageError(
             "say who is invited: fleet hub invite NAME, or --car NAME, or --service NAME, or --site NAME"
         )
     with cli_errors(), _disk_errors():
         what = "car name" if car else "site" if site else "person"
-        name = keys.check_name(person or car or service or site or "", what)
+        name = keys.check_name(person or car or site or service or "", what)
         if service:
-            invited = identity.service(Service(service))
+            invited = identity.service(Service(service), site or "")
+            name = f"{service} of {site}" if site else service
         else:
             invited = identity.car(name) if car else identity.site(name) if site else identity.person(name)
         endpoint = resolve_endpoint()

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.client.client import certified_sender, default_sender
-from fleet.client.services import ask_recorder, why_unrecorded
+from fleet.client.services import RECORDER_TIMEOUT_S, ask_recorder, why_unrecorded
 from fleet.commands.fleets import the_fleet
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from fleet.recording.writing.disk_space import Reserve
+from fleet.recording.writing.recorder_service import AnotherRecorder
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.identity import Service, service
@@ -79,6 +80,7 @@ def record() -> None:
 examples:
   fleet record run --quota 20GB
   fleet record run --sessions /media/disk --segment-time 5m
+  fleet record run --site north
 
 The quota takes whole files, the oldest of all sessions first. It takes last those around stops, marks, and what pin:
 of the fleet file says, and nothing of marked sessions."""
@@ -128,6 +130,12 @@ of the fleet file says, and nothing of marked sessions."""
     "--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml, and pin what its pin: says."
 )
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
+@click.option(
+    "--site",
+    default="",
+    metavar="SITE",
+    help="Record at this other site, beside the recorder of the fleet, which answers while it can be reached.",
+)
 @connect_option()
 @fleet_option()
 @starter_option()
@@ -142,6 +150,7 @@ def run(
     keep_free: int,
     fleet_file: Path | None,
     plan: Path | None,
+    site: str,
     connect: str | None,
     fleet: str,
     *,
@@ -151,7 +160,7 @@ def run(
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
     from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
-    from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
+    from fleet.recording.writing.recorder import Recorder, RecordingFailed
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
@@ -170,9 +179,10 @@ def run(
     stop = threading.Event()
     signals.calls(stop.set)
     try:
-        with Bus.open(connect, start_hub=True, identity=service(Service.RECORDER)) as bus:
+        identity = service(Service.RECORDER, keys.check_name(site, "site") if site else "")
+        with Bus.open(connect, start_hub=True, identity=identity) as bus:
             pins, people = _of_file(fleet_file)
-            recorder = Recorder(bus, fleet, place, options, pins=pins, people=people, notify=_warn)
+            recorder = Recorder(bus, fleet, place, options, site=site, pins=pins, people=people, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
                 _say(
@@ -273,14 +283,16 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
         )
 
 
-def _show_status(found: Any, *, as_json: bool) -> None:
+def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
     if as_json:
         from google.protobuf.json_format import MessageToDict
 
-        click.echo(json.dumps(MessageToDict(found, preserving_proto_field_name=True)))
+        named = {"site": site} if site else {}
+        click.echo(json.dumps({**named, **MessageToDict(found, preserving_proto_field_name=True)}))
         return
+    where = f"{site}: " if site else ""
     click.echo(
-        f"{found.state}: {found.session}, {found.messages} messages, {found.bytes / 1e6:.1f} MB in "
+        f"{where}{found.state}: {found.session}, {found.messages} messages, {found.bytes / 1e6:.1f} MB in "
         f"{found.segments} file{'s' * (found.segments != 1)}, {found.free_bytes / 1e9:.1f} GB free"
     )
     for counts, words in ((found.drops, "dropped for want of room"), (found.missed, "missed on the bus")):
@@ -314,8 +326,15 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Show what is being recorded, where to, how much was lost, and whether there is room."""
+    """Show what is being recorded, where to, how much was lost, and whether there is room. Also of other sites."""
     _show_status(_query(RecorderVerb.STATUS, connect, fleet), as_json=as_json)
+    with Bus.open(connect) as bus:
+        fleet = the_fleet(bus, fleet)
+        for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
+            if isinstance(answer, Failure):
+                continue
+            site = keys.recorder_site(fleet, answer.key.removesuffix("/status"))
+            _show_status(answer.message(), as_json=as_json, site=site or "")
 
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from schemas import keys
 from schemas.bus.credentials import HUB
-from schemas.identity import IdentityRole, Service, parse, role_of, service
+from schemas.identity import IdentityRole, Service, parse, role_of
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 """Messages that ask for something."""
@@ -110,7 +110,7 @@ def _answers(identity: str) -> list[dict[str, Any]]:
     role, name = known
     # Others ask with wildcards: what a rule does not include never arrives.
     is_asked = _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS))
-    if identity == service(Service.LOCATOR):
+    if known == (IdentityRole.SERVICE, Service.LOCATOR):
         return [_rule(f"{identity} tells", "ingress", _TELLS, ("*/*/sensor/pose", "*/*/sensor/pose/@adv/**")), is_asked]
     if role is IdentityRole.PERSON or (role is IdentityRole.SERVICE and name not in _OWN_SERVICE):
         return []

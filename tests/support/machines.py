@@ -96,6 +96,26 @@ class Machines:
         self.join(machine, "--site", "north")
         return self.start(machine, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
 
+    def record(self, machine: str, site: str = "") -> tuple[GatewayProcess, Path]:
+        """Start a recorder. Return it and the directory of its sessions. site: of which this machine is the hub."""
+        place = self.directory / f"sessions-{machine}"
+        options = ("--site", site) if site else ()
+        recorder = self.start(machine, "-m", "fleet.cli", "record", "run", "--sessions", str(place), "--json", *options)
+        recorder.line()
+        return recorder, place
+
+    def check_whole(self, *places: Path) -> None:
+        """Require that each place has one session that is whole, and that they merge into one that is."""
+        sessions = [str(session) for place in places for session in place.iterdir() if session.is_dir()]
+        assert len(sessions) == len(places), sessions
+        merged = self.directory / "merged"
+        code, lines, words = self.run(HUB, "sessions", "merge", *sessions, "--out", str(merged))
+        assert code == 0, (lines, words)
+        for session in (*sessions, str(merged)):
+            code, lines, words = self.run(HUB, "sessions", "verify", session, "--json")
+            print(session, *lines, words)
+            assert code == 0, (session, lines, words)
+
     def kill_hub(self) -> None:
         """Kill the hub, whoever has started it."""
         listed = subprocess.run(["ip", "netns", "pids", HUB], capture_output=True, text=True, check=True).stdout.split()

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
@@ -24,13 +24,18 @@ from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.pin_watch import PinWatch
 from fleet.recording.writing.receive_clock import ReceiveClock
+from fleet.recording.writing.recorder_service import (
+    MARK_TOPIC,
+    STATUS_TIMEOUT_S,
+    STATUS_TOPIC,
+    RecorderService,
+)
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
 from schemas.bus import Bus, SampleChannel, messages_of, reply_value, sequence_of
 from schemas.gen import fleet_v1_pb2
 from schemas.identity import NotTheSender, sender_for
 from schemas.rights import Authority, People
-from schemas.topics import TOPICS
 from schemas.words import Level, RecorderState, RecorderVerb
 
 MAX_QUEUED_MESSAGES: Final = 100_000
@@ -52,16 +57,7 @@ MAX_DRAIN_DELAY_S: Final = 0.2
 """Maximum delay of both together. Beyond it, hub or recorder stood still, and the time begins anew."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all of it, on a machine that stays too busy."""
-STATUS_TIMEOUT_S: Final = 5.0
-"""Timeout for the status of another recorder, which answers only between two writes to its disk."""
 MAX_PENDING_QUERIES: Final = 64
-
-STATUS_TOPIC: Final = TOPICS["@recorder/status"]
-MARK_TOPIC: Final = TOPICS["@recorder/mark"]
-
-
-class AnotherRecorder(Exception):
-    """Another recorder records this fleet. The message names its session."""
 
 
 class RecordingFailed(Exception):
@@ -103,6 +99,7 @@ class Recorder:
         root: Path,
         options: Options | None = None,
         *,
+        site: str = "",
         pins: Sequence[PinRule] = (),
         people: Callable[[], People | None] = lambda: None,
         max_messages: int = MAX_QUEUED_MESSAGES,
@@ -112,6 +109,7 @@ class Recorder:
     ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
+        self._service = RecorderService(bus, fleet, site)
         self._root = root
         self._options = options or Options()
         self._pin_rules = pins
@@ -143,17 +141,14 @@ class Recorder:
 
         Raises AnotherRecorder, and OSError if the session cannot be created. A full disk does not raise.
         """
-        self._refuse_a_second()
+        self._service.refuse_a_second()
         for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, SUBSCRIBER_QUEUE_SIZE))
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._overflow: dict[tuple[str, Hashable], tuple[int, int]] = {}
         """Messages that did not fit the queue: their count and the last number, by key and sender."""
         session = self._session.path
-        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS_TOPIC.name.partition("/")[2])
-        self._publisher = self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER)
-        marks = keys.topic_key(self._fleet, keys.RECORDER, MARK_TOPIC.name.partition("/")[2])
-        self._marks = self._bus.publisher(marks, MARK_TOPIC, keys.RECORDER)
+        self._service.declare_publishers()
         self._last = self._status()
         self._backfill = Backfill(
             self._bus, keys.recorded_keys(self._fleet), resumes=bool(self._session.description.continues)
@@ -163,13 +158,7 @@ class Recorder:
         self._reader.start()
         self._writer.start()
         self._backfill.start()
-        self._bus.queryable(key, self._on_query)
-        for expression in keys.command_keys(self._fleet, keys.RECORDER):
-            self._bus.queryable(expression, self._on_query)
-        token = keys.car_token(self._fleet, keys.RECORDER)
-        self._bus.token(token)
-        # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
-        self._bus.tokens(token)
+        self._service.open(self._on_query)
         return session
 
     @property
@@ -200,21 +189,10 @@ class Recorder:
         end += MAX_SHUTDOWN_DRAIN_S
         while began < end:
             time.sleep(SHUTDOWN_DRAIN_S)
-            with contextlib.suppress(zenoh.ZError):  # without a bus nothing is in transit
-                self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER), SHUTDOWN_DRAIN_S)
+            self._service.wait_for_hub(SHUTDOWN_DRAIN_S)
             began, before = time.monotonic(), began
             if began - before < SHUTDOWN_DRAIN_S + MAX_DRAIN_DELAY_S:
                 return
-
-    def _refuse_a_second(self) -> None:
-        if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
-            return
-        where = "to an unknown place"
-        for message in messages_of(self._bus.query(f"{self._fleet}/{STATUS_TOPIC.name}", timeout_s=STATUS_TIMEOUT_S)):
-            where = f"to {message.session}"
-        raise AnotherRecorder(
-            f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, {where}. One recorder is enough."
-        )
 
     def _on_query(self, query: zenoh.Query) -> bool:
         """Queue a query, on a Zenoh thread. Return False if too many are pending."""
@@ -314,6 +292,7 @@ class Recorder:
             for item in self._writing:
                 add(*item)
             self._pin(batch)
+            self._take_marks(batch)
             self._add_backfilled(backfilled)
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
@@ -334,6 +313,16 @@ class Recorder:
                 published_ns = received_ns if stamp is None else stamp.get_time_as_ntp64().as_nanos()
                 for pin in watch.add(key, str(encoding), payload, published_ns, received_ns):
                     self._session.pin(pin)
+
+    def _take_marks(self, batch: Sequence[_Item]) -> None:
+        """Keep the session also for the marks that the recorder of another site has set."""
+        if self._service.speaks_for_fleet:
+            return  # it sets them itself
+        for key, payload, encoding, _, _, received_ns in batch:
+            if key == self._service.mark_key:
+                with contextlib.suppress(messages.BadPayload, OSError):  # the message itself is recorded in any case
+                    mark: Any = messages.parse(MARK_TOPIC.message, payload, str(encoding))
+                    self._session.mark(mark.message[:MAX_MARK_CHARACTERS], mark.name[:MAX_MARK_CHARACTERS], received_ns)
 
     def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
         late: list[tuple[int, str, str, bytes]] = []
@@ -399,7 +388,7 @@ class Recorder:
         )
         self._last.drops.update(self._session.drops)
         with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report it
-            self._publisher.put(self._last, self._now())
+            self._service.publish(self._last, self._now())
 
     @property
     def _state(self) -> RecorderState:
@@ -427,7 +416,7 @@ class Recorder:
 
     def _publish(self, state: str = "") -> None:
         self._last = self._status(state)
-        self._publisher.put(self._last, self._now())
+        self._service.publish(self._last, self._now())
 
     # ------------------------------------------------------------------ queries and commands
 
@@ -518,7 +507,7 @@ class Recorder:
         if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
             raise _CommandRefused(f"text needs 1 to {MAX_MARK_CHARACTERS} characters, by at most {MAX_MARK_CHARACTERS}")
         now = self._now()
-        self._marks.put(messages.log_message(now, Level.INFO, by, text), now)
+        self._service.publish_mark(messages.log_message(now, Level.INFO, by, text), now)
         with contextlib.suppress(OSError):  # the disk is full: the bus has the mark, and `close` writes it
             self._session.mark(text, by, now)
         self._last = self._status()

@@ -12,7 +12,8 @@ from schemas import keys
 from schemas.commands import COMMANDS
 from schemas.identity import Service, car, may_locate, person, service
 
-EVERYONE = [person("mia"), person("eve"), car("red"), car("blue"), *map(service, Service)]
+NORTH = service(Service.RECORDER, "north")
+EVERYONE = [person("mia"), person("eve"), car("red"), car("blue"), *map(service, Service), NORTH]
 RULES = access_control([(each, each) for each in EVERYONE])
 
 
@@ -54,6 +55,7 @@ OWN_CHUNK: dict[str, tuple[str, ...]] = {
     service(Service.SUPERVISOR): (keys.SUPERVISOR,),
     service(Service.COORDINATOR): (keys.COORDINATOR,),
     service(Service.RECORDER): (keys.RECORDER,),
+    NORTH: (keys.RECORDER,),
     service(Service.SIMULATOR): (keys.SIMULATOR,),
 }
 

@@ -17,7 +17,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
 from fleet.recording.writing.backfill import BACKFILL_POLL_INTERVAL_S, LEASE_POLLS
-from fleet.recording.writing.recorder import AnotherRecorder, Recorder
+from fleet.recording.writing.recorder import Recorder
+from fleet.recording.writing.recorder_service import AnotherRecorder
 from schemas import keys, messages
 from schemas.bus import Bus, Sample, router_config
 from schemas.gen import fleet_v1_pb2 as pb

@@ -1,0 +1,117 @@
+"""What others see of a recorder: its status, its answers, its marks, its token.
+
+A fleet has one recorder, and one more at each other site (`fleet record --site north`). All of them record all that
+they can see. Commands of people go to one of them: that of the fleet where it can be reached, else the site with the
+first name. So while two sites are cut off from one another, marks are set and the status is told on both sides.
+
+The recorder of a site tells its status under a key of its own, too: `fleet/@recorder/north/status`.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import zenoh
+
+from schemas import keys
+from schemas.bus import Bus, messages_of
+from schemas.topics import TOPICS
+
+STATUS_TOPIC: Final = TOPICS["@recorder/status"]
+MARK_TOPIC: Final = TOPICS["@recorder/mark"]
+STATUS_TIMEOUT_S: Final = 5.0
+"""Timeout for the status of another recorder, which answers only between two writes to its disk."""
+
+
+class AnotherRecorder(Exception):
+    """Another recorder records this fleet, or this site. The message names its session."""
+
+
+def speaks_for_fleet(site: str, others: Iterable[str]) -> bool:
+    """Return True if a recorder carries out the commands for the fleet, beside others. A site is empty for the first.
+
+    Each recorder decides it by itself from the tokens that it sees.
+    """
+    return all(site <= other for other in others)
+
+
+class RecorderService:
+    """The declarations of a recorder in a bus session. site: empty, or the name of the other site where it runs."""
+
+    def __init__(self, bus: Bus, fleet: str, site: str = "") -> None:
+        self._bus = bus
+        self.fleet = fleet
+        self._site = site if not site else keys.check_name(site, "site")
+        self._token = keys.recorder_token(fleet, site)
+        self.mark_key = f"{keys.recorder_token(fleet)}/mark"
+        self._others: set[str] = set()
+        """Sites of the other recorders that are there."""
+        self._lock = threading.Lock()
+
+    def refuse_a_second(self) -> None:
+        """Raise AnotherRecorder if this site has a recorder."""
+        if not self._bus.tokens(self._token):
+            return
+        where = "to an unknown place"
+        for message in messages_of(self._bus.query(f"{self._token}/status", timeout_s=STATUS_TIMEOUT_S)):
+            where = f"to {message.session}"
+        if self._site:
+            raise AnotherRecorder(f"site {self._site} is recorded already, {where}. One recorder at a site is enough.")
+        raise AnotherRecorder(
+            f"{keys.describe_fleet(self.fleet).capitalize()} is recorded already, {where}. One recorder is enough; at "
+            "another site, `fleet record --site NAME` records, too."
+        )
+
+    def declare_publishers(self) -> None:
+        """Declare the publishers."""
+        status = [f"{keys.recorder_token(self.fleet)}/status"]
+        if self._site:
+            status.append(f"{self._token}/status")
+        self._status = [self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER) for key in status]
+        self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
+
+    def open(self, on_query: Callable[[zenoh.Query], object]) -> None:
+        """Answer from now on. on_query: as of `Bus.queryable`; it gets what this recorder carries out."""
+
+        def for_fleet(query: zenoh.Query) -> object:
+            if self.speaks_for_fleet:
+                return on_query(query)
+            with query:  # another one answers
+                return True
+
+        if self._site:
+            self._bus.watch_tokens(f"{keys.recorder_token(self.fleet)}/**", self._on_token)
+            self._bus.queryable(f"{self._token}/status", on_query)
+        self._bus.queryable(f"{keys.recorder_token(self.fleet)}/status", for_fleet)
+        for expression in keys.command_keys(self.fleet, keys.RECORDER):
+            self._bus.queryable(expression, for_fleet)
+        self._bus.token(self._token)
+        # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
+        self.wait_for_hub()
+
+    def wait_for_hub(self, timeout_s: float = 5.0) -> None:
+        """Wait for the hub's answer to a question that comes after all that was sent before."""
+        with contextlib.suppress(zenoh.ZError):  # without a bus nothing is in transit
+            self._bus.tokens(self._token, timeout_s)
+
+    @property
+    def speaks_for_fleet(self) -> bool:
+        """Return True if this recorder carries out the commands for the fleet now."""
+        with self._lock:
+            return speaks_for_fleet(self._site, self._others)
+
+    def publish(self, status: Any, now_ns: int) -> None:
+        """Publish the status: for the fleet if this recorder speaks for it, and for its own site."""
+        for publisher in self._status if self.speaks_for_fleet else self._status[1:]:
+            publisher.put(status, now_ns)
+
+    def publish_mark(self, mark: Any, now_ns: int) -> None:
+        """Publish a mark, which every recorder records."""
+        self._marks.put(mark, now_ns)
+
+    def _on_token(self, key: str, came: bool) -> None:  # noqa: FBT001 - the bus calls it so
+        site = keys.recorder_site(self.fleet, key)
+        if site is not None and site != self._site:
+            with self._lock:
+                (self._others.add if came else self._others.discard)(site)

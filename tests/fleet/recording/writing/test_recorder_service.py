@@ -1,0 +1,86 @@
+"""The recorder of another site beside that of the fleet: both record, one answers, and a mark is in both."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fleet.client.services import ask_recorder
+from fleet.recording.reading.session import Session
+from fleet.recording.writing.recorder import Recorder
+from fleet.recording.writing.recorder_service import AnotherRecorder, speaks_for_fleet
+from schemas import messages
+from schemas.bus import Bus, messages_of
+from schemas.words import RecorderState, RecorderVerb
+from tests.fleet.recording.conftest import wait_for
+
+
+@pytest.mark.parametrize(
+    ("site", "others", "speaks"),
+    [
+        ("", {"north"}, True),
+        ("north", {""}, False),
+        ("north", {"", "south"}, False),
+        ("north", {"south"}, True),
+        ("south", {"north"}, False),
+        ("south", set(), True),
+    ],
+)
+def test_one_recorder_speaks_for_fleet(site: str, others: set[str], speaks: bool) -> None:
+    assert speaks_for_fleet(site, others) is speaks
+
+
+@contextlib.contextmanager
+def recording(endpoint: str, place: Path, site: str = "") -> Iterator[Path]:
+    with Bus.open(endpoint) as own:
+        recorder = Recorder(own, "fleet", place, site=site)
+        session = recorder.start()
+        try:
+            yield session
+        finally:
+            recorder.close()
+
+
+def session_that_answers(bus: Bus) -> str:
+    found = ask_recorder(bus, "fleet", RecorderVerb.STATUS)
+    return "" if found is None else str(found.session)
+
+
+def marks(session: Path) -> list[str]:
+    """Return the texts of the marks among the messages, and require the same in the description."""
+    opened = Session(session)
+    found = [
+        messages.parse(each.message, each.payload, "application/protobuf").message  # type: ignore[attr-defined]
+        for each in opened.messages()
+        if each.key.endswith("/mark")
+    ]
+    assert opened.description is not None
+    assert [each["text"] for each in opened.description.marks] == found
+    assert opened.description.kept
+    return found
+
+
+def test_site_recorder_records_too_and_answers_alone(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    with recording(endpoint, tmp_path / "north", "north") as north:
+        wait_for(lambda: session_that_answers(bus) == str(north), "the one that is there answers")
+        with recording(endpoint, tmp_path / "first") as first:
+            wait_for(lambda: session_that_answers(bus) == str(first), "the recorder of the fleet answers")
+            ask_recorder(bus, "fleet", RecorderVerb.MARK, text="both", by="mia")
+            (own,) = messages_of(bus.query("fleet/@recorder/*/status", timeout_s=10.0))
+            assert (own.session, own.state) == (str(north), RecorderState.RECORDING)
+            with pytest.raises(AnotherRecorder, match=str(north)):
+                Recorder(bus, "fleet", tmp_path / "again", site="north").start()
+        wait_for(lambda: session_that_answers(bus) == str(north), "that of the site answers again")
+        ask_recorder(bus, "fleet", RecorderVerb.MARK, text="alone", by="mia")
+    assert marks(first) == ["both"]
+    assert marks(north) == ["both", "alone"]
+    for session in (first, north):
+        opened = Session(session)
+        opened.check()
+        assert not opened.damage
+
+
+def test_bad_site_name_is_refused(bus: Bus, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="site 'a/b'"):
+        Recorder(bus, "fleet", tmp_path, site="a/b")
