@@ -6,6 +6,7 @@ command to control, and answers after control could write. Only `Writer` writes 
 """
 
 import asyncio
+import contextlib
 import gc
 import logging
 import random
@@ -23,14 +24,15 @@ from gateway import drivers
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
-from gateway.bus.service import CarService
+from gateway.bus.service import AlreadyServed, CarService
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
 from gateway.control.holds_and_leases import PersistedSafety
 from gateway.learned_file import LearnedFile
-from gateway.link import LinkUrl
+from gateway.link import LinkError, LinkUrl
 from gateway.link_loop import LinkLoop, at_rate
 from gateway.state_file import SafetyStateFile
+from gateway.stop_without_hub import stop_alone
 from gateway.wake import Wake
 from gateway.writer import Writer
 from schemas import bus
@@ -197,10 +199,12 @@ class CarGateway:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             failed = [task for task in done if task is not stopped and task.exception() is not None]
             if failed:
-                if self._control.was_open:
+                if self._control.was_open and not tasks[1].done():
                     if not self._ending:
                         self.stop()
                     await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
+                if tasks[1].done():  # it writes nothing any more
+                    self._fail_commands()
                 failed[0].result()
         finally:
             running = {stopped, *tasks}
@@ -232,6 +236,11 @@ class CarGateway:
             wait = f" It takes up to {SHUTDOWN_S:g} s until the car confirms it." if confirms else ""
             log.info("%s: stopping.%s A second Ctrl-C ends at once.", self._settings.car, wait)
         self._wake.set()
+
+    def _fail_commands(self) -> None:
+        """Fail what is under way, and take back every claim. The driver may be what failed."""
+        with contextlib.suppress(Exception):
+            self._driver.link_down("its gateway failed", self._loop.time())
 
     async def _check_rival(self) -> None:
         """Check once more for another gateway. Of two that started together the one with the higher id ends."""
@@ -401,4 +410,12 @@ async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> boo
     gc.freeze()
     loop = asyncio.get_running_loop()
     signals.calls_in(loop, lambda _: car.stop())
-    return await car.run()
+    try:
+        return await car.run()
+    except (AlreadyServed, LinkError):
+        raise
+    except Exception:  # a driver may come from another package, and must not leave a moving car alone
+        log.exception("the gateway of %s failed, and its car is stopped by a new driver", settings.car)
+        where = (settings.car, settings.url, settings.platform, settings.fleet, settings.state_dir)
+        log.error("%s", await stop_alone(*where))
+        return False

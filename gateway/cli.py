@@ -263,10 +263,10 @@ def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: s
     except BadEndpoint:
         raise
     except BusError as error:
-        from gateway.stop_without_hub import stop_alone
+        from gateway.stop_without_hub import run_stop_alone
 
         state_dir = _state_dir(arguments, resolve_endpoint(arguments.connect))
-        raise BusError(f"{error} {stop_alone(car, url, platform, fleet, state_dir)}") from error
+        raise BusError(f"{error} {run_stop_alone(car, url, platform, fleet, state_dir)}") from error
 
 
 def _state_dir(arguments: argparse.Namespace, endpoint: str) -> "Path":

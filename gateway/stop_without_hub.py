@@ -1,11 +1,17 @@
-"""Stops a car without the bus: the gateway starts, its hub is away, and the car may still do what it was told last.
+"""Stops a car without the bus, over a link of its own and with a new driver.
 
-Without it, a gateway that its watchdog has ended in an outage of the network would leave a moving car alone, since its
-successor waits for the hub first. Nothing is taken from the bus here, and nothing is claimed on it.
+It is needed twice:
+
+- A gateway starts, its hub is away, and the car may still do what it was told last. A gateway that its watchdog has
+  ended in an outage of the network would leave a moving car alone, since its successor waits for the hub first.
+- A gateway fails, because its driver does, which may come from another package. That driver writes nothing any more.
+
+Nothing is taken from the bus here, and nothing is claimed on it.
 """
 
 import asyncio
 import contextlib
+import logging
 import time
 from functools import partial
 from pathlib import Path
@@ -19,21 +25,31 @@ from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.link_loop import at_rate
 from schemas.links import car_link
 
+log = logging.getLogger("gateway")
+
 _STOP_POLL_S: Final = 0.05
 """Interval at which the stop goes on. Frames are tens of milliseconds apart."""
 
 
-def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
+def run_stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
+    """Do what `stop_alone` does, in a loop of its own."""
+    return asyncio.run(stop_alone(car, url, platform, fleet, state_dir))
+
+
+async def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
     """Stop the car without the bus, and return what became of it as a sentence for a person."""
     try:
-        why_not = asyncio.run(_stop(car, url, platform, fleet, state_dir))
+        why_not = await _stop(car, url, platform, fleet, state_dir)
     except LinkError as error:
-        return f"{car} was not stopped either: {error}"
-    return f"{car} may be moving: {why_not}" if why_not else f"{car} was stopped without it."
+        return f"{car} may be moving, and was not stopped: {error}"
+    except Exception as error:  # a driver may fail again
+        log.exception("%s could not be stopped", car)
+        return f"{car} may be moving, and was not stopped: {type(error).__name__}: {error}"
+    return f"{car} may be moving: {why_not}" if why_not else f"{car} was stopped all the same."
 
 
 async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Open the link, stop the car, close the link. Return what became of it, in words. Raises LinkError."""
+    """Open the link, stop the car, close the link. Return why it was not stopped; empty if it was. Raises LinkError."""
     learned = LearnedFile(state_dir, fleet, car, link=car_link(url), platform=platform)
     loop = asyncio.get_running_loop()
     make = learned.load(partial(drivers.driver_of, platform))

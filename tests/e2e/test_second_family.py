@@ -1,14 +1,16 @@
 """Cars of other families behind real gateways: Waveshare's over a terminal, and a tank of another package over TCP."""
 
+import contextlib
 import json
 import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from schemas.words import Basis, Motors, Phase
+from schemas.words import Basis, Motors, Phase, Reason
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
@@ -65,7 +67,14 @@ class TankServer:
         return f"tcp://127.0.0.1:{self.server.getsockname()[1]}"
 
     def _serve(self) -> None:
-        peer, _ = self.server.accept()
+        while not self.ended.is_set():
+            try:
+                peer, _ = self.server.accept()
+            except OSError:  # closed
+                return
+            self._serve_one(peer)
+
+    def _serve_one(self, peer: socket.socket) -> None:
         with peer:
             peer.settimeout(0.2)
             rest = b""
@@ -83,17 +92,42 @@ class TankServer:
     def close(self) -> None:
         """End it."""
         self.ended.set()
+        with contextlib.suppress(OSError):
+            self.server.shutdown(socket.SHUT_RDWR)  # else `accept` waits on
         self.server.close()
         self.thread.join(timeout=5)
 
 
-def test_a_car_of_another_package_is_named_driven_and_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
-    found = tmp_path / "packages" / "tank_driver-1.0.dist-info"
+def install_tank(fleet: FleetProcesses, directory: Path, module: str) -> None:
+    """Install the package of a driver for the processes of a fleet."""
+    found = directory / "packages" / "tank_driver-1.0.dist-info"
     found.mkdir(parents=True)
     (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
-    (found / "entry_points.txt").write_text("[zenoh_car_fleet.drivers]\ntank = tests.support.tank\n")
-    root = Path(__file__).parents[2]
-    fleet.environment["PYTHONPATH"] = f"{found.parent}:{root}"
+    (found / "entry_points.txt").write_text(f"[zenoh_car_fleet.drivers]\ntank = {module}\n")
+    fleet.environment["PYTHONPATH"] = f"{found.parent}:{Path(__file__).parents[2]}"
+
+
+def test_failing_driver_leaves_no_moving_car(fleet: FleetProcesses, tmp_path: Path) -> None:
+    install_tank(fleet, tmp_path, "tests.support.failing_tank")
+    tank = TankServer()
+    try:
+        gateway = fleet.gateway(tank.url, platform="tank")
+        fleet.ready()
+        fleet.ask("drive", motion="forward", duration_s=10.0)
+        wait_for(lambda: tank.moves[-1:] == [[0.5, 0.5]], "it drives")
+        told: list[Any] = []
+        fleet.bus.subscribe("fleet/red/event/command", lambda sample: told.append(sample.message()))
+        fleet.ask_all("drive", car="red", motion="spin_left", duration_s=1.0, id="spin")
+        assert gateway.wait() == 1
+        assert tank.moves[-2:] == [[0, 0], [0, 0]], "a new driver has stopped it"
+        last = {each.id: (each.phase, each.reason) for each in told}
+        assert last["spin"] == (Phase.FAILED, Reason.LINK_DOWN), "not as if the car had been stopped"
+    finally:
+        tank.close()
+
+
+def test_a_car_of_another_package_is_named_driven_and_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
+    install_tank(fleet, tmp_path, "tests.support.tank")
     tank = TankServer()
     try:
         fleet.gateway(tank.url, platform="tank")
