@@ -1,0 +1,49 @@
+"""Notices a panic of a library in Rust, whose threads otherwise end one by one while the process looks alive.
+
+Rust writes the message of a panic to stderr, and has no other sign for Python. So stderr goes through a pipe here, and
+on to where it went before.
+"""
+
+import os
+import sys
+import threading
+from typing import Final, Self
+
+MESSAGE: Final = b"panicked at"
+"""Part of every such message (Rust's standard panic hook)."""
+_MAX_READ_BYTES: Final = 65_536
+
+
+class PanicWatch:
+    """Passes stderr on, and sets `panicked` once a panic was written to it. Use it as a context, in the main module."""
+
+    def __init__(self, descriptor: int = 2) -> None:
+        self._descriptor = descriptor
+        self.panicked = threading.Event()
+
+    def __enter__(self) -> Self:
+        sys.stderr.flush()
+        self._real = os.dup(self._descriptor)
+        reads, writes = os.pipe()
+        os.dup2(writes, self._descriptor)
+        os.close(writes)
+        self._reads = reads
+        self._thread = threading.Thread(target=self._pass_on, name="stderr", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.stderr.flush()
+        os.dup2(self._real, self._descriptor)  # the pipe has no other writer, so it ends
+        self._thread.join()
+        os.close(self._reads)
+        os.close(self._real)
+
+    def _pass_on(self) -> None:
+        rest = b""
+        while data := os.read(self._reads, _MAX_READ_BYTES):
+            rest = rest[-len(MESSAGE) :] + data
+            if MESSAGE in rest:
+                self.panicked.set()
+            while data:
+                data = data[os.write(self._real, data) :]
