@@ -322,6 +322,8 @@ class FrameOrigin(StrEnum):
     REPEAT = "repeat"
     STOP = "stop"
     RECOVERY = "recovery"
+    SETUP = "setup"
+    """What prepares a car, asks it, or keeps its link alive: no motion and no stop."""
     SHUTDOWN = "shutdown"
 
 

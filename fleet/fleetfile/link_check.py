@@ -149,4 +149,4 @@ def _check_host(host: str, port: int, *, bridge: bool) -> tuple[bool, str]:
         return False, f"{host}: {words}: switch the car on, join its network"
     if bridge:
         return True, "its bridge accepts connections"
-    return True, f"{host} is there; not connected to port {port}, which would end the car's program"
+    return True, f"{host} is there; port {port} was not tried, as some cars end with their first connection"

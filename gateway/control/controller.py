@@ -121,6 +121,8 @@ class Controller(Generic[D_co]):
             return f"its link: {model.link_reason}"
         if self.is_free(now):
             return ""
+        if words := self.driver.wait_words(now):
+            return words
         left_s = self._busy_s(now)
         what = "its first stop" if not model.known else "a stop"
         return f"{what}, for {left_s:.1f} s at most"
@@ -502,6 +504,8 @@ class Controller(Generic[D_co]):
             return ""
         if isinstance(command.what, SetMode):
             return f"opens in {wait_s:.1f} s at most: {self.car} is stopped first"
+        if words := self.driver.wait_words(now):
+            return f"begins after {words}"
         what = "a stop" if self.driver.is_stopping else "a command"
         return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"
 

@@ -398,6 +398,11 @@ class Driver(ABC):
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""
 
+    def wait_words(self, now: float) -> str:
+        """Return what must happen before the car may be driven, for a person; empty if it may."""
+        del now
+        return ""
+
     def mode_wait_s(self, busy_s: float, now: float) -> float:
         """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
         del now

@@ -25,6 +25,8 @@ BUILT_IN: Final = {
 }
 """Module of each family that comes with the gateway."""
 GROUP: Final = "zenoh_car_fleet.drivers"
+broken: Final[dict[str, str]] = {}
+"""The drivers of other packages that could not be imported, with the reason."""
 
 
 class Family(Protocol):
@@ -110,7 +112,8 @@ def _find(kind: str) -> tuple[str, Family]:
     found = next(((name, family) for name, family in _families() if kind in family.PLATFORMS), None)
     if found is None:
         hint = did_you_mean(kind, platforms()) or f"There are {', '.join(platforms())}."
-        raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
+        failed = "".join(f" The driver {name} is not there: {why}." for name, why in broken.items())
+        raise ValueError(f'Unknown platform "{kind[:40]}". {hint}{failed}')
     return found
 
 
@@ -130,4 +133,10 @@ def _installed() -> tuple[tuple[str, Family], ...]:
     # The metadata of all installed packages takes some 10 ms, and few cars need it.
     from importlib.metadata import entry_points
 
-    return tuple((each.name, cast("Family", each.load())) for each in entry_points(group=GROUP))
+    found = []
+    for each in entry_points(group=GROUP):
+        try:
+            found.append((each.name, cast("Family", each.load())))
+        except Exception as error:  # noqa: BLE001 - a mistake in one package must not keep the cars of others from running
+            broken[each.name] = f"{each.value} cannot be imported: {type(error).__name__}: {error}"
+    return tuple(found)

@@ -5,11 +5,13 @@ only from readings, an end. What is particular about a family it cannot know. Ex
 wrong use.
 """
 
+import contextlib
 import random
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, Final
 
 from gateway.control.commands import (
@@ -29,7 +31,7 @@ from gateway.control.commands import (
     Stop,
 )
 from gateway.control.controller import Controller
-from gateway.control.driver import Driver
+from gateway.control.driver import Driver, Event
 from gateway.control.events import CommandRecord
 from gateway.drivers import Family
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
@@ -61,6 +63,21 @@ ACTIONS: Final[tuple[Action, ...]] = (
     Find(),
     *(SetMode(mode) for mode in Mode),
 )
+STOP_ORIGINS: Final = (FrameOrigin.STOP, FrameOrigin.RECOVERY, FrameOrigin.SHUTDOWN)
+OPPOSITES: Final = (
+    (Motion.FORWARD, Motion.BACK),
+    (Motion.LEFT, Motion.RIGHT),
+    (Motion.SPIN_LEFT, Motion.SPIN_RIGHT),
+)
+PARTS: Final[Mapping[str, tuple[type[Action], ...]]] = {
+    "led": (Led,),
+    "light": (SetLight,),
+    "servo": (MoveServo,),
+    "servo_deg": (AimServo,),
+    "arm": (MoveArm,),
+    "fan": (Fan,),
+}
+"""Actions of a capability, one of which such a car must have frames for."""
 _NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
@@ -77,28 +94,38 @@ class Bench:
         self.faults: list[str] = []
         self._number = 0
         self._tick_at = 0.0
+        self._due_at = 0.0
+        """When a gateway would ask for a frame again if nothing happened before."""
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
         end = self.now + seconds
+        driver = self.control.driver
         while self.now < end:
             self.now += CHECK_STEP_S
-            if self.now >= self._tick_at:
+            said: list[Event] = []
+            if ticked := self.now >= self._tick_at:
                 self._tick_at = self.now + TICK_S
                 self.control.tick(self.now)
-                said = [event for each in self._samples for event in self.control.driver.feed(each, self.now)]
-                for event in said:
-                    self.control.driver.on_event(event, self.now)
-            for event in self.control.driver.flush(self.now):
-                self.control.driver.on_event(event, self.now)
-            self.write()
+                said = [event for each in self._samples for event in driver.feed(each, self.now)]
+            said += driver.flush(self.now)
+            for event in said:
+                driver.on_event(event, self.now)
+            # As `gateway.wake` does: events and ticks wake the writer only if it has work, or will have earlier.
+            is_early = (said or ticked) and (self.control.has_records or driver.next_at(self.now) < self._due_at)
+            if is_early or self.now >= self._due_at:
+                self.write()
 
     def write(self) -> None:
         """Write what is due."""
+        driver = self.control.driver
         for count in range(MAX_FRAMES_AT_ONCE + 1):
-            write = self.control.driver.poll(self.now)
+            named_at = driver.setup_at() if isinstance(driver, PlainDriver) else self.now
+            write = driver.poll(self.now)
             if write is None:
                 break
+            if write.why is FrameOrigin.SETUP and named_at > self.now:
+                self.faults.append("setup_frame has a frame before setup_at: a gateway would write it late or never")
             if not write.data:
                 self.faults.append(f"an empty frame ({write.why})")
             if count == MAX_FRAMES_AT_ONCE:
@@ -107,7 +134,8 @@ class Bench:
             self.control.driver.sends(write.data, self.now)
             self.control.driver.on_written(write, self.now)
             self.sent.append((self.now, write.data, write.why))
-        if self.control.driver.next_at(self.now) < self.now:
+        self._due_at = self.control.driver.next_at(self.now)
+        if self._due_at < self.now:
             self.faults.append("next_at lies before now")
         self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
 
@@ -118,6 +146,10 @@ class Bench:
         self.control.command(command, self.now)
         self.write()
         return command.id
+
+    def stop_frames(self, since: float = 0.0) -> list[float]:
+        """Return when frames of stops were written. What sets a car up, or asks it, is none."""
+        return [at for at, _, why in self.sent if at >= since and why in STOP_ORIGINS]
 
     def last(self, command_id: str) -> CommandRecord | None:
         """Return the last record of a command."""
@@ -174,8 +206,8 @@ def check_bytes(family: Family, platform: str) -> Iterator[str]:
 def check_connect(family: Family, platform: str) -> Iterator[str]:
     """Check that a car is stopped when its link opens, and that nothing is claimed that it has not shown."""
     bench = _connected(family, platform)
-    if not bench.sent:
-        yield "nothing was written within 30 s after the link was opened: the car may drive"
+    if not bench.stop_frames():
+        yield "no stop was written within 30 s after the link was opened: the car may drive"
     if bench.control.driver.model.basis is Basis.SHOWN:
         yield "a car that said nothing counts as one that has shown its stop"
     yield from dict.fromkeys(bench.faults)
@@ -186,6 +218,10 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
     driver = _connected(family, platform).control.driver
     if not isinstance(driver, PlainDriver):
         return  # its frames are its own; `check_drive` sees what it writes
+    if driver.STOP_FRAMES < 1:
+        yield f"STOP_FRAMES is {driver.STOP_FRAMES}: a stop has at least one frame"
+    if not hasattr(driver, "STOPS_WITHIN_S"):
+        yield "STOPS_WITHIN_S is missing: the time in which a car that got its stop has stopped"
     stops = {driver.stop_frame(index) for index in range(driver.STOP_FRAMES)} | {driver.motion_frame(Motion.STOP)}
     for speed in (SPEED_STEP, 0.5, 1.0):
         driver.model.speed = speed
@@ -199,11 +235,34 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
                 yield f"the frame of {motion}, or of a stop, is empty"
             if motion is not Motion.STOP and frame in stops:
                 yield f"the frame of {motion} at {speed:.0%} is one of the stop"
+    yield from _alike(driver)
+
+
+def _alike(driver: PlainDriver) -> Iterator[str]:
+    """Yield motions whose frames are the same, and should not be."""
+    frames: dict[tuple[float, Motion], bytes] = {}
+    for speed, motion in product((SPEED_STEP, 1.0), Motion):
+        driver.model.speed = speed
+        with contextlib.suppress(KeyError, ValueError, TypeError):
+            frames[speed, motion] = driver.motion_frame(motion)
+    for one, other in OPPOSITES:
+        if (1.0, one) in frames and frames[1.0, one] == frames.get((1.0, other)):
+            yield f"the frames of {one} and {other} are the same"
+    slow, fast = frames.get((SPEED_STEP, Motion.FORWARD)), frames.get((1.0, Motion.FORWARD))
+    if "speed" in driver.model.profile.capabilities and slow is not None and slow == fast:
+        yield "it has the capability speed, and motion_frame is the same at every self.model.speed"
 
 
 def check_samples(family: Family, platform: str) -> Iterator[str]:
-    """Check that what is measured has a topic and a field. `SAMPLES` of the module: bytes of a real car."""
+    """Check that what is measured has a topic and a field, by `SAMPLES` of the module: bytes of a real car.
+
+    Nothing may be measured in its `UNMEASURED`, such as acknowledgements and values that stand for none.
+    """
     driver = _connected(family, platform).control.driver
+    for sample in getattr(family, "UNMEASURED", ()):
+        for event in (*driver.feed(sample, 100.0), *driver.flush(110.0)):
+            for topic in driver.measured(event):
+                yield f"{topic} is measured in {sample!r}"
     for sample in getattr(family, "SAMPLES", ()):
         events = [*driver.feed(sample, 200.0), *driver.flush(210.0)]
         found = [each for event in events for each in driver.measured(event).items()]
@@ -230,7 +289,7 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
         announced_s = max((each.worst_case_s for each in bench.records if each.command.id == stop), default=0.0)
         # It may join a stop that goes on: then the frames of that one count.
         from_s, until_s = asked_at - JOINED_S, asked_at + max(FIRST_STOP_S, announced_s)
-        if not any(from_s <= at <= until_s for at, _, _ in bench.sent):
+        if not any(at <= until_s for at in bench.stop_frames(from_s)):
             yield f"no frame of a stop within {until_s - asked_at:g} s, {wait_s:g} s after the link was opened"
         last = bench.last(stop)
         if last is None or last.phase not in (Phase.SENT, Phase.FAILED):
@@ -250,16 +309,19 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
         yield "a drive waits for ever"
     moved = any(each.command.id == drive and each.phase is Phase.SENT for each in bench.records)
     if not moved:
+        if getattr(family, "SAMPLES", ()):
+            waits = bench.control.driver.wait_words(bench.now)
+            yield f"a drive never goes out while the car sends its SAMPLES{': it waits for ' if waits else ''}{waits}"
         return
     frames = bench.sent[before:]
     driven = (FrameOrigin.COMMAND, FrameOrigin.REPEAT)
     during = [at for at, _, why in frames if at <= began + lasts_s and why in driven]
-    ended = next((at for at, _, why in frames if why not in driven), began + lasts_s)
+    stopped = [at for at in bench.stop_frames() if at > began]
+    ended = min((at for at in stopped if during and at > during[0]), default=began + lasts_s)
     gaps = [b - a for a, b in pairwise((*during, min(ended, began + lasts_s)))]
     if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
         yield f"a held motion is not repeated within half of its dead-man of {dead_man_s:g} s"
-    stops = (FrameOrigin.STOP, FrameOrigin.RECOVERY)
-    if not any(why in stops for _, _, why in frames[1:]):
+    if during and not any(at > during[0] for at in stopped):
         yield "the end of a drive sends no stop"
     if bench.control.driver.model.motors is Motors.ON:
         yield "the motors count as on after the drive"
@@ -280,6 +342,15 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
             yield f"{what} is {'accepted' if refusal is None else 'refused'}, unlike its profile says"
 
 
+def check_capabilities(family: Family, platform: str) -> Iterator[str]:
+    """Check that what a profile says the car can do has frames."""
+    driver = _connected(family, platform).control.driver
+    for word, kinds in PARTS.items():
+        able = [what for what in ACTIONS if isinstance(what, kinds) and driver.refusal(what) is None]
+        if word in driver.model.profile.capabilities and not any(driver.frames(what) for what in able):
+            yield f"it has the capability {word}, and frames for none of its actions"
+
+
 def check_loss(family: Family, platform: str) -> Iterator[str]:
     """Check that a lost link ends what waits, and that a stop goes first when it is back."""
     bench = _connected(family, platform)
@@ -287,7 +358,7 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
     bench.run(0.1)
     bench.control.driver.link_down("unplugged", bench.now)
     bench.write()
-    before = len(bench.sent)
+    before, lost_at = len(bench.sent), bench.now
     bench.run(5.0)
     if len(bench.sent) > before:
         yield "frames are written without a link"
@@ -298,19 +369,19 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
         yield "the motors count as off without a link"
     bench.control.link_up(bench.now)
     bench.run(10.0)
-    if len(bench.sent) == before:
-        yield "nothing is written when the link is back"
+    if not [at for at in bench.stop_frames() if at > lost_at]:
+        yield "no stop is written when the link is back"
 
 
 def check_end(family: Family, platform: str) -> Iterator[str]:
     """Check that a gateway which ends stops its car, and ends in time."""
     bench = _connected(family, platform)
-    before = len(bench.sent)
+    ended_at = bench.now
     bench.control.driver.shut_down(bench.now)
     bench.run(SHUTDOWN_S + 1.0)
     if not bench.control.driver.finished:
         yield f"it has not ended {SHUTDOWN_S:g} s after it was told to"
-    if len(bench.sent) == before:
+    if not bench.stop_frames(ended_at):
         yield "it ends without a stop of a car that has shown nothing"
 
 
@@ -323,6 +394,7 @@ CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
     check_stop,
     check_drive,
     check_actions,
+    check_capabilities,
     check_loss,
     check_end,
 )
@@ -332,7 +404,16 @@ def check(family: Family) -> Iterator[tuple[str, str, list[str]]]:
     """Yield platform, check and faults, for each check of each platform."""
     for platform in family.PLATFORMS:
         for each in CHECKS:
-            yield platform, each.__name__, list(each(family, platform))
+            yield platform, each.__name__, list(_caught(each(family, platform)))
+
+
+def _caught(faults: Iterator[str]) -> Iterator[str]:
+    """Yield the faults, and an exception of the driver as one more."""
+    try:
+        yield from faults
+    except Exception as error:  # noqa: BLE001 - it is what the driver's author asked for
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        yield f"raises {type(error).__name__}: {error} ({last.filename}:{last.lineno}, in {last.name})"
 
 
 def main(arguments: list[str]) -> int:
@@ -345,8 +426,8 @@ def main(arguments: list[str]) -> int:
         try:
             family: Any = import_module(name)
             missing = [each for each in _NAMES if not hasattr(family, each)]
-        except ImportError as error:
-            sys.stderr.write(f"gateway.drivers.check: {name} cannot be imported: {error}\n")
+        except Exception as error:  # noqa: BLE001 - a module may raise anything
+            sys.stderr.write(f"gateway.drivers.check: {name} cannot be imported: {type(error).__name__}: {error}\n")
             return 2
         if missing:
             sys.stderr.write(

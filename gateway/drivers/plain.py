@@ -286,11 +286,6 @@ class PlainDriver(Driver):
         """Return False while the car cannot take frames, as in a boot: then no stop ends as `sent`."""
         return True
 
-    def wait_words(self, now: float) -> str:
-        """Return what must happen before the car may be driven, for a person; empty if it may."""
-        del now
-        return ""
-
     def setup_frame(self, now: float) -> bytes | None:
         """Return the next frame that prepares the car, asks it, or keeps its link alive, if one is due."""
         del now
@@ -409,7 +404,7 @@ class PlainDriver(Driver):
             if write is not None or self._stop is stop:
                 return write
         if (data := self.setup_frame(now)) is not None:
-            return self._write(data, FrameOrigin.RECOVERY, None)
+            return self._write(data, FrameOrigin.SETUP, None)
         return None if self.wait_words(now) else self._next_command(now)
 
     def _next_of_stop(self, stop: PlainStop, now: float) -> OutgoingFrame | None:
@@ -438,7 +433,7 @@ class PlainDriver(Driver):
             stop.index = 0
             return self._write(self.stop_frame(0), stop.why, stop)
         data = self.setup_frame(now)
-        return None if data is None else self._write(data, FrameOrigin.RECOVERY, None)
+        return None if data is None else self._write(data, FrameOrigin.SETUP, None)
 
     def _next_command(self, now: float) -> OutgoingFrame | None:
         model, held = self._model, self.queue.held

@@ -1,12 +1,6 @@
-"""A stock Zenoh router in the place of our hub, with the configuration of `fleet hub config`: the same rules hold.
+"""A stock Zenoh router in the place of our hub, with the configuration of `fleet hub config`: the same rules hold."""
 
-It is built from crates.io, in the version of the wheel, which takes ten minutes of a processor the first time.
-"""
-
-import shutil
-import subprocess
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -16,22 +10,7 @@ from tests.e2e import test_secure_bus
 from tests.e2e.test_secure_bus import ANN, BLUE, EVE, MIA, RED, SecureStage
 from tests.support.secure import secure_fleet
 
-CACHE = Path(__file__).parents[2] / ".cache"
 IDENTITIES = (ANN, MIA, EVE, RED, BLUE, *map(service, Service))
-
-
-@pytest.fixture(scope="module")
-def zenohd() -> Path:
-    """Return the router. Build it if it is not there."""
-    number = version("eclipse-zenoh")
-    place = CACHE / f"zenohd-{number}"
-    program = place / "bin/zenohd"
-    if not program.exists():
-        cargo = shutil.which("cargo")
-        assert cargo, "this soak builds zenohd with cargo, of Rust"
-        install = ["nice", cargo, "install", "zenohd", "--version", number, "--locked", "--debug", "--root", str(place)]
-        subprocess.run(install, check=True)
-    return program
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ HUB, PI, OPERATOR = "fleet-hub", "fleet-pi", "fleet-operator"
 WIRE = "fleet-wire"
 """Where the links lose and delay."""
 SUBNETS = {PI: "10.77.1", OPERATOR: "10.77.2"}
-_EXEC = "import os, sys; os.execvp('ip', ['ip', 'netns', 'exec', sys.argv[1], sys.executable, *sys.argv[2:]])"
+_EXEC = "import os, sys; os.execvp('ip', ['ip', 'netns', 'exec', *sys.argv[1:]])"
 
 
 _WITHOUT_OFFLOADS = "import sys; from tests.support.bad_link import without_offloads; without_offloads(sys.argv[1])"
@@ -41,6 +42,8 @@ class Machines:
     def __init__(self, directory: Path, loss: float = 0.0, delay_s: float = 0.0) -> None:
         self.directory = directory
         self._started: list[GatewayProcess] = []
+        self._zenohd: list[str] = []
+        """Command of the stock router in the place of our hub; empty for ours."""
         for name in (HUB, PI, OPERATOR, WIRE):
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
             _ip("netns", "add", name)
@@ -60,6 +63,10 @@ class Machines:
 
     def start(self, machine: str, *arguments: str, **environment: str) -> GatewayProcess:
         """Start Python with these arguments on a machine."""
+        return self.start_program(machine, sys.executable, *arguments, **environment)
+
+    def start_program(self, machine: str, *arguments: str, **environment: str) -> GatewayProcess:
+        """Start any program with its arguments on a machine."""
         own = {"FLEET_STATE_DIR": str(self.directory / machine), "FLEET_ENDPOINT": "", **environment}
         log = self.directory / f"{len(self._started)}.log"
         self._started.append(GatewayProcess(["-c", _EXEC, machine, *arguments], log, own))
@@ -116,13 +123,34 @@ class Machines:
             print(session, *lines, words)
             assert code == 0, (session, lines, words)
 
+    def replace_hub(self, zenohd: Path) -> None:
+        """Put a stock router in the place of our hub, with the same certificates and rules."""
+        code, lines, words = self.run(HUB, "hub", "config")
+        assert code == 0, words
+        config = self.directory / "zenohd.json5"
+        config.write_text("\n".join(lines))
+        self._zenohd = [str(zenohd), "--config", str(config)]
+        self._kill(*self._hubs())
+        self.start_program(HUB, *self._zenohd)
+        wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the router is up")
+
     def kill_hub(self) -> None:
-        """Kill the hub, whoever has started it."""
-        listed = subprocess.run(["ip", "netns", "pids", HUB], capture_output=True, text=True, check=True).stdout.split()
-        hubs = [pid for pid in listed if "schemas.bus.hub" in " ".join(psutil.Process(int(pid)).cmdline())]
+        """Kill the hub, whoever has started it. A stock router is started again, as its service manager does."""
+        hubs = self._hubs()
         assert hubs, "there is a hub"
-        for pid in hubs:
-            os.kill(int(pid), signal.SIGKILL)
+        self._kill(*hubs)
+        if self._zenohd:
+            self.start_program(HUB, *self._zenohd)
+
+    def _hubs(self) -> list[int]:
+        listed = subprocess.run(["ip", "netns", "pids", HUB], capture_output=True, text=True, check=True).stdout.split()
+        words = {int(pid): psutil.Process(int(pid)).cmdline() for pid in listed}
+        return [pid for pid, each in words.items() if "schemas.bus.hub" in each or each[:1] == self._zenohd[:1] != []]
+
+    @staticmethod
+    def _kill(*pids: int) -> None:
+        for pid in pids:
+            os.kill(pid, signal.SIGKILL)
 
     def cut(self, machine: str) -> None:
         """Cut the link of a machine: no byte and no sign of its end goes through."""

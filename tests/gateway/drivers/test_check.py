@@ -1,6 +1,9 @@
 """Each family passes the checks that a gateway relies on, and a careless driver does not."""
 
+import re
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -86,9 +89,93 @@ class OnlySays(tank.TankDriver):
         self.model.profile = replace(tank.PROFILE, dead_man_s=5.0)
 
 
+class Beats(tank.TankDriver):
+    """Keeps its link alive, twice a second."""
+
+    beat_at = 0.0
+
+    def setup_at(self) -> float:
+        return self.beat_at
+
+    def setup_frame(self, now: float) -> bytes | None:
+        if now < self.beat_at:
+            return None
+        self.beat_at = now + 0.5
+        return b'{"beat":1}\n'
+
+
+class BeatsOnly(Beats):
+    """Says a dead-man, does not repeat its motions, and beats."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__(desk)
+        self.model.profile = replace(tank.PROFILE, dead_man_s=5.0)
+
+
+class BeatsAsleep(Beats):
+    """Asks for its beats, and does not say when they are due."""
+
+    def setup_at(self) -> float:
+        return float("inf")
+
+
+class Never(Beats):
+    """Has no frame of a stop."""
+
+    STOP_FRAMES = 0
+
+
+class OneSpeed(tank.TankDriver):
+    """Drives at one speed."""
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        speed, self.model.speed = self.model.speed, 1.0
+        frame = super().motion_frame(motion)
+        self.model.speed = speed
+        return frame
+
+
+class Turned(tank.TankDriver):
+    """Drives ahead to go back."""
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        return super().motion_frame(Motion.FORWARD if motion is Motion.BACK else motion)
+
+
+class Promises(tank.TankDriver):
+    """Says that it has lights."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__(desk)
+        self.model.profile = replace(tank.PROFILE, capabilities=tank.PROFILE.capabilities | {"light"})
+
+
+class Waits(tank.TankDriver):
+    """Is never ready."""
+
+    def wait_words(self, now: float) -> str:
+        return "the moon"
+
+
+class Fails(tank.TankDriver):
+    """Raises."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        raise ZeroDivisionError
+
+
 @pytest.mark.parametrize(
     ("driver", "fails"),
     [
+        (Beats, set()),
+        (BeatsOnly, {"check_drive"}),
+        (BeatsAsleep, {"check_connect", "check_drive"}),
+        (Never, {"check_connect", "check_motions", "check_stop", "check_drive", "check_loss", "check_end"}),
+        (OneSpeed, {"check_motions"}),
+        (Turned, {"check_motions"}),
+        (Promises, {"check_capabilities"}),
+        (Waits, {"check_drive"}),
+        (Fails, {"check_bytes", "check_samples"}),
         (Talks, {"check_connect", "check_stop", "check_end"}),
         (Mute, {"check_connect", "check_stop", "check_loss", "check_end", "check_bytes", "check_drive"}),
         (Splits, {"check_bytes", "check_samples"}),
@@ -102,19 +189,15 @@ def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
     family = SimpleNamespace(
         PLATFORMS=("tank",),
         SAMPLES=tank.SAMPLES,
-        profile_of=lambda name: replace(tank.profile_of(name), dead_man_s=5.0 if driver is OnlySays else None),
+        profile_of=lambda name: replace(
+            tank.profile_of(name), dead_man_s=5.0 if driver in (OnlySays, BeatsOnly) else None
+        ),
         profiles=tank.profiles,
         driver_of=lambda name, kept: driver,
     )
-    found = set()
-    for each in check.CHECKS:
-        try:
-            if list(each(cast("Family", family), "tank")):
-                found.add(each.__name__)
-        except ValueError:  # a driver that writes nothing has no bytes to try
-            found.add(each.__name__)
-    assert found & fails
-    assert found <= fails
+    found = {name: faults for _, name, faults in check.check(cast("Family", family)) if faults}
+    assert bool(found) is bool(fails)
+    assert found.keys() <= fails, found
 
 
 def test_a_driver_that_floods_is_found() -> None:
@@ -122,6 +205,22 @@ def test_a_driver_that_floods_is_found() -> None:
     bench.control.link_up(bench.now)
     bench.run(1.0)
     assert any("frames at one moment" in each for each in bench.faults)
+
+
+def test_what_must_not_be_measured_is_found() -> None:
+    family = SimpleNamespace(**vars(tank), UNMEASURED=(b'{"v":0,"dist_cm":999}\n', b'{"v":7.9,"dist_cm":0}\n'))
+    found = list(check.check_samples(cast("Family", family), "tank"))
+    assert len(found) == 1
+    assert "sensor/battery" in found[0]
+
+
+def test_bench_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[3] / "docs/how-to/write-a-driver.md").read_text()
+    (block,) = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Bench(" in each]
+    monkeypatch.setitem(sys.modules, "my_tank", tank)
+    scope: dict[str, Any] = {}
+    exec(block, scope)
+    assert any(b'"move": [0.5, 0.5]' in data for _, data, _ in scope["bench"].sent)
 
 
 def test_the_command_names_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,8 @@
 """A platform finds its family: ours by a table, others by the entry point of their package."""
 
+import contextlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,18 +36,33 @@ def test_names_are_read_in_any_case() -> None:
     assert [each.name for each in drivers.profiles_of("auto+arm")] == ["arduino+arm", "stm32+arm", "raspberry_pi+arm"]
 
 
-def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@contextlib.contextmanager
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str) -> Iterator[None]:
+    """Install a package with the driver of a tank."""
     found = tmp_path / "tank_driver-1.0.dist-info"
     found.mkdir()
     (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
-    (found / "entry_points.txt").write_text("[zenoh_car_fleet.drivers]\ntank = tests.support.tank\n")
+    (found / "entry_points.txt").write_text(f"[zenoh_car_fleet.drivers]\ntank = {module}\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     drivers._installed.cache_clear()
     drivers._find.cache_clear()
     try:
-        assert "tank" in drivers.platforms()
-        assert drivers.check_platform("tank") == "tank"
-        assert drivers.profile_of("tank").measurable(Mode.MANUAL) == {"battery", "range"}
+        yield
     finally:
         drivers._installed.cache_clear()
         drivers._find.cache_clear()
+        drivers.broken.clear()
+
+
+def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with installed(tmp_path, monkeypatch, "tests.support.tank"):
+        assert "tank" in drivers.platforms()
+        assert drivers.check_platform("tank") == "tank"
+        assert drivers.profile_of("tank").measurable(Mode.MANUAL) == {"battery", "range"}
+
+
+def test_package_that_fails_is_named_and_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with installed(tmp_path, monkeypatch, "no_such_package.driver"):
+        assert drivers.profile_of("ugv02").name == "ugv02"
+        with pytest.raises(ValueError, match=r"Unknown platform .*tank.* no_such_package"):
+            drivers.profile_of("tank")

@@ -235,7 +235,7 @@ def test_errors_of_servos_keep_no_car_from_its_setup() -> None:
     for _ in range(40):
         episode.car._print(b'{"T":1005,"id":2,"status":0}\r\n')
         episode.run(0.1)
-    assert episode.control.driver.wait_words(episode.now) == ""  # type: ignore[attr-defined]  # of this family
+    assert episode.control.driver.wait_words(episode.now) == ""
 
 
 def test_estop_during_boot_is_repeated_and_not_counted() -> None:
