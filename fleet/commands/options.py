@@ -14,7 +14,7 @@ from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
 from fleet.client.lost_hub import describe_running, explained
 from fleet.client.outcome import NO_ANSWER, Outcome
-from fleet.client.refused import why_refused
+from fleet.client.refused_by_hub import why_refused
 from fleet.commands.fleets import open_client
 from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.params import Number, complete_people, describe_other_fleets, no_cars, resolve_cars

@@ -14,7 +14,7 @@ from click.shell_completion import CompletionItem
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.lost_hub import describe_running
-from fleet.client.refused import why_refused
+from fleet.client.refused_by_hub import why_refused
 from fleet.client.supervision import ask_status, fleets_on, groups_of
 from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
 from fleet.recording.time_spec import ago_s

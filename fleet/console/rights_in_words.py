@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from fleet.policy.denials import describe, fleet_refusal
+from fleet.policy.denial_words import describe, fleet_refusal
 from schemas.keys import person_of
 from schemas.rights import Authority, People, Right, Sender
 from schemas.words import Rank

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from fleet.hub.certificate_authority import BadRequestForCertificate
 from fleet.hub.hub_store import HubStore
 from schemas.bus import BusError
+from schemas.bus.certificate_request import CERTIFICATE, REQUEST
 from schemas.bus.hub_renewals import MAX_RENEWAL_BYTES
-from schemas.bus.renewal import CERTIFICATE, REQUEST
 
 
 def main() -> int:

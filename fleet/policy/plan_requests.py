@@ -4,7 +4,7 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import Final
 
-from fleet.policy.denials import fleet_refusal
+from fleet.policy.denial_words import fleet_refusal
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState

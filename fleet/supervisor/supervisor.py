@@ -20,7 +20,7 @@ from typing import Any, Final
 from fleet.client.hints import complete_hints, fleet_options
 from fleet.client.services import why_unrecorded
 from fleet.fleetfile.fleet_file import people_table
-from fleet.policy.denials import fleet_refusal
+from fleet.policy.denial_words import fleet_refusal
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus, StartProgress, describe_old_stops, describe_start
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy

@@ -99,10 +99,10 @@ def renew_file(
     identity: empty: as the certificate names it. file: of the certificate. ask: asks the hub for an identity.
     """
     try:
-        from schemas.bus import renewal  # cryptography takes a while to load
+        from schemas.bus import certificate_request  # cryptography takes a while to load
 
-        name = identity or renewal.identity_in(credentials.directory / f"{file}.pem")
-        return renewal.renew(credentials, name, file, now, lambda request: ask(name, request))
+        name = identity or certificate_request.identity_in(credentials.directory / f"{file}.pem")
+        return certificate_request.renew(credentials, name, file, now, lambda request: ask(name, request))
     except ImportError:
         return "the package cryptography is missing here: pip install 'zenoh-car-fleet[secure]'"
     except (OSError, ValueError) as error:

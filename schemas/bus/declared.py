@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from time import monotonic
 from typing import Any, Self
 
 import zenoh
@@ -83,10 +84,10 @@ class SampleChannel(Declared):
             is_over = self._older_is_over
             with suppress(zenoh.ZError):  # it is undeclared, and empty
                 while (sample := older()) is not None:
-                    if not overlap.is_twin(mark_of_sample(self._declaration, sample), newer=False):
+                    if not overlap.is_twin(mark_of_sample(self._declaration, sample), monotonic(), newer=False):
                         return sample
             while (sample := newer()) is not None:
-                if not overlap.is_twin(mark_of_sample(self._declaration, sample), newer=True):
+                if not overlap.is_twin(mark_of_sample(self._declaration, sample), monotonic(), newer=True):
                     return sample
             if is_over:
                 self.try_recv = newer

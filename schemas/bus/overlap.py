@@ -2,37 +2,50 @@
 
 A bus opens its second session before it closes the first one (`Bus.reopen`). Meanwhile the hub sends every message and
 every query to both, over two links: either may be first. So each is counted by what it is: on one side, a message is a
-twin if the other side has had one more of it. Equal queries of two clients are not mixed up that way.
+twin if the other side has had one more of it a moment ago. Equal queries of two clients are not mixed up that way.
+
+A query that came over the first session just before the hub knew the second one has no twin. It is forgotten after
+`TWIN_S`: else the next equal query, such as the same stop once more, would be taken for its twin and dropped. No two
+messages are equal, as they have a time.
 """
 
 import threading
-from collections import Counter
+from collections import deque
 from collections.abc import Hashable
+from math import inf
+from typing import Final
 
 import zenoh
 
+TWIN_S: Final = 0.3
+"""Maximum time between the two copies of a query, which the hub sends at once over two links to one computer."""
+
 
 class Overlap:
-    """What has come over one of two sessions only."""
+    """What has come over one of two sessions only, and when. Times: s, monotonic."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._once: tuple[Counter[Hashable], Counter[Hashable]] = Counter(), Counter()
+        self._once: tuple[dict[Hashable, deque[float]], dict[Hashable, deque[float]]] = {}, {}
         self.older_is_deaf = False
         """True once everything comes over the newer session: nothing counts over the older one then."""
 
-    def is_twin(self, what: Hashable, *, newer: bool) -> bool:
-        """Return True if the same has come over the other session. newer: over which session it came."""
+    def is_twin(self, what: Hashable, now: float, *, newer: bool, within_s: float = inf) -> bool:
+        """Return True if the same has come over the other session within this time. newer: over which one this came."""
         with self._lock:
             if self.older_is_deaf and not newer:
                 return True
             own, other = self._once[newer], self._once[not newer]
-            if other[what] > 0:
-                other[what] -= 1
+            came = other.pop(what, deque())
+            while came and came[0] < now - within_s:
+                came.popleft()
+            if came:
+                came.popleft()
+                if came:
+                    other[what] = came
                 return True
-            del other[what]
             if not self.older_is_deaf:
-                own[what] += 1
+                own.setdefault(what, deque()).append(now)
             return False
 
 

@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
+from math import inf
+from time import monotonic
 from typing import Any, Final, Self
 
 import zenoh
@@ -17,7 +19,7 @@ from schemas.bus.credentials import Credentials
 from schemas.bus.declared import Declare, Declared, SampleChannel
 from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_secure, resolve_endpoint
 from schemas.bus.errors import BusError, NoFleet
-from schemas.bus.overlap import Overlap, mark_of_query, mark_of_sample
+from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, unread
@@ -194,12 +196,12 @@ class Bus:
             if errors:
                 raise errors[0]
 
-    def _is_twin(self, number: int, mark: Callable[[], Hashable]) -> bool:
+    def _is_twin(self, number: int, mark: Callable[[], Hashable], within_s: float = inf) -> bool:
         """Return True if this came over another session, too, and was handled. number: of the session it came over."""
         overlap, is_newest = self._overlap, number == self._number
         if overlap is None:
             return not is_newest
-        return overlap.is_twin(mark(), newer=is_newest)
+        return overlap.is_twin(mark(), monotonic(), newer=is_newest, within_s=within_s)
 
     def reopen(self, overlap_s: float = OVERLAP_S, answers_s: float = ANSWERS_S) -> None:
         """Go on in a second session, which has the certificate that is in the file now, and close the first one.
@@ -325,7 +327,7 @@ class Bus:
         def declare(session: zenoh.Session, number: int) -> Any:
             def on_query(query: zenoh.Query) -> None:
                 words = unread(query)
-                if self._is_twin(number, lambda: mark_of_query(declaration, query)):
+                if self._is_twin(number, lambda: mark_of_query(declaration, query), TWIN_S):
                     with query:  # the other one is answered
                         return
                 if words and too_large is None:

@@ -15,7 +15,7 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
 from schemas.bus import Bus, Sample
-from schemas.bus.renewal import renew
+from schemas.bus.certificate_request import renew
 from schemas.identity import car, person
 from schemas.words import Rank
 from tests.support.processes import FleetProcesses, driving, wait_for

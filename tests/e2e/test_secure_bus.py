@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from fleet.client.client import Fleet as Client
-from fleet.client.refused import why_refused
+from fleet.client.refused_by_hub import why_refused
 from fleet.hub import certificate_authority
 from fleet.hub.hub_store import HubStore
 from fleet.hub.x509_parts import LIFETIME

@@ -13,7 +13,7 @@ import zenoh
 
 from schemas import topics
 from schemas.bus import Bus, BusError, Sample, SampleChannel, accepts, messages_of, sample_of
-from schemas.bus.overlap import Overlap
+from schemas.bus.overlap import TWIN_S, Overlap
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
 from tests.support import processes
@@ -184,15 +184,24 @@ def test_without_a_hub_the_first_session_goes_on(
 
 def test_a_twin_is_counted_and_the_older_session_is_deaf_in_the_end() -> None:
     found = Overlap()
-    assert [found.is_twin("a", newer=side) for side in (False, False, True, True, True)] == [
+    assert [found.is_twin("a", 1.0, newer=side) for side in (False, False, True, True, True)] == [
         False,
         False,
         True,
         True,
         False,
     ]
-    assert not found.is_twin("b", newer=False)
+    assert not found.is_twin("b", 1.0, newer=False)
     found.older_is_deaf = True
-    assert found.is_twin("b", newer=True), "it came before"
-    assert found.is_twin("c", newer=False)
-    assert not found.is_twin("c", newer=True)
+    assert found.is_twin("b", 9.0, newer=True), "it came before"
+    assert found.is_twin("c", 9.0, newer=False)
+    assert not found.is_twin("c", 9.0, newer=True)
+
+
+def test_equal_query_later_is_no_twin() -> None:
+    found = Overlap()
+    for _ in range(2):  # before the hub knew the second session
+        assert not found.is_twin("stop", 1.0, newer=False, within_s=TWIN_S)
+    found.older_is_deaf = True
+    assert found.is_twin("stop", 1.0 + TWIN_S, newer=True, within_s=TWIN_S)
+    assert not found.is_twin("stop", 1.01 + TWIN_S, newer=True, within_s=TWIN_S)
