@@ -24,6 +24,7 @@ BENCHMARKS = {
     "sessions": "sessions",
     "questions": "questions",
     "fleet": "fleet",
+    "router": "routing",
     "plan": "planning",
     "cli": "command_line",
     "secure": "securing",

@@ -30,7 +30,7 @@ UP_S = 60.0
 """Maximum time until a hundred cars are at rest, on two processors (issue 10)."""
 
 
-def _cpu_s(pids: list[int]) -> float:
+def cpu_s(pids: list[int]) -> float:
     """Return the CPU time of these processes, by the scheduler's own count."""
     total = 0
     for pid in pids:
@@ -48,7 +48,7 @@ def _pss_mb(pid: int) -> float:
     return 0.0
 
 
-class _Fleet:
+class SimulatedFleet:
     """A fleet of this size, up and at rest."""
 
     def __init__(self, up: Up, size: int, scale: Scale) -> None:
@@ -74,9 +74,9 @@ class _Fleet:
     def cpu(self) -> float:
         """Return the CPU time of one gateway, percent of a core."""
         pids = self.pids()
-        before, began = _cpu_s(pids), perf_counter()
+        before, began = cpu_s(pids), perf_counter()
         time.sleep(self.scale.seconds(WINDOW_S, 1.2))  # a report comes once a second
-        return (_cpu_s(pids) - before) / (perf_counter() - began) / self.size * 100
+        return (cpu_s(pids) - before) / (perf_counter() - began) / self.size * 100
 
     def pss(self) -> float:
         """Return the memory of one gateway, MB."""
@@ -126,7 +126,7 @@ def run(scale: Scale) -> list[Measured]:
     goals = scale.count(GOALS)
     for size in sizes:
         with scratch() as directory, Up(directory, free_endpoint(), "--sim", str(size), "--no-record") as up:
-            fleet = _Fleet(up, size, scale)
+            fleet = SimulatedFleet(up, size, scale)
             idle[size] = fleet.cpu(), fleet.pss()
             first = idle[sizes[0]]
             found += [
@@ -139,7 +139,7 @@ def run(scale: Scale) -> list[Measured]:
     return found
 
 
-def _goals(fleet: _Fleet) -> list[Measured]:
+def _goals(fleet: SimulatedFleet) -> list[Measured]:
     found = []
     with Fleet(fleet.up.endpoint) as client:
         assert len(client.cars()) == fleet.size
