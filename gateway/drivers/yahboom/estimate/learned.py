@@ -17,7 +17,7 @@ learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, Final
@@ -74,16 +74,13 @@ class Rhythm:
     intervals: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_INTERVALS))
     _others: deque[float] = field(default_factory=lambda: deque(maxlen=CHANGED_INTERVALS))
     """The last consecutive intervals that do not fit."""
+    median_s: float = 0.0
+    """The median; 0 if no interval is known. It is asked for at every report and tick, and changes with an interval."""
 
     @property
     def is_known(self) -> bool:
         """Return True if there is an interval."""
         return bool(self.intervals)
-
-    @property
-    def median_s(self) -> float:
-        """Return the median; 0 if no interval is known."""
-        return median(self.intervals) if self.intervals else 0.0
 
     @property
     def spread_s(self) -> float:
@@ -117,7 +114,7 @@ class Rhythm:
     def add(self, interval_s: float) -> bool:
         """Add an undisturbed interval. Return True if it completes another rhythm, which replaces this one."""
         if not self.intervals or self.fits(interval_s):
-            self.intervals.append(interval_s)
+            self.restore((interval_s,))
             self._others.clear()
             return False
         self._others.append(interval_s)
@@ -127,9 +124,14 @@ class Rhythm:
         if len(latest) < needed or max(latest) - min(latest) > SAME_S:
             return False
         self.intervals.clear()
-        self.intervals.extend(latest)
+        self.restore(latest)
         self._others.clear()
         return not first
+
+    def restore(self, intervals: Iterable[float]) -> None:
+        """Add intervals that belong to this rhythm."""
+        self.intervals.extend(intervals)
+        self.median_s = median(self.intervals) if self.intervals else 0.0
 
     def is_multiple(self, delay_s: float, tolerance_s: float) -> bool:
         """Return True if a delay is a whole number of intervals, as if the link had lost that many reports."""
@@ -294,7 +296,7 @@ class Learned:
             intervals = [float(each) for each in kept[name]]
             if not all(0.0 < each <= MAX_LEARNED_S for each in intervals):  # also refuses NaN
                 raise ValueError(f"{name}: {intervals}")
-            rhythm.intervals.extend(intervals)
+            rhythm.restore(intervals)
         learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
         if not all(0.0 < each <= MAX_LEARNED_S for each in learned._blocks.values()):
             raise ValueError(f"blocks_s: {learned._blocks}")

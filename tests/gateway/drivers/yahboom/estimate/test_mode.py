@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.estimate.learned import Learned, Rhythm
 from gateway.drivers.yahboom.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator
 from gateway.drivers.yahboom.protocol.decoder import MISSING_END_SILENCE_S, Decoder
 from gateway.drivers.yahboom.protocol.modes import only_candidate
@@ -207,7 +207,7 @@ def test_silence_in_never_reported_mode_shows_nothing(mode: Mode) -> None:
 @pytest.mark.parametrize(("interval_s", "limit_s"), [(0.3, 3.0), (1.25, 3.0), (1.5, 3.25), (3.0, 4.75)])
 def test_silence_that_contradicts_mode_0_is_learned(interval_s: float, limit_s: float) -> None:
     truth = estimator()
-    truth.learned.echo.intervals.clear()
+    truth.learned.echo = Rhythm()
     truth.learned.add_interval(interval_s, echo=True)
     assert truth.manual_silence_s == pytest.approx(limit_s)
 
