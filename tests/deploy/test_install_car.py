@@ -19,6 +19,8 @@ CAR_IMPORTS: Final = {
     "ifaddr",
     "protobuf",
     "pyserial",
+    "segno",
+    "zeroconf",
 }
 
 
@@ -67,6 +69,7 @@ def test_what_a_car_needs_is_as_the_package_says() -> None:
     text = SCRIPT.read_text(encoding="ascii")
     wanted = by_name([each for words in re.findall(r"^needs='(.*)'$", text, re.MULTILINE) for each in words.split()])
     assert set(wanted) == CAR_IMPORTS
+    assert by_name(extras["secure"]).keys() <= set(wanted), "`fleet join` imports them"
     wanted |= by_name(re.findall(r"^needs_ble='(.*)'$", text, re.MULTILINE))
     assert len(wanted) == len(CAR_IMPORTS) + 1
     assert wanted == {name: said[name] for name in wanted}
