@@ -61,7 +61,7 @@ class LinkUrl(ABC):
     forms: ClassVar[tuple[str, ...]]
     """How it is written, for the help."""
     options: ClassVar[str] = ""
-    """What may follow the forms, for the help."""
+    """What may follow its URL, for the help."""
     module: ClassVar[str] = ""
     """The module that it needs beside the installation, if any; `extra` has it, `needs` is its name for people."""
     extra: ClassVar[str] = ""
@@ -264,7 +264,7 @@ class BleUrl(LinkUrl):
     scheme = "ble"
     same_car = MappingProxyType({"adapter": None})
     forms = ("ble://ADDRESS or ble://name=BT04",)
-    options = ", both also with ?adapter=hci1 or auto"
+    options = "?adapter=hci1 or auto"
     module, extra, needs = "bleak", "ble", "Bluetooth"
 
     @classmethod
@@ -293,7 +293,7 @@ KINDS: Final[tuple[type[LinkUrl], ...]] = (SerialUrl, UsbUrl, TcpUrl, BleUrl)
 _BY_SCHEME: Final = {kind.scheme: kind for kind in KINDS}
 LINK_HELP: Final = ", ".join(form for kind in KINDS for form in kind.forms)
 """How links are written, for the help of a command."""
-LINK_HELP_OPTIONS: Final = "".join(kind.options for kind in KINDS)
+LINK_HELP_OPTIONS: Final = "".join(f"; {kind.scheme}:// also with {kind.options}" for kind in KINDS if kind.options)
 """What may follow some of them."""
 
 

@@ -60,6 +60,18 @@ MODE_TEXTS: Final = {
 """Each mode for a person: its name, and what the car does in it."""
 
 
+MODE_COLORS: Final = {
+    Mode.MANUAL: 0x5C7FA3,
+    Mode.REMOTE_CONTROL: 0xA0522D,
+    Mode.TRACKING: 0x8E6BBF,
+    Mode.OBSTACLE_AVOIDANCE: 0xD08A3C,
+    Mode.COLOR_LED: 0xC0689F,
+    Mode.LIGHT_SEEKING: 0xC9B037,
+    Mode.FOLLOWING: 0x3C9D9B,
+}
+"""The color of each mode on a time line, 0xRRGGBB."""
+
+
 class Light(StrEnum):
     """A color of the light."""
 

@@ -334,7 +334,9 @@ def written_out(keyexpr: str, fleet: str) -> str:
 
 def no_cars(client: Fleet) -> click.ClickException:
     """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
-    words = describe_other_fleets(client) or why_refused(client) or "No car is connected."
+    if others := describe_other_fleets(client):
+        return click.ClickException(others)
+    words = why_refused(client) or "No car is connected."
     if running := describe_running(client.bus.endpoint):  # on their way back to a hub that was restarted
         words = f"No car is connected, but {running}. Repeat this in some seconds. Else go to the cars."
     return click.ClickException(words)

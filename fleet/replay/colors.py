@@ -6,10 +6,10 @@ from typing import Final
 from schemas.colors import Rgb
 from schemas.commands import COMMANDS
 from schemas.words import (
+    MODE_COLORS,
     UNKNOWN,
     BatteryLevel,
     LinkState,
-    Mode,
     Motion,
     Motors,
     Phase,
@@ -26,9 +26,7 @@ STATE_COLORS: Final[Mapping[str, int]] = {
     "true": 0x4FB477FF, "false": 0x30343BFF,
     LinkState.ONLINE: 0x4FB477FF, LinkState.QUIET: 0x5C7FA3FF, LinkState.STALE: 0xE0A030FF, LinkState.LOST: 0xD9534FFF,
     Verdict.CONFIRMED: 0x4FB477FF, Verdict.ASSUMED: 0x8A8F98FF, Verdict.CONTRADICTED: 0xD9534FFF, UNKNOWN: 0x555A63FF,
-    Mode.MANUAL: 0x5C7FA3FF, Mode.TRACKING: 0x8E6BBFFF, Mode.OBSTACLE_AVOIDANCE: 0xD08A3CFF,
-    Mode.LIGHT_SEEKING: 0xC9B037FF, Mode.FOLLOWING: 0x3C9D9BFF, Mode.COLOR_LED: 0xC0689FFF,
-    Mode.REMOTE_CONTROL: 0xA0522DFF,
+    **{mode: color << 8 | 0xFF for mode, color in MODE_COLORS.items()},
     Motion.STOP: 0x30343BFF, Motion.FORWARD: 0x4FB477FF, Motion.BACK: 0xD08A3CFF, Motion.LEFT: 0x5C7FA3FF,
     Motion.RIGHT: 0x8E6BBFFF, Motion.SPIN_LEFT: 0x3C9D9BFF, Motion.SPIN_RIGHT: 0xC0689FFF,
     Motors.OFF: 0x30343BFF, Motors.ON: 0x4FB477FF,

@@ -9,7 +9,7 @@ A kind of link is a URL in `schemas.links`, and a module with its `KIND` here. T
 """
 
 from importlib import import_module
-from typing import Any, Final
+from typing import Any
 
 from gateway.link.base import Device, Link, LinkKind
 from gateway.link.baud import BaudWatch
@@ -33,13 +33,12 @@ __all__ = [
     "parse_url",
 ]
 
-_MODULES: Final = {"serial": "gateway.link.serial", "tcp": "gateway.link.tcp", "ble": "gateway.link.ble"}
-"""Scheme of a URL: the module with its `KIND`, imported when it is needed: a gateway starts faster."""
-
-
 def kind_of(scheme: str) -> LinkKind[Any]:
-    """Return what opens and lists the links of this scheme; raise ImportError if a module that it needs is missing."""
-    kind: LinkKind[Any] = import_module(_MODULES[scheme]).KIND
+    """Return what opens and lists the links of this scheme. Raises ImportError if a module that it needs is missing.
+
+    Its module is imported when it is needed, so a gateway starts faster.
+    """
+    kind: LinkKind[Any] = import_module(f"gateway.link.{scheme}").KIND
     return kind
 
 

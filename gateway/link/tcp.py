@@ -5,6 +5,7 @@ import contextlib
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
@@ -17,6 +18,8 @@ from schemas.links import TcpUrl
 # A vanished peer is noticed within about five seconds, where the system has these options.
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
+SAID_WITHIN_S: Final = 3.0
+"""Time in which a bridge that has another client says so, and closes. Later bytes are those of a car."""
 MAX_SAID_BYTES: Final = 120
 """Maximum bytes of what the other end said before it closed that an error shows."""
 
@@ -37,6 +40,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._first = b""
         """The first received bytes. A bridge that is in use says so, and closes."""
         self._paused = False
+        self._made_at = 0.0
 
     async def read(self) -> bytes:
         """Return the next bytes as they arrived; raise LinkLost."""
@@ -84,6 +88,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         """Set the socket options."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
+        self._made_at = time.monotonic()
         peer: socket.socket = transport.get_extra_info("socket")
         # macOS refuses on a connection that is already reset; connection_lost follows.
         with contextlib.suppress(OSError):
@@ -108,7 +113,8 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         """Store the reason."""
         why = "the car closed it" if exc is None else _cause(exc)
         # A car serves one client and rejects the next. A bridge often says why before it closes (ser2net does).
-        said = _sentence(self._first)
+        is_early = time.monotonic() - self._made_at < SAID_WITHIN_S
+        said = _sentence(self._first) if is_early else ""
         if (said or not self._first) and (exc is None or isinstance(exc, ConnectionResetError)):
             why += f', and said "{said}".' if said else " before it sent anything."
             why += " Perhaps another gateway or program is connected to it."
@@ -121,7 +127,7 @@ def _sentence(data: bytes) -> str:
     """Return what a bridge said before it closed, with control characters escaped. Empty for a car's bytes."""
     text = data.decode(errors="replace").strip()
     printed = sum(each.isprintable() and each != "\ufffd" for each in text)
-    if b"$" in data or 2 * printed < len(text):
+    if b"$" in data or text.startswith("{") or 2 * printed < len(text):  # frames, JSON, or no text
         return ""
     shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
     return shown[:MAX_SAID_BYTES] + ("..." if len(shown) > MAX_SAID_BYTES else "")
@@ -141,8 +147,8 @@ class TcpKind(LinkKind[TcpUrl]):
             raise CannotOpen(f"{url}: there is no host {url.host!r}. Check the name, or use its address.") from None
         except ConnectionRefusedError:
             reason = (
-                "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it, "
-                "switch it off, and restart its program."
+                "nothing listens on that port. If the car's own program died, the car may be driving: look at it, "
+                "switch it off, and start it again."
             )
             raise CannotOpen(f"{url}: {reason}") from None
         except OSError as error:

@@ -400,6 +400,7 @@ async def test_second_client_is_told_of_the_first(says: bytes, reset: bool) -> N
         (b"\r\n", ""),
         (bytes.fromhex("0080E0F8FE") * 5, None),
         (FRAME, None),
+        (b'{"v":7.9,"dist_cm":42}\n', None),
     ],
 )
 async def test_what_a_bridge_says_before_it_closes_is_shown(says: bytes, shown: str | None) -> None:

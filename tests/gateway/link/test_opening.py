@@ -193,10 +193,8 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # bound, not listening: refuses, and no other process gets the port
         words = await refused(TcpUrl("127.0.0.1", taken.getsockname()[1]))
-        assert (
-            "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it"
-            in words
-        )
+        assert "nothing listens on that port" in words
+        assert "may be driving" in words
     assert "there is no host 'no.such.car.invalid'. Check the name" in await refused(TcpUrl("no.such.car.invalid", 1))
     assert "there is no host" in await refused(TcpUrl("a" * 64, 8888))
     assert "there is no host" in await refused(TcpUrl("a..b", 8888))
