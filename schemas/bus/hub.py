@@ -155,7 +155,9 @@ def _begin_again(watch: PanicWatch) -> None:
     back within a second, as after a change of the rules.
     """
     watch.panicked.wait()
+    watch.restore()
     sys.stderr.write("hub: Zenoh's router has failed, so the hub begins again\n")
+    sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - itself
 
 

@@ -33,11 +33,15 @@ class PanicWatch:
         return self
 
     def __exit__(self, *_: object) -> None:
-        sys.stderr.flush()
-        os.dup2(self._real, self._descriptor)  # the pipe has no other writer, so it ends
+        self.restore()
         self._thread.join()
         os.close(self._reads)
         os.close(self._real)
+
+    def restore(self) -> None:
+        """Let stderr go where it went before, also that of a program that takes the place of this one."""
+        sys.stderr.flush()
+        os.dup2(self._real, self._descriptor)  # the pipe has no other writer, so it ends
 
     def _pass_on(self) -> None:
         rest = b""

@@ -29,6 +29,8 @@ def panic(): os.write(2, b"thread 'rx-0' panicked at resource.rs:491:27:\\n")
 if "AGAIN" not in os.environ:
     os.environ["AGAIN"] = "1"
     threading.Thread(target=lambda: (sys.stdin.readline(), panic()), daemon=True).start()
+else:
+    os.write(2, b"said by the second\\n")
 sys.exit(hub.main())
 """
 
@@ -46,7 +48,7 @@ def test_panic_of_zenoh_is_noticed_and_stderr_passed_on() -> None:
 def test_hub_begins_again_after_panic() -> None:
     endpoint = free_endpoint()
     command = [sys.executable, "-c", HUB, "--endpoint", endpoint]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as hub:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as hub:
         try:
             wait_for(lambda: accepts(endpoint), "it listens")
             with Bus.open(endpoint) as bus:
@@ -57,5 +59,11 @@ def test_hub_begins_again_after_panic() -> None:
                 (second,) = wait_for(lambda: bus.hubs not in ((), (first,)) and bus.hubs, "another hub")
             assert first != second
             assert hub.poll() is None, "it is the same process"
+            hub.terminate()
+            assert hub.wait(20.0) == 0
+            assert hub.stderr is not None
+            told = hub.stderr.read()
+            assert "begins again" in told
+            assert "said by the second" in told, "its stderr is that of the first"
         finally:
             hub.kill()
