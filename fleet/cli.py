@@ -27,15 +27,18 @@ def _plain_commands(section: str) -> dict[str, tuple[str, str]]:
 
 COMMANDS: Final = {
     "Start here": {
-        "demo": ("fleet.demo:demo", "Three simulated cars do a job. No hardware needed."),
+        "demo": ("fleet.demo:demo", "Let three simulated cars do a job. No hardware is needed."),
         "scan": ("fleet.commands.gateway_tools:scan", "Look for cars on Bluetooth and serial ports."),
         "init": ("fleet.commands.fleet_file:init", "Create fleet.yaml: find the cars and name them."),
-        "example": ("fleet.commands.example:example", "Fleet files, plans, worlds and programs to start from."),
+        "example": (
+            "fleet.commands.example:example",
+            "Show and copy fleet files, plans, worlds and programs to start from.",
+        ),
         "check": ("fleet.commands.check:check", "Check fleet files, plans and worlds for mistakes."),
         "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, plans or worlds."),
         "bind": (
             "fleet.commands.bind:bind",
-            "Find out which car is which: each blinks, you type its name.",
+            "Find out which car is which: each car blinks, you type its name.",
         ),
     },
     "Run a fleet": {
@@ -43,25 +46,28 @@ COMMANDS: Final = {
         "down": ("fleet.commands.lifecycle:down", "Stop every car and end `fleet up`."),
         "list": (
             "fleet.commands.observe:list_cars",
-            "The cars: link, mode, motion, who is in control, battery.",
+            "List the cars: link, mode, motion, who is in control, battery.",
         ),
-        "console": ("fleet.commands.console:console", "The fleet as a web page: watch, drive, STOP."),
-        "status": ("fleet.commands.lifecycle:status", "Processes, session and hub at a glance."),
-        "doctor": ("fleet.commands.doctor:doctor", "Why a car or a session is odd, and what to type."),
+        "console": ("fleet.commands.console:console", "Serve the fleet as a web page: watch, drive, STOP."),
+        "status": ("fleet.commands.lifecycle:status", "Show processes, session and hub at a glance."),
+        "doctor": ("fleet.commands.doctor:doctor", "Tell why a car or a session is odd, and what to type."),
         "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
-        "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),
+        "logs": ("fleet.commands.lifecycle:logs", "Show what a car's gateway or a service has logged."),
         "exporter": (
             "fleet.commands.exporter:exporter",
-            "The fleet as metrics for Prometheus.",
+            "Serve the fleet as metrics for Prometheus.",
         ),
-        "foxglove": ("fleet.commands.foxglove_live:foxglove", "The fleet live in Foxglove."),
-        "mqtt": ("fleet.commands.mqtt:mqtt", "The cars as devices of Home Assistant, by MQTT."),
-        "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),
+        "foxglove": ("fleet.commands.foxglove_live:foxglove", "Show the fleet live in Foxglove."),
+        "mqtt": ("fleet.commands.mqtt:mqtt", "Show the cars in Home Assistant, by MQTT."),
+        "sim": (
+            "fleet.commands.gateway_tools:sim",
+            "Run simulated cars alone, with faults, to test your own programs.",
+        ),
     },
     "Several computers": {
         "hub": ("fleet.commands.hub:hub", "Let other computers join, with certificates: invite, show, revoke."),
         "join": ("fleet.commands.hub:join_hub", "Join the hub on another computer, with its code."),
-        "leave": ("fleet.commands.hub:leave", "Leave that hub."),
+        "leave": ("fleet.commands.hub:leave", "Leave the hub that this computer has joined."),
     },
     "Drive": {
         "drive": (
@@ -70,7 +76,7 @@ COMMANDS: Final = {
         ),
         "mode": (
             "fleet.commands.drive:mode",
-            "Let cars act by themselves: tracking, obstacle_avoidance, ...",
+            "Make cars act by themselves: tracking, obstacle_avoidance, ...",
         ),
         "stop": (
             "fleet.commands.drive:stop",
@@ -81,8 +87,8 @@ COMMANDS: Final = {
             "Emergency stop: cars refuse everything until `resume --estops`.",
         ),
         "resume": ("fleet.commands.drive:resume", "Let the plan use stopped cars again."),
-        "pause": ("fleet.commands.people:pause", "Stop all cars; nobody but a lead moves one until `unpause`."),
-        "unpause": ("fleet.commands.people:unpause", "End the pause. No car moves by it."),
+        "pause": ("fleet.commands.people:pause", "Stop all cars. Only a lead moves a car until `unpause`."),
+        "unpause": ("fleet.commands.people:unpause", "End the pause. This does not move a car."),
         "lend": ("fleet.commands.people:lend", "Lend cars to a person for a time."),
         **_plain_commands("Drive"),
     },
@@ -96,36 +102,36 @@ COMMANDS: Final = {
         "speed": ("fleet.commands.actuators:speed", "Go faster or slower by one step."),
     },
     "Sensors": {
-        "get": ("fleet.commands.observe:get", "Latest value, or history (--last, --since, --csv)."),
-        "watch": ("fleet.commands.observe:watch", "New values as they come (--when CONDITION)."),
+        "get": ("fleet.commands.observe:get", "Print the latest value, or history (--last, --since, --csv)."),
+        "watch": ("fleet.commands.observe:watch", "Print new values as they come (--when CONDITION)."),
         "wait": ("fleet.commands.observe:wait", "Wait until a condition is true."),
         "keys": (
             "fleet.commands.observe:list_keys",
-            "Everything that is being published, with rate and age.",
+            "List everything that is published now, with rate and age.",
         ),
     },
     "Plans": {
         "plan": ("fleet.commands.plan:plan", "run | set | show | try | ...: what the cars do together."),
         "why": (
             "fleet.commands.plan:why",
-            "Why a car does what it does, and what would change it.",
+            "Explain why a car does what it does, and what would change that.",
         ),
     },
     "Sessions": {
         "record": (
             "fleet.commands.record:record",
-            "Record without `fleet up`; start and stop a session.",
+            "Record without `fleet up`, or start and stop a session.",
         ),
         "mark": ("fleet.commands.record:mark", "Add a note to the session, now."),
-        "view": ("fleet.commands.view:view", "The fleet live in Rerun."),
-        "replay": ("fleet.commands.replay:replay", "A session in Rerun."),
+        "view": ("fleet.commands.view:view", "Show the fleet live in Rerun."),
+        "replay": ("fleet.commands.replay:replay", "Show a session in Rerun."),
         "play": ("fleet.commands.play:play", "Publish a session again, for your own programs."),
         "sessions": ("fleet.commands.sessions:sessions", "List, verify, repair, cut and export."),
-        "find": ("fleet.commands.find:find", "When a condition held, in all sessions."),
-        "query": ("fleet.commands.query:query", "SQL over the tables of all sessions."),
+        "find": ("fleet.commands.find:find", "Find when a condition held, in all sessions."),
+        "query": ("fleet.commands.query:query", "Ask the tables of all sessions with SQL."),
     },
 }
-"""Subcommands by heading: function and line in `fleet --help`."""
+"""Subcommands by heading, each with its function and its line in `fleet --help`."""
 
 _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (where, _) in section.items()}
 

@@ -109,14 +109,14 @@ class Demo:
     default=DEFAULT_OUT,
     show_default=True,
     metavar="DIR",
-    help="Where the session goes.",
+    help="Write the session to DIR.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object: checks, session, rrd.")
 @click.option(
     "--view/--no-view", default=None, help="Open Rerun's viewer afterwards (default: ask, if there is a display)."
 )
 def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
-    """Run a job with three simulated cars of two platforms: modes, driving, LEDs, a cut link, a stop. Check it."""
+    """Run a job with three simulated cars of two platforms, and check it: modes, driving, LEDs, a cut link, a stop."""
 
     def say(text: str) -> None:
         click.echo(text, err=as_json)

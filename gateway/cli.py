@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from schemas.links import LinkUrl
 
 COMMANDS: Final = {
-    "sim": ("gateway.sim.cli", "simulated cars that behave like real ones, hazards included"),
-    "scan": ("gateway.tools.scan", "the ports and Bluetooth devices there are, and which of them are cars"),
-    "monitor": ("gateway.tools.monitor", "what a car sends, decoded beside the raw bytes"),
-    "send": ("gateway.tools.send", "one frame to a car on the desk, checked against the table"),
+    "sim": ("gateway.sim.cli", "run simulated cars that behave like real ones, with their hazards"),
+    "scan": ("gateway.tools.scan", "list the serial ports and Bluetooth devices, and find the cars among them"),
+    "monitor": ("gateway.tools.monitor", "show what a car sends: the decoded readings beside the raw bytes"),
+    "send": ("gateway.tools.send", "check one frame, and send it to a car on the desk"),
 }
-"""Subcommand: the module with its `add_arguments` and `run`, imported when called, and its line in the help."""
+"""For each subcommand, the module with its `add_arguments` and `run`, and its line in the help.
+
+A module is imported only when its subcommand is called.
+"""
 
 _EPILOG: Final = "Exit codes: 0 done, 1 failed, 2 wrong use, 130 Ctrl-C."
 _RUN_EPILOG: Final = """\
@@ -43,7 +46,7 @@ Ctrl-C stops the car before the process ends."""
 
 
 def main() -> None:
-    """Run the command line. Exit codes: 1 failure, 2 wrong use."""
+    """Run the command line, and exit with 1 after a failure and with 2 after wrong use."""
     stdio.complete()
     parser = _GatewayParser(prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
@@ -74,7 +77,7 @@ class _GatewayParser(argparse.ArgumentParser):
                 self.error(f"No such option '{name}'. {did_you_mean(name, self._option_string_actions)}".rstrip())
         parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f'{self.prog} takes no "{unknown[0]}".')
+            self.error(f'{self.prog} does not accept "{unknown[0]}".')
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
@@ -84,7 +87,7 @@ class _GatewayParser(argparse.ArgumentParser):
         super()._check_value(action, value)
 
     def error(self, message: str) -> NoReturn:
-        """Print the error and where the help is, and exit with 2. The usage has up to eight lines: it is left out."""
+        """Print the error and where the help is, and exit with 2. Leave out the usage, which has up to eight lines."""
         sys.exit(_failed(f"{message} (see {self.prog} --help)", 2))
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
@@ -93,7 +96,7 @@ class _GatewayParser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """Prints the version. Imports the metadata of packages only then: a gateway starts faster without them."""
+    """Prints the version. Imports packages' metadata only then, because a gateway starts faster without it."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
@@ -115,52 +118,65 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run = commands.add_parser(
         "run",
         help="connect one car to the bus",
-        description="Connect one car to the bus: readings out, commands in.",
+        description="Connect one car to the bus: publish its readings and carry out commands.",
         epilog=_RUN_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    run.add_argument("--car", required=True, help="its name: a-z, 0-9, _ and -, at most 32")
+    run.add_argument("--car", required=True, help="name of the car: at most 32 of the characters a-z, 0-9, _ and -")
     run.add_argument(
         "--link",
         required=True,
-        help=f"{LINK_HELP}{LINK_HELP_OPTIONS} (`fleet scan` shows them)",
+        help=f"where the car is: {LINK_HELP}{LINK_HELP_OPTIONS} (`fleet scan` lists the links)",
     )
     run.add_argument(
         "--platform",
         default="auto",
-        help="arduino, stm32, raspberry_pi, unknown; with options as in arduino+arm (default auto: found out); to be "
-        "named: wave_rover, ugv01, ugv02, ugv_rover, ugv_beast, and those of installed drivers",
+        help="what the car is: arduino, stm32, raspberry_pi or unknown, with options as in arduino+arm. With auto the "
+        "gateway finds out (the default). It cannot find out wave_rover, ugv01, ugv02, ugv_rover, ugv_beast, and the "
+        "platforms of installed drivers: name these",
     )
-    run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
     run.add_argument(
-        "--connect", metavar="ENDPOINT", help="the bus, tcp/HOST:PORT (default FLEET_ENDPOINT, or loopback)"
+        "--fleet", default=DEFAULT_FLEET, help="name of the fleet, the first part of every key (default: fleet)"
+    )
+    run.add_argument(
+        "--connect", metavar="ENDPOINT", help="the bus, as tcp/HOST:PORT (default: FLEET_ENDPOINT, or loopback)"
     )
     run.add_argument(
         "--state-dir",
         metavar="DIR",
-        help="directory for the e-stops and holds of each bus (default: FLEET_STATE_DIR, or the user's)",
+        help="directory for the e-stops and holds of each bus (default: FLEET_STATE_DIR, or the state directory of "
+        "the user)",
     )
     run.add_argument(
         "--holds-of",
         metavar="TEXT",
-        help="the car that holds and loans belong to (default: the link; fleet up: the folder of a simulated car)",
+        help="name under which the holds and loans of this car are kept (default: its link; `fleet up` uses the folder "
+        "of a simulated car)",
     )
     run.add_argument(
         "--person",
         metavar="NAME",
         action="append",
-        help="who may drive this car, once for each: NAME, NAME:lead, or NAME:other for one who drives other cars; "
-        "all others only watch and stop (default: everybody drives, nobody is a lead)",
+        help="a person who may drive this car: NAME, or NAME:lead for a lead. NAME:other is a person who may drive "
+        "other cars only. May be repeated. All others only watch and stop (default: all drive, nobody is a lead)",
     )
-    run.add_argument("--people-only", action="store_true", help="without --person: nobody drives this car")
+    run.add_argument(
+        "--people-only",
+        action="store_true",
+        help="let only the people of --person drive this car, and nobody if there are none",
+    )
     run.add_argument(
         "--longest-drive",
         metavar="DURATION",
         default="10s",
-        help="longest duration of a drive command (default 10s)",
+        help="maximum duration of a drive command (default: 10s)",
     )
     run.add_argument(
-        "--speed-max", metavar="SHARE", type=float, default=1.0, help="no step beyond this share of full speed, 0..1"
+        "--speed-max",
+        metavar="SHARE",
+        type=float,
+        default=1.0,
+        help="maximum speed as a share of full speed, more than 0 and at most 1 (default: 1)",
     )
     for level, default, volts in (
         (BatteryLevel.LOW, BatteryAction.WARN, LOW_V),
@@ -170,12 +186,17 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
             f"--on-battery-{level}",
             choices=tuple(map(str, BatteryAction)),
             default=default,
-            help=f"reaction to a {level} battery: warn, refuse new drives and modes, or stop (default {default})",
+            help=f"what to do if the battery is {level}: warn, refuse new drives and modes, or stop "
+            f"(default: {default})",
         )
         run.add_argument(
-            f"--battery-{level}-v", metavar="V", type=float, default=volts, help=f"below this it is {level} ({volts} V)"
+            f"--battery-{level}-v",
+            metavar="V",
+            type=float,
+            default=volts,
+            help=f"voltage below which the battery is {level} (default: {volts})",
         )
-    run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
+    run.add_argument("--retry", action="store_true", help="keep trying if the link cannot be opened at the start")
     run.add_argument(
         "--parent",
         metavar="PID",
@@ -254,7 +275,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: str, fleet: str) -> "Bus":
-    """Return the bus. If it is away, stop the car first, which may still do what it was told. Raises BusError."""
+    """Return the bus. Raises BusError if the bus cannot be reached.
+
+    Stops the car before that, because the car may still do what it was told last.
+    """
     from schemas import identity
     from schemas.bus import BadEndpoint, Bus, BusError, resolve_endpoint
 

@@ -94,7 +94,7 @@ def _names(ctx: click.Context, words: tuple[str, ...]) -> tuple[str, ...]:
 @json_option
 @with_client
 def led(client: Fleet, cars: tuple[str, ...], color: tuple[int, int, int], *, as_json: bool) -> None:
-    """Set the color LED to any color. The light, a lamp of its own, has seven colors: `fleet light`."""
+    """Set the color LED to any color. The light is another lamp with seven colors: see `fleet light`."""
     carry_out(client, led_request(*color), cars, as_json=as_json)
 
 
@@ -127,7 +127,7 @@ def servo(
     take: bool,
     as_json: bool,
 ) -> None:
-    """Move a servo: left, right or reset (vertical: up, down or reset). The front servo also takes 0 to 180 degrees.
+    """Move a servo: left, right or reset (vertical: up, down or reset). The front servo also accepts 0 to 180 degrees.
 
     The car turns the front servo to 180 minus the number.
     """
@@ -162,7 +162,7 @@ def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_jso
 @json_option
 @with_client
 def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
-    """Switch the fan. Cars only know "toggle", so `on` and `off` work only if its state is known."""
+    """Switch the fan. Cars can only toggle it, so `on` and `off` work only if its state is known."""
     cars, request = cars_and_request
     if cars[1:] and (near := misspelled(cars[-1], FanState)) and cars[-1] not in client.cars():
         raise click.UsageError(f'"{cars[-1]}" is neither a connected car nor on or off. Did you mean {near[0]}?')
@@ -182,7 +182,7 @@ def _plain_command(row: CommandType) -> click.Command:
     if row.max_duration_s:
         example += " --for 2s"
         limit = Duration(row.max_duration_s)
-        command = click.option("--for", "duration_s", type=limit, required=True, help="Duration, such as 2s.")(command)
+        command = click.option("--for", "duration_s", type=limit, required=True, help="How long, such as 2s.")(command)
     return click.command(row.subcommand, help=row.summary, epilog=f"\b\nexample:\n  {example}")(command)
 
 

@@ -43,14 +43,14 @@ examples:
   fleet bind
   fleet bind lab.yaml --link /dev/ttyUSB0
 
-A TCP car is named by its address: write that into the file."""
+A TCP car does not need this command: write its address into the file."""
 )
 @file_argument
 @link_option
 @listen_option
 @connect_option("The bus (default: the file's, FLEET_ENDPOINT, or port 7447).")
 def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
-    """Find out which car is which: each blinks and beeps, you type its name, and the file gets its link."""
+    """Find out which car is which: each car blinks and beeps, you type its name, and the file gets the car's link."""
     with cli_errors():
         for link in links:
             validate_link(link)
@@ -92,7 +92,7 @@ def _print_error(words: str) -> None:
 
 
 def _which(client: Fleet, name: str, file: Path) -> str:
-    """Let the car blink until the user names it. Return the name, or `-` for none."""
+    """Make the car blink until the user types its name. Return the name, or `-` if the user gives it none."""
     while True:
         outcome = client.car(name).find()
         if not outcome.ok:

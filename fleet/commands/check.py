@@ -65,8 +65,8 @@ Exit codes: 0 no mistakes, 1 a car's port is missing or a part of a plan can nev
 def check(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
 
-    Does not touch the cars. With a fleet file, its plan and world are checked too, for the cars of that file. Warns if
-    a Bluetooth adapter has more cars than it holds.
+    The command does not touch the cars. For a fleet file, it also checks the plan and the world in it, for the cars in
+    that file. It warns if a Bluetooth adapter has more cars than it can connect at once.
     """
     checks = _Checks(as_json=as_json)
     kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}
@@ -84,7 +84,7 @@ class _Checks:
         self._as_json = as_json
         self._cars: _Cars = None
         self._simulated: list[str] = []
-        """Cars that can carry things of a world. Empty: any car."""
+        """The cars that can carry things of a world. If there are none here, any car can."""
         self._done: set[Path] = set()
 
     def recognize(self, file: Path) -> FileKind | None:

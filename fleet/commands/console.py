@@ -67,7 +67,7 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
 
 
 def listen_or_fail(port: int | None, other: str) -> socket.socket:
-    """Return a listening socket. None: the default port. Raises ClickException with what to type for another one.
+    """Return a socket that listens at this port, or at the default port if `port` is None. Raises ClickException.
 
     other: this command, with `{other}` for the number of a neighboring port.
     """
@@ -95,7 +95,7 @@ async def _send_heartbeats(parent: int, address: str) -> None:
     epilog="\b\nexamples:\n  fleet console --open\n  fleet console --as teacher --lan\n  fleet console pair group_a",
 )
 def console() -> None:
-    """Serve the fleet as a web page: watch, drive, STOP. Without a command, serve."""
+    """Serve the fleet as a web page: watch, drive, STOP. Without a command, this is `fleet console serve`."""
 
 
 @console.command(
@@ -107,7 +107,11 @@ examples:
   fleet console --lan""",
 )
 @click.option(
-    "--port", type=Number(int, 0, 65535), default=DEFAULT_PORT, show_default=True, help="Port, 0 for any free one."
+    "--port",
+    type=Number(int, 0, 65535),
+    default=DEFAULT_PORT,
+    show_default=True,
+    help="Serve at this port. With 0, at any free port.",
 )
 @click.option(
     "--host",
@@ -116,28 +120,28 @@ examples:
     show_default=True,
     callback=_check_host,
     expose_value=False,
-    help="Address: loopback only.",
+    help="Serve at this address. Only loopback is allowed.",
 )
-@click.option("--lan", "on_lan", is_flag=True, help="Serve paired devices on the network, too, over HTTPS.")
+@click.option("--lan", "on_lan", is_flag=True, help="Also serve paired devices on the network, over HTTPS.")
 @click.option(
     "--lan-port",
     type=Number(int, 0, 65535),
     default=DEFAULT_LAN_PORT,
     show_default=True,
-    help="Port on the network, 0 for any free one.",
+    help="Serve the network at this port. With 0, at any free port.",
 )
 @click.option(
     "--sessions",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Where the sessions are (default: as the file says, or sessions).",
+    help="Show the sessions in DIR (default: as in the fleet file, or sessions).",
 )
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
     default=Path("fleet.yaml"),
     show_default=True,
-    help="The file that the page Set up writes links into.",
+    help="Let the page Set up write links into FILE.",
 )
 @starter_option()
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
@@ -201,15 +205,15 @@ examples:
     default=RANKS[0],
     show_default=True,
     metavar="RANK",
-    help="Rank: person or lead.",
+    help="Rank of the person: person or lead.",
 )
 @connect_option()
 @fleet_option()
 def pair(name: str | None, rank: str, connect: str | None, fleet: str) -> None:
     """Make a code that pairs one device with the console as the person NAME (default: you).
 
-    NAME is one of the people of the fleet file, if it lists any, and a lead only if the file says so. A console must
-    serve the network: fleet console --lan.
+    If the fleet file lists people, NAME must be one of them, and a lead only if the file says so. A console must
+    serve the network: `fleet console --lan`.
     """
     person = PagePerson(name or _own_name(), rank)
     with cli_errors():
@@ -228,7 +232,9 @@ examples:
   fleet console people
   fleet console people --revoke group_a""",
 )
-@click.option("--revoke", metavar="NAME", multiple=True, help="Revoke all devices of a person, or one by its id.")
+@click.option(
+    "--revoke", metavar="NAME", multiple=True, help="Revoke all devices of a person, or one device by its id."
+)
 @json_option
 @connect_option()
 @fleet_option()

@@ -35,16 +35,16 @@ examples:
   fleet doctor latest
   fleet doctor latest red     # why did red not stop
 
-The first line is the likely cause with what to type. Exit code 1: something is odd."""
+The first line is the likely cause and what to type. The exit code is 1 if something is odd."""
 )
 @click.argument("name", required=False, metavar="[CAR | SESSION]", shell_complete=complete_car)
 @click.argument("car", required=False, metavar="[CAR]")
 @json_option
 @bus_options
 def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Say in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars.
+    """Tell in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars.
 
-    Of a session it names each stop that was not shown or did not stop its car: the car, the time and the cause.
+    For a session, the command lists each stop that was not shown or did not stop its car: car, time and cause.
     """
     if name is not None and (session := _session_of(name)) is not None:
         _show_session(session, car or "", as_json=as_json)
@@ -86,7 +86,7 @@ def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
 
 
 def _show_session(path: Path, car: str, *, as_json: bool) -> None:
-    """Print what is known of a session, and exit. car: the only car to look at; empty: all."""
+    """Print what is known about a session, and exit. If `car` is empty, look at all its cars."""
     try:
         session = Session(path)
     except NoSession as error:

@@ -59,7 +59,7 @@ examples:
 @json_option
 @with_client
 def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
-    """Move for a time, then stop. Wait until the car has stopped; Ctrl-C stops it early."""
+    """Move for a time, then stop. The command waits until the car has stopped. Ctrl-C stops it earlier."""
     named = resolve_cars(client, cars)
     with signals.sigterm_interrupts():
         try:
@@ -77,7 +77,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
 @json_option
 @with_client
 def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
-    """Let cars act by themselves. `manual` ends every other mode, and the car waits for commands.
+    """Make cars act by themselves. `manual` ends every other mode, and the car waits for commands.
 
     To stop cars, use `fleet stop`: after it a running plan leaves them alone.
     """
@@ -89,24 +89,24 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 @json_option
 @bus_options
 def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Stop these cars now (no name: all). A running plan leaves them alone until you drive or resume them.
+    """Stop these cars now, or all cars if you name none. A running plan leaves them alone until you drive or resume.
 
-    Of several fleets on one bus, every one that could be meant is stopped. `fleet estop` also makes cars refuse every
-    command. `fleet mode CAR manual` stops without a hold.
+    If there are several fleets on one bus, every fleet stops that could be meant. `fleet estop` also makes cars refuse
+    every command. `fleet mode CAR manual` stops without a hold.
     """
     _stop(connect, fleet, cars, lambda _: stop_request(), as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
 @any_cars_argument
-@click.option("--why", default="", metavar="WORDS", help="What happened, for the record.")
+@click.option("--why", default="", metavar="WORDS", help="Record what happened.")
 @json_option
 @bus_options
 def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
 
-    Of several fleets on one bus, every one that could be meant. `fleet resume --estops` releases them. `fleet stop` is
-    for every day: cars obey again at once.
+    If there are several fleets on one bus, every fleet stops that could be meant. `fleet resume --estops` releases the
+    cars. For everyday use there is `fleet stop`, after which cars obey again at once.
     """
     _stop(
         connect,
@@ -137,7 +137,7 @@ def _stop(
     *,
     as_json: bool,
 ) -> Never:
-    """Stop the cars in every fleet that the command could mean. request_for: makes the request for the named cars."""
+    """Stop the cars in every fleet that the command could mean. `request_for` makes the request for the named cars."""
 
     def act(there: Fleet) -> list[Outcome]:
         named = _named(there, cars)
@@ -163,21 +163,24 @@ examples:
     "ids",
     multiple=True,
     metavar="ID",
-    help="Release this emergency stop (the beginning of its id is enough); may be repeated.",
+    help="Release this emergency stop. The beginning of its id is enough. Repeatable.",
 )
 @click.option("--estops", is_flag=True, help="Release every emergency stop of these cars. They stay on hold.")
 @click.option(
-    "--all", "everything", is_flag=True, help="End the hold and every emergency stop that you may end. Say what stays."
+    "--all",
+    "everything",
+    is_flag=True,
+    help="End the hold and every emergency stop that you may end. Print what stays.",
 )
 @json_option
 @with_client
 def resume(
     client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops: bool, everything: bool, as_json: bool
 ) -> None:
-    """Let the plan use stopped cars again (no name: all cars).
+    """Let the plan use stopped cars again: these cars, or all cars if you name none.
 
-    --estops also releases emergency stops. The cars stay stopped and wait for a second `resume`. An emergency stop of
-    the whole fleet ends on every car when it ends on one. What a lead stopped, only a lead ends.
+    --estops also releases emergency stops. The cars stay stopped and wait for a second `fleet resume`. An emergency
+    stop of the whole fleet ends for every car when it ends for one. Only a lead can end what a lead stopped.
     """
     if estops and ids:
         raise click.UsageError("--estops releases every emergency stop: leave --id out")

@@ -24,7 +24,7 @@ Prometheus reads http://127.0.0.1:9478/metrics. Everyone who reaches the address
 command a car there."""
 )
 @serving_options(DEFAULT_EXPORTER_PORT)
-@click.option("--dashboard", "prints_board", is_flag=True, help="Print a board for Grafana, and exit.")
+@click.option("--dashboard", "prints_board", is_flag=True, help="Print a dashboard for Grafana, and exit.")
 @bus_options
 def exporter(*, port: int, address: str, prints_board: bool, connect: str | None, fleet: str) -> None:
     """Serve the state of all cars and of the recorder as metrics for Prometheus, until Ctrl-C."""

@@ -46,11 +46,13 @@ examples:
 @click.argument("condition", metavar="CONDITION")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @car_option
-@click.option("--for", "for_s", type=Duration(MAX_FOR_S), default=None, help="Only if it held for so long.")
 @click.option(
-    "--since", metavar="TIME", help="Only since then: monday, yesterday 14:05, 14:05, a date, or 1h (one hour ago)."
+    "--for", "for_s", type=Duration(MAX_FOR_S), default=None, help="Print a hit only if it lasted for so long."
 )
-@click.option("--mark", is_flag=True, help="Mark each closed session with a hit, at its first hit.")
+@click.option(
+    "--since", metavar="TIME", help="Search from TIME on: monday, yesterday 14:05, 14:05, a date, or 1h (one hour ago)."
+)
+@click.option("--mark", is_flag=True, help="Mark each closed session that has a hit, at its first hit.")
 @click.option("--csv", "as_csv", is_flag=True, help="Write CSV, with times in UTC.")
 @json_option
 def find(
@@ -66,9 +68,9 @@ def find(
 ) -> None:
     """Find when CONDITION held, in every session in DIR (default: sessions).
 
-    CONDITION is as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is unknown.
-    A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is none, or if
-    a session with a hit could not be marked. The quota does not remove marked sessions.
+    CONDITION is written as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is
+    unknown. A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is no hit, or
+    if a session with a hit could not be marked. The quota does not remove marked sessions.
     """
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")
@@ -135,7 +137,7 @@ def _answers(
 
 
 def _marked(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
-    """Mark the first hit of each session. Return False if a session cannot be marked; it is named on stderr."""
+    """Mark the first hit of each session. If a session cannot be marked, name it on stderr and return False."""
     hits: dict[Path, list[Hit]] = {}
     for path, hit in found:
         hits.setdefault(path, []).append(hit)

@@ -36,11 +36,9 @@ _TAKE_ALL: Final = "`fleet init --yes` takes every likely car without a question
 file_argument = click.argument(
     "file", default=DEFAULT_FILE, type=click.Path(path_type=Path, dir_okay=False), metavar="[FILE]"
 )
-link_option = click.option(
-    "--link", "links", multiple=True, metavar="URL", help="Scan only this link; may be repeated."
-)
+link_option = click.option("--link", "links", multiple=True, metavar="URL", help="Scan only this link. Repeatable.")
 listen_option = click.option(
-    "--for", "seconds", type=Duration(120.0, 0.5), help="How long to listen at each port (default 6s)."
+    "--for", "seconds", type=Duration(120.0, 0.5), help="How long to listen at each port (default: 6s)."
 )
 
 
@@ -95,7 +93,7 @@ examples:
     "simulated",
     type=Number(int, 1, MAX_SIMULATED_CARS),
     metavar="N",
-    help="Write N simulated cars and plan.yaml. Look for no cars.",
+    help="Write N simulated cars and plan.yaml. Do not look for cars.",
 )
 @click.option("-y", "--yes", is_flag=True, help="Accept every detected car without asking.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
@@ -106,7 +104,7 @@ examples:
     show_default=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The file to write.",
+    help="Write this file.",
 )
 @link_option
 @listen_option
@@ -208,7 +206,7 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
 
 
 def prompt_name(words: str, offered: str | None, taken: set[str], instead: str = "") -> str:
-    """Prompt for an unused name of a car, or `-`. instead: what to type where nobody answers."""
+    """Prompt for an unused name of a car, or `-`. `instead` is what to type where nobody can answer."""
 
     def check_name(name: str) -> str:
         name = name.strip()

@@ -27,7 +27,9 @@ In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. Everyone 
 nobody can command a car there."""
 )
 @serving_options(DEFAULT_FOXGLOVE_PORT)
-@click.option("--layout", "prints_layout", is_flag=True, help="Print a layout for the cars of now, and exit.")
+@click.option(
+    "--layout", "prints_layout", is_flag=True, help="Print a layout for the cars that are connected now, and exit."
+)
 @bus_options
 def foxglove(*, port: int, address: str, prints_layout: bool, connect: str | None, fleet: str) -> None:
     """Serve everything that the fleet publishes to Foxglove, until Ctrl-C."""

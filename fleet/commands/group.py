@@ -66,7 +66,9 @@ def _from_group(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
     return value if at is ctx or at.get_parameter_source(name) is not ParameterSource.COMMANDLINE else at.params[name]
 
 
-def connect_option(words: str = "The bus, tcp/HOST:PORT (default: FLEET_ENDPOINT, or port 7447).") -> _Decorator:
+def connect_option(
+    words: str = "The bus, as tcp/HOST:PORT (default: FLEET_ENDPOINT, or port 7447 on this computer).",
+) -> _Decorator:
     """Return the option --connect with this help."""
     return click.option("-e", "--connect", "--endpoint", metavar="ENDPOINT", callback=_from_group, help=words)
 
@@ -85,7 +87,7 @@ def choose_fleet(connect: str | None, fleet: str) -> None:
 
 
 def name_fleet_in_hints() -> None:
-    """Name also the default fleet in the commands that messages propose: there are several, or the user named it."""
+    """Name even the default fleet in the commands that messages propose: there are several, or the user named it."""
     click.get_current_context().meta[_NAMED] = True
 
 
@@ -126,7 +128,7 @@ def as_option(complete: Callable[..., list[str]] | None = None) -> _Decorator:
         expose_value=False,
         callback=_choose_person,
         shell_complete=complete,
-        help="Who you are: a person of the fleet file (default: FLEET_AS, or your login).",
+        help="Who you are: a person in the fleet file (default: FLEET_AS, or your login).",
     )
 
 

@@ -46,25 +46,27 @@ examples:
 """,
 )
 def hub() -> None:
-    """Make this computer the hub of several: with certificates, so that everybody is who they say."""
+    """Make this computer the hub of several computers. Certificates prove who everybody is."""
 
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub init\n  fleet hub init --car red")
-@click.option("--car", "cars", multiple=True, metavar="CAR", help="Also for this car, whose gateway runs here.")
+@click.option(
+    "--car", "cars", multiple=True, metavar="CAR", help="Also make a certificate for this car, whose gateway runs here."
+)
 @click.option(
     "--service",
     "services",
     multiple=True,
     type=click.Choice([each.value for each in Service]),
-    help="Take this service back, which another computer was invited for.",
+    help="Run this service here again, although another computer was invited for it.",
 )
 @click.option("--local", is_flag=True, help="Listen on loopback only, as `fleet up --secure` does.")
 def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> None:
     """Make this computer the hub that other computers may join.
 
-    It gets an authority, and a certificate for you and for each service; `fleet up` adds those of its cars. It listens
-    on the network, with TLS: who has no certificate gets nothing. `fleet up` starts it. On one computer alone, `fleet
-    up --secure` does the same, and listens on loopback only.
+    The hub gets an authority, and a certificate for you and for each service. `fleet up` starts the hub, and adds the
+    certificates of its cars. The hub listens on the network, with TLS, and refuses everybody without a certificate. On
+    one computer alone, `fleet up --secure` does the same, but the hub listens on loopback only.
     """
     with cli_errors(), _disk_errors():
         take = [*map(identity.car, map(keys.check_name, cars)), *map(identity.service, map(Service, services))]
@@ -97,11 +99,13 @@ examples:
 @click.option(
     "--site",
     metavar="SITE",
-    help="Invite the computer that is the hub of another site; with --service, a service there.",
+    help="Invite the computer that is the hub of another site. With --service, invite a service there.",
 )
-@click.option("--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen here (default: {JOIN_PORT}).")
-@click.option("--as-hub", "host", metavar="HOST", help="Name this computer so in the command that is printed.")
-@click.option("--qr", is_flag=True, help="Also draw the line to type as a QR code, for a camera and `fleet join -`.")
+@click.option(
+    "--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen at this port (default: {JOIN_PORT})."
+)
+@click.option("--as-hub", "host", metavar="HOST", help="Call this computer HOST in the command that is printed.")
+@click.option("--qr", is_flag=True, help="Also draw the command as a QR code, for a camera and `fleet join -`.")
 @json_option
 def invite(
     person: str | None,
@@ -114,9 +118,9 @@ def invite(
     qr: bool,
     as_json: bool,
 ) -> None:
-    """Let one other computer join, once, within ten minutes. Prints the command to type there, and waits.
+    """Let one other computer join, once, within ten minutes. Print the command to type there, and wait.
 
-    The hub restarts first, since it gets another rule: drives may end, modes go on, and all are back after a second.
+    First the hub restarts, because it gets another rule. Drives may end, modes go on, and all are back after a second.
     """
     if [person, car, service, None if service else site].count(None) != 3:
         raise click.UsageError(
@@ -164,7 +168,7 @@ def invite(
 @hub.command(epilog="\b\nexamples:\n  fleet hub show\n  fleet hub show --json")
 @json_option
 def show(*, as_json: bool) -> None:
-    """Show who may connect, who is connected now and from where, and when certificates end."""
+    """Show who may connect, who is connected now and from where, and when the certificates expire."""
     with cli_errors():
         store = _own_store(resolve_endpoint())
     links = _links(store)
@@ -178,7 +182,7 @@ def show(*, as_json: bool) -> None:
 
 @hub.command(epilog="\b\nexample:\n  fleet hub config > zenohd.json5 && zenohd -c zenohd.json5")
 def config() -> None:
-    """Print the configuration of a stock Zenoh router in the place of this hub, with its certificates and rules.
+    """Print the configuration of a stock Zenoh router that replaces this hub, with its certificates and rules.
 
     Print it again and restart the router after each `fleet hub invite` and `revoke`, and after a new car.
     """
@@ -191,7 +195,7 @@ def config() -> None:
 @hub.command(epilog="\b\nexamples:\n  fleet hub revoke person.mia\n  fleet hub revoke car.red")
 @click.argument("who", metavar="IDENTITY")
 def revoke(who: str) -> None:
-    """Deny everything to an identity, from now on. The hub restarts; all others are back after a second."""
+    """Deny everything to an identity from now on. The hub restarts, and all others are back after a second."""
     with cli_errors(), _disk_errors():
         store = _own_store(resolve_endpoint())
         if who == store.credentials.me:
@@ -216,16 +220,16 @@ examples:
     "--at",
     "site",
     metavar="HOST[:PORT]",
-    help="Use the hub of a site at this address. On its own computer: 127.0.0.1.",
+    help="Use the hub of a site at this address. On the computer of that hub it is 127.0.0.1.",
 )
 def join_hub(words: tuple[str, ...], site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.
 
-    Without HOST the hub is looked for in this network; the code tells the right one from others. With - in the place of
-    both, they are read from stdin: the line that `fleet hub invite --qr` draws for a camera.
+    Without HOST, the command searches for the hub in this network. It finds the right hub by the code. With -
+    instead of both, it reads HOST and CODE from stdin, for example from a camera: `fleet hub invite --qr` draws them.
 
-    From then on every program of yours uses that hub, until `fleet leave`. With the code of `fleet hub invite --site`,
-    this computer becomes the hub of another site, which is linked to the first one.
+    From then on all your programs use that hub, until `fleet leave`. With the code of `fleet hub invite --site`, this
+    computer becomes the hub of another site, which is linked to the first one.
     """
     with cli_errors(), _disk_errors():
         host, code = _host_and_code(words)
@@ -255,7 +259,7 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
 
 @click.command(epilog="\b\nexample:\n  fleet leave")
 def leave() -> None:
-    """Leave the hub that this computer has joined. Its certificate here is deleted."""
+    """Leave the hub that this computer has joined. The certificate on this computer is deleted."""
     with cli_errors(), _disk_errors():
         endpoint, kept = local_hub.leave()
     if not endpoint:

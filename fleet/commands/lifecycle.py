@@ -43,7 +43,7 @@ LOG_POLL_S: Final = 0.2
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -> None:
-    """Show fleet and session, then the cars, then the services that are not running as they should."""
+    """Show the fleet and its session, then the cars, then the services that do not run as they should."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
@@ -96,7 +96,7 @@ def _describe_process(process: Any) -> str:
 @json_option
 @bus_options
 def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Stop every car and end `fleet up`, as Ctrl-C there does. Waits, and reports the result for each car."""
+    """Stop every car and end `fleet up`, as Ctrl-C in its terminal does. Wait, and print the result for each car."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         received: list[Any] = []
@@ -153,7 +153,7 @@ Exit codes: 0 every change is in force, 1 some need a restart of the fleet, 2 th
 @json_option
 @bus_options
 def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Read the fleet file again and apply changes of cars and plan. Says which changes need a restart."""
+    """Read the fleet file again, and apply changes of cars and plan. Print which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
@@ -182,7 +182,7 @@ def _logged(directory: Path) -> list[str]:
 
 @click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs recorder --follow\n  fleet logs red --json")
 @click.argument("name", metavar="CAR|SERVICE", shell_complete=_complete_logs)
-@click.option("-f", "--follow", is_flag=True, help="Go on until Ctrl-C.")
+@click.option("-f", "--follow", is_flag=True, help="Print new lines until Ctrl-C.")
 @json_option
 @bus_options
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:

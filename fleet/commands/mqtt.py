@@ -33,21 +33,21 @@ Home Assistant shows each car by itself. Nothing that comes by MQTT commands a c
     metavar="URL",
     default=f"mqtt://127.0.0.1:{PLAIN_PORT}",
     show_default=True,
-    help="The broker, mqtt://HOST[:PORT], or mqtts:// with TLS.",
+    help="URL of the broker: mqtt://HOST[:PORT], or mqtts:// for TLS.",
 )
-@click.option("--user", metavar="NAME", help=f"Its user. {PASSWORD_VARIABLE} has the password.")
+@click.option("--user", metavar="NAME", help=f"User of the broker. {PASSWORD_VARIABLE} has the password.")
 @click.option(
     "--ca",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="For mqtts://: the authority of the broker's certificate, PEM (default: those of this computer).",
+    help="Trust the authority in this PEM file, for mqtts:// (default: the authorities of this computer).",
 )
 @click.option(
     "--discovery",
     metavar="PREFIX",
     default=DISCOVERY_PREFIX,
     show_default=True,
-    help="First part of the topics of announcements, as set in Home Assistant.",
+    help="First part of the topics for announcements, as set in Home Assistant.",
 )
 @bus_options
 def mqtt(*, broker: str, user: str | None, ca: Path | None, discovery: str, connect: str | None, fleet: str) -> None:

@@ -72,16 +72,17 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, cars: Sequence[str], *, as_json: bool) -> None:
-    """List cars: link, ready or what for it waits, mode, motors and what that rests on, who is in control, battery.
+    """List cars: link, readiness, mode, motors and what shows their state, who is in control, battery.
 
-    SHOWS STOPS: whether the car's reports show that a stop arrived. A car that cannot show it drives and stops like any
-    other. On a narrow terminal columns are left out: platform, shows stops, verdict and more. --json has them all.
+    SHOWS STOPS tells whether the car's reports show that a stop arrived. A car that cannot show this drives and stops
+    like any other. On a narrow terminal, some columns are left out, such as platform, shows stops and verdict. --json
+    prints all of them.
     """
     show_cars(client, resolve_cars(client, cars), as_json=as_json)
 
 
 def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False) -> None:
-    """Print the table of cars. `only`: those of these names."""
+    """Print the table of cars. If `only` has names, the table has only these cars."""
     cars = client.cars()
     latest: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query, so that a hung gateway delays it only once
@@ -204,7 +205,7 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
 
 
 def _cell(row: Mapping[str, Any], name: str) -> str:
-    """Return the cell of a claim: what, basis, and its age if it is old."""
+    """Return the cell of a claim: the claim, its basis, and `stale` if it is old."""
     if row[name] is None:
         return "-"
     basis = [row["claims"][name]["basis"], "stale" if "state/safety" in row["stale"] else None]
@@ -216,11 +217,11 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
     "  fleet get red/sensor/range --last 100\n  fleet get '*/sensor/range' --since 30s --csv > range.csv"
 )
 @click.argument("keyexpr", metavar="KEY", shell_complete=complete_car)
-@click.option("-n", "--last", type=Number(int, 1), help="The last N values of each key, oldest first.")
+@click.option("-n", "--last", type=Number(int, 1), help="Print the last N values of each key, oldest first.")
 @click.option(
     "--since",
     type=Since(history.MAX_HISTORY_S),
-    help="The values since then: 30s or 5m ago, a local time (14:05, yesterday 14:05), or a date.",
+    help="Print the values since TIME: 30s or 5m ago, a local time (14:05, yesterday 14:05), or a date.",
 )
 @click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
 @json_option
@@ -237,7 +238,7 @@ def get(
 ) -> None:
     """Print the latest value of every matching reading, or its history (--last, --since).
 
-    `red` is every sensor of red. `*` stands for any one part of a key.
+    `red` means every sensor of red. `*` stands for any single part of a key.
     """
     written = check_key(written_out(keyexpr, fleet))
     under = topics_under(written)
@@ -282,7 +283,9 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
     "  fleet watch '*/sensor/range' --when 'range_m < 0.3'\n  fleet watch red/sensor/light --when left --count 1"
 )
 @click.argument("keyexpr", metavar="KEY", shell_complete=complete_car)
-@click.option("--when", metavar="CONDITION", help="Only readings for which this is true, such as 'range_m < 0.3'.")
+@click.option(
+    "--when", metavar="CONDITION", help="Print only readings for which this is true, such as 'range_m < 0.3'."
+)
 @click.option("--count", type=Number(int, 1), help="End after N readings.")
 @json_option
 @bus_options
@@ -322,14 +325,14 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     type=Duration(600.0),
     default=f"{SURVEY_S:g}s",
     show_default=True,
-    help="How long rates are measured.",
+    help="How long to measure rates.",
 )
 @json_option
 @bus_options
 def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str | None, fleet: str) -> None:
-    """List everything that is being published: message type, units, rate and age of the newest value.
+    """List everything that is published now: message type, units, rate, and age of the newest value.
 
-    Rate "-": fewer than two messages while measuring. Age "-": nothing received.
+    A rate is "-" if fewer than two messages came in that time. An age is "-" if no message came.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
@@ -413,7 +416,7 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
     "--for",
     "for_s",
     type=Duration(_DAY_S),
-    help="Minimum time for which the condition must be true. With --ready: the same as --timeout.",
+    help="How long the condition must be true at least. With --ready, the same as --timeout.",
 )
 @json_option
 @bus_options
@@ -429,8 +432,8 @@ def wait(
 ) -> None:
     """Wait until CONDITION is true for KEY and print the reading. The latest reading counts unless it is stale.
 
-    With a wildcard any key will do. CONDITION is as in `fleet watch --when`. With --ready, wait for cars instead: a car
-    is ready when its link is open and the state of its motors is known.
+    If KEY has a wildcard, one matching key is enough. CONDITION is written as for `fleet watch --when`. With --ready,
+    wait for cars instead. A car is ready when its link is open and the state of its motors is known.
     """
     if ready:
         cars = [car for word in words for car in word.split(",") if car != "all"]

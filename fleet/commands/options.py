@@ -28,10 +28,10 @@ from_option = click.option(
     "--from",
     "start",
     metavar="TIME",
-    help="Begin here: 90s after the start, -5m before the end, a local time (14:05), or a date.",
+    help="Begin at TIME: 90s after the start, -5m before the end, a local time (14:05), or a date.",
 )
-to_option = click.option("--to", "end", metavar="TIME", help="End before this time, written as for --from.")
-json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object per line.")
+to_option = click.option("--to", "end", metavar="TIME", help="End before TIME, which is written as for --from.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 
 
 def bus_options(function: _Function) -> _Function:
@@ -54,10 +54,14 @@ def serving_options(port: int) -> Callable[[_Function], _Function]:
 
     def add(function: _Function) -> _Function:
         address = click.option(
-            "--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Address to serve at."
+            "--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Serve at this address."
         )
         at = click.option(
-            "--port", type=Number(int, 0, 65535), default=port, show_default=True, help="Port, 0 for any."
+            "--port",
+            type=Number(int, 0, 65535),
+            default=port,
+            show_default=True,
+            help="Serve at this port. With 0, at any free port.",
         )
         return at(address(function))
 

@@ -253,7 +253,7 @@ def _place(ctx: click.Context, _: click.Parameter, value: Path | None) -> None:
 cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="CAR...", callback=_needed)
 any_cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]", callback=_flat)
 car_option = click.option(
-    "--car", "cars", type=CarNames(), multiple=True, metavar="CAR[,CAR...]", callback=_flat, help="Only these cars."
+    "--car", "cars", type=CarNames(), multiple=True, metavar="CAR[,CAR...]", callback=_flat, help="Use only these cars."
 )
 
 
@@ -266,7 +266,7 @@ def session_argument(function: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_place,
-        help="Where SESSION is searched (default: sessions).",
+        help="Search for SESSION in DIR (default: sessions).",
     )
     return place(click.argument("session", type=SessionPath(), default="latest", metavar="[SESSION]")(function))
 

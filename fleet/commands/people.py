@@ -9,13 +9,13 @@ from schemas.commands import COMMANDS, Verb
 
 
 @click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")
-@click.option("--why", default="", metavar="WORDS", help="Why: shown to everyone whose command is refused.")
+@click.option("--why", default="", metavar="WORDS", help="Reason, which everyone sees whose command is refused.")
 @json_option
 @with_client
 def pause(client: Fleet, why: str, *, as_json: bool) -> None:
-    """Stop all cars. Until `fleet unpause` nobody but a lead moves one, also after a restart.
+    """Stop all cars. Until `fleet unpause` nobody but a lead moves a car, even after a restart.
 
-    Without leads in the fleet file any person may pause, and nobody moves a car meanwhile.
+    Without leads in the fleet file, any person may pause, and until the end of the pause nobody moves a car.
     """
     end_with(client, client.pause(why), as_json=as_json)
 
@@ -24,7 +24,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 @json_option
 @with_client
 def unpause(client: Fleet, *, as_json: bool) -> None:
-    """End the pause of the fleet. No car moves by it, and a stopped car stays on hold."""
+    """End the pause of the fleet. This does not move a car, and a stopped car stays on hold."""
     end_with(client, client.unpause(), as_json=as_json)
 
 
@@ -35,22 +35,22 @@ examples:
   fleet lend red --end --as teacher"""
 )
 @cars_argument
-@click.option("--to", metavar="PERSON", shell_complete=complete_people, help="Who gets the cars.")
+@click.option("--to", metavar="PERSON", shell_complete=complete_people, help="Lend the cars to PERSON.")
 @click.option(
     "--for",
     "duration_s",
     type=Duration(COMMANDS[Verb.LEND].max_duration_s),
-    help="For how long, such as 10m; at most 24h.",
+    help="How long to lend them, such as 10m. At most 24h.",
 )
-@click.option("--end", is_flag=True, help="End the loan now. A car that the borrower drives is stopped.")
+@click.option("--end", is_flag=True, help="End the loan now. A car that the borrower drives stops.")
 @json_option
 @with_client
 def lend(
     client: Fleet, cars: tuple[str, ...], *, to: str | None, duration_s: float | None, end: bool, as_json: bool
 ) -> None:
-    """Lend cars to a person: for this time only that person and leads drive them.
+    """Lend cars to a person. During the loan only that person and leads drive them.
 
-    Without leads in the fleet file any person may lend. At the end a car that the borrower drives is stopped.
+    Without leads in the fleet file, any person may lend. When the loan ends, a car stops that the borrower drives.
     """
     if end and (to or duration_s):
         raise click.UsageError("--end ends the loan: leave --to and --for out")

@@ -42,16 +42,21 @@ examples:
 )
 @click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...", shell_complete=complete_car)
 @click.option("--session", type=SessionPath(), help="Explain a car in this recording, at the time of --at.")
-@click.option("--at", "at", metavar="TIME", help="Local time of day (14:05, 14:05:12), or a time in the session.")
+@click.option(
+    "--at",
+    "at",
+    metavar="TIME",
+    help="Explain this moment: a local time of day (14:05, 14:05:12), or a time in the session.",
+)
 @json_option
 @bus_options
 def why(
     subjects: tuple[str, ...], session: Path | None, at: str | None, connect: str | None, fleet: str, *, as_json: bool
 ) -> None:
-    """Explain why a car does what it does: what the plan decided, from which readings, and what would change it.
+    """Explain why a car does what it does: what the plan decided, from which readings, and what would change that.
 
-    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at:
-    what happened to one car around that time of a recording, and why a stop was not shown.
+    Also tell who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at,
+    tell what happened to one car around that time of a recording, and why a stop was not shown.
     """
     if session is not None or at is not None:
         from fleet.commands.why_session import explain_session
@@ -163,9 +168,9 @@ def plan() -> None:
 @json_option
 @bus_options
 def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> None:
-    """Put another plan in force. It is accepted as a whole, or rejected with all its errors.
+    """Put another plan in force. The plan is accepted as a whole, or rejected with all its errors.
 
-    Roles, rules and the phase go on if both plans have them. A stopped plan runs again.
+    Roles, rules and the phase continue if both plans have them. A stopped plan runs again.
     """
     from fleet.policy.plan.parser import parse
     from schemas.yaml_document.document import read_text
@@ -229,7 +234,7 @@ def restart(client: Fleet, *, as_json: bool) -> None:
 @json_option
 @with_client
 def next_phase(client: Fleet, *, as_json: bool) -> None:
-    """Go on to the next phase of the plan, now. Refused if the plan has no phases, or is in its last one."""
+    """Go on to the next phase of the plan now. This is refused if the plan has no phases, or is in its last phase."""
     _request(client, PlanRequest.NEXT, as_json=as_json)
 
 
@@ -239,8 +244,9 @@ def next_phase(client: Fleet, *, as_json: bool) -> None:
 def stop(client: Fleet, *, as_json: bool) -> None:
     """Stop the plan. The coordinator brings the cars that it commands to rest, and makes no more decisions.
 
-    The cars get no hold: anyone may drive them at once. Cars that a person has stopped or drives stay as they are.
-    Go on with `fleet plan restart` or `fleet plan set`. Under one `fleet up`, a restarted coordinator stays stopped.
+    The cars get no hold, so anyone may drive them at once. Cars that a person has stopped or drives stay as they are.
+    Continue with `fleet plan restart` or `fleet plan set`. While `fleet up` runs, a coordinator that restarts does not
+    run the stopped plan again.
     """
     _request(client, PlanRequest.STOP, as_json=as_json)
 

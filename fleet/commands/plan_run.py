@@ -44,14 +44,14 @@ a plan:
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="The fleet file with the cars' capabilities and roles.",
+    help="Read the cars' capabilities and roles in this fleet file.",
 )
 @click.option(
     "--run",
     "run_name",
     default="",
     metavar="NAME",
-    help="Name of a run of `fleet up`. Within one run, phase and rules survive a restart of the coordinator.",
+    help="Name of the run of `fleet up`. Within a run, phase and rules survive a restart of the coordinator.",
 )
 @starter_option()
 @json_option
@@ -66,7 +66,7 @@ def run(
     starter: int | None,
     as_json: bool,
 ) -> None:
-    """Run a plan until Ctrl-C. Prints one line per decision. Cars you stopped are left alone."""
+    """Run a plan until Ctrl-C, and print one line per decision. It leaves cars alone that you have stopped."""
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
     file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)

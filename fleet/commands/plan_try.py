@@ -42,21 +42,21 @@ Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="What the cars may do (default: the copy in the session, if there is one).",
+    help="Read in FILE what the cars may do (default: the copy in the session, if there is one).",
 )
 @click.option(
     "--tolerance",
     default=f"{TOLERANCE_S:g}s",
     show_default=True,
     type=Duration(60.0, 0.1),
-    help="Time by which the same decision may come earlier or later.",
+    help="Let the same decision come earlier or later by this time.",
 )
 @json_option
 def try_plan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
     """Replay the recorded sensor data through a plan and show where it would have decided differently.
 
-    Without PLAN it takes the session's own plan. The cars' messages stay as recorded, whatever the plan decides. They
-    include a person's stops and drives.
+    Without PLAN, it uses the session's own plan. Whatever the plan decides, the cars' messages stay as recorded, with
+    the stops and drives by people.
     """
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet

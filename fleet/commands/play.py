@@ -46,11 +46,15 @@ Look at it with `fleet list --fleet fleet-replay`, or run your own program on it
 @click.option(
     "--as", "name", metavar="NAME", help="Name of the replayed fleet (default: the recorded name with -replay)."
 )
-@click.option("--rate", default=1.0, type=Number(float, 0.01, 1000.0), help="Speed factor.")
+@click.option("--rate", default=1.0, type=Number(float, 0.01, 1000.0), help="Play FACTOR times as fast.")
 @click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
-@click.option("--offset", metavar="TIME", help="Start at this time; with --loop in the first round only.")
-@click.option("--skip-gaps", "skip_gaps_s", type=Duration(_DAY_S), help="Shorten longer pauses to this, such as 5s.")
-@click.option("--cars-only", is_flag=True, help="Leave out the messages of coordinator, recorder and supervisor.")
+@click.option("--offset", metavar="TIME", help="Start at this time. With --loop, only the first round starts there.")
+@click.option(
+    "--skip-gaps", "skip_gaps_s", type=Duration(_DAY_S), help="Shorten longer pauses to DURATION, such as 5s."
+)
+@click.option(
+    "--cars-only", is_flag=True, help="Leave out the messages of the coordinator, the recorder and the supervisor."
+)
 @connect_option()
 def play(
     session: Path,
@@ -66,9 +70,9 @@ def play(
     cars_only: bool,
     connect: str | None,
 ) -> None:
-    """Publish a session again for your own programs, as a fleet of another name with the original timing.
+    """Publish a session again for your own programs, as a fleet with another name and with the original timing.
 
-    No car moves: a replayed fleet takes no commands.
+    No car moves, because a replayed fleet accepts no commands.
     """
     from fleet.commands.session_part import part_of
     from fleet.recording.reading.session import NoSession, Session

@@ -30,13 +30,13 @@ examples:
 @click.option("--csv", "as_csv", is_flag=True, help="Write CSV.")
 @json_option
 def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool, as_json: bool) -> None:
-    """Answer an SQL question about every session in DIR (default: sessions). SQL: that of DuckDB, or - for stdin.
+    """Answer an SQL question about all sessions in DIR (default: sessions). With - for SQL, read it from stdin.
 
-    Each topic is a table, such as sensor_range or event_command, with the columns of `fleet sessions export` and the
-    session. Tables named ..._context add mode, motion, driver and plan of that moment. Times are UTC.
-    Who sent a command is a process (tom@host-4711): person_of(sender) is the person.
-    Sessions that are not whole are named, and their intact part counts. The exit code is 1 if none could be read, or
-    if no disk has room for the tables.
+    SQL is that of DuckDB. Each topic is a table, such as sensor_range or event_command, with the columns of `fleet
+    sessions export` and the column session. Tables named ..._context add the mode, motion, driver and plan at that
+    time. Times are UTC. The sender of a command is a process (tom@host-4711): person_of(sender) is the person.
+    Sessions that are not whole are listed, and their intact part counts. The exit code is 1 if no session could be
+    read, or if no disk has room for the tables.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing

@@ -82,8 +82,8 @@ examples:
   fleet record run --sessions /media/disk --segment-time 5m
   fleet record run --site north
 
-The quota takes whole files, the oldest of all sessions first. It takes last those around stops, marks, and what pin:
-of the fleet file says, and nothing of marked sessions."""
+The quota removes whole files, the oldest of all sessions first. It removes last the files around stops, marks, and
+what `pin:` in the fleet file lists. It never removes files of marked sessions."""
 )
 @click.option(
     "--sessions",
@@ -92,7 +92,7 @@ of the fleet file says, and nothing of marked sessions."""
     show_default=True,
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Directory in which the session's directory is created.",
+    help="Create the session's directory in DIR.",
 )
 @click.option(
     "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="Maximum size of a file."
@@ -107,17 +107,18 @@ of the fleet file says, and nothing of marked sessions."""
     type=Choice("time to sync", ("never", "segment", "second")),
     default="segment",
     show_default=True,
-    help="How often data is forced to disk. Matters only if the computer itself crashes.",
+    help="How often data is forced to disk. This matters only if the computer itself crashes.",
 )
 @click.option(
     "--session-size",
     type=SizeType(10**6),
-    help="Maximum size of a session. Then the next one begins. With --quota at most half of it (default: a tenth).",
+    help="Maximum size of a session, after which the next session begins. With --quota at most half of the quota "
+    "(default: a tenth).",
 )
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="Maximum size of all sessions in --sessions. The oldest minutes that nothing pins are removed.",
+    help="Maximum size of all sessions in --sessions. Beyond it, the oldest minutes that nothing pins are removed.",
 )
 @click.option(
     "--keep-free",
@@ -236,7 +237,7 @@ def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FB
 
 
 def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[], People | None]]":
-    """Return what a fleet file pins, and what reads its people, as they are then.
+    """Return what a fleet file pins, and a function that reads its people as they are when it is called.
 
     Recording goes on without the pins of a file with mistakes.
     """
@@ -326,7 +327,7 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Show what is being recorded, where to, how much was lost, and whether there is room. Also of other sites."""
+    """Show what is recorded now and where to, at all sites, how much was lost, and whether there is room."""
     _show_status(_query(RecorderVerb.STATUS, connect, fleet), as_json=as_json)
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
@@ -339,7 +340,7 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")
 @click.argument("text", metavar="WORDS")
-@click.option("--by", metavar="NAME", help="Author of the mark (default: your sender name).")
+@click.option("--by", metavar="NAME", help="Author of the mark (default: your name as a sender).")
 @bus_options
 def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
     """Add a note to the running recording. The quota does not remove a marked session."""

@@ -25,18 +25,18 @@ examples:
   fleet sessions redecode
   fleet sessions redecode tests/vectors/recorded/tracking.jsonl
 
-Exit codes: 0 no difference, 1 some, or nothing to decode."""
+Exit codes: 0 no differences, 1 differences, or nothing to decode."""
 )
 @session_argument
 @car_option
 @click.option(
     "--platform",
     metavar="PLATFORM",
-    help="Platform to use instead of the recorded one: arduino, raspberry_pi, stm32+imu.",
+    help="Use this platform instead of the recorded one: arduino, raspberry_pi, stm32+imu.",
 )
 @json_option
 def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
-    """Decode the recorded raw bytes with this version and list differences.
+    """Decode the recorded raw bytes with this version, and list the differences from the recorded readings.
 
     SESSION may also be a vector that `fleet sessions vector` made. Decoding uses the recorded platform and mode.
     """
@@ -181,7 +181,7 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     required=True,
     metavar="CAR",
     callback=lambda _ctx, _param, value: keys.check_name(value),
-    help="Whose frames.",
+    help="Take the frames of this car.",
 )
 @from_option
 @to_option
@@ -191,11 +191,11 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.jsonl",
-    help="The vector's file; a new one.",
+    help="Write the vector to this file, which must not exist.",
 )
-@click.option("--source", metavar="WORDS", help="Where it is from, in words (default: the session and the car).")
+@click.option("--source", metavar="WORDS", help="Tell where the frames are from (default: the session and the car).")
 def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
-    """Write a part of a session as a test vector: raw frames with their times, and their decoded readings.
+    """Write a part of a session as a test vector: raw frames with their times, and the decoded readings.
 
     `fleet sessions redecode FILE.jsonl` compares it with the decoder of this version.
     """

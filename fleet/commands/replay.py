@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="OUT.rrd",
-    help="Write a file with its layout instead of opening the viewer. `rerun OUT.rrd` shows it.",
+    help="Write a file (with its layout) instead of opening the viewer. `rerun OUT.rrd` shows it.",
 )
 def replay(
     session: Path,

@@ -40,7 +40,7 @@ examples:
 """,
 )
 def sessions() -> None:
-    """List, inspect, check, repair, cut and export recordings. Without a command, list those of a directory."""
+    """List, inspect, check, repair, cut and export recordings. Without a command, list the recordings in DIR."""
 
 
 sessions.add_command(redecode)
@@ -54,10 +54,9 @@ _new_session = partial(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="The new session's directory.",
 )
-out_option = _new_session()
-required_out_option = _new_session(required=True)
+out_option = _new_session(help="Write the new session to DIR (default: SESSION-recovered, beside the session).")
+required_out_option = _new_session(required=True, help="Write the new session to DIR.")
 
 
 @contextmanager
@@ -96,7 +95,7 @@ def _open(path: Path) -> "Session":
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, stops, marks and cars.
 
-    A stop of several cars counts once, whoever asked for it. Damaged sessions are in the list, with what is wrong.
+    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and their damage.
     """
     _show(_summaries(directory), as_json=as_json)
     if not as_json:
@@ -121,7 +120,7 @@ def _say_removed(place: Path) -> None:
 def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date.
 
-    The exit code is 1 if there is none.
+    The exit code is 1 if no session ran then.
     """
     now_s = time.time()
     try:
@@ -187,7 +186,7 @@ def _size(count: int) -> str:
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
-    """Show what a session holds: versions, cars, keys with their rates, marks, lost messages.
+    """Show what is in a session: versions, cars, keys with their rates, marks, lost messages.
 
     The exit code is 1 if no message could be read.
     """
@@ -246,7 +245,7 @@ def _say_contents(about: "SessionSummary") -> None:
 def verify(session: Path, *, as_json: bool) -> None:
     """Check a recording: checksums, missing messages, schemas, clocks.
 
-    It lists exactly what is missing. The exit code is 1 if anything is.
+    The command lists exactly what is missing. The exit code is 1 if anything is missing.
     """
     from fleet.recording.tools.summary import growing, total
     from fleet.recording.tools.verify import verify as look
@@ -266,7 +265,7 @@ def verify(session: Path, *, as_json: bool) -> None:
 @session_argument
 @out_option
 def recover(session: Path, out: Path | None) -> None:
-    """Repair: copy everything readable from a damaged recording into a new one."""
+    """Repair a damaged recording: copy everything readable into a new session."""
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.transform import recover as make
 
@@ -287,9 +286,9 @@ example:
 @click.argument("several", nargs=-1, required=True, type=SessionPath(), metavar="SESSION SESSION...")
 @required_out_option
 def merge(several: tuple[Path, ...], out: Path) -> None:
-    """Merge what several recorders of one fleet have recorded at the same time, such as on two sites.
+    """Merge what several recorders of one fleet recorded at the same time, for example at two sites.
 
-    A message that several have got is written once. The order is that of the recorders' clocks.
+    A message that several recorders received is written once. The recorders' clocks decide the order of the messages.
     """
     from fleet.recording.tools.transform import merge as make
 
@@ -315,7 +314,7 @@ examples:
 @car_option
 @required_out_option
 def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
-    """Copy a part of a session into a new one."""
+    """Copy a part of a session into a new session."""
     from fleet.recording.tools.transform import cut as make
 
     with _session_errors():
@@ -331,21 +330,25 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
     "  fleet sessions export --ros2 bag\n  fleet sessions export --foxglove foxglove\n",
 )
 @session_argument
-@click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV here.")
+@click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV to DIR.")
 @click.option(
-    "--parquet", "parquet", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write Parquet here."
+    "--parquet",
+    "parquet",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Write Parquet to DIR.",
 )
 @click.option(
-    "--ros2", "ros2", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write a ROS 2 bag here."
+    "--ros2", "ros2", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write a ROS 2 bag to DIR."
 )
 @click.option(
     "--foxglove",
     "foxglove",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Write one MCAP file with one schema per topic here, and a layout for its cars.",
+    help="Write to DIR one MCAP file with one schema per topic, and a layout for its cars.",
 )
-@click.option("--nanoseconds", is_flag=True, help="Write the times of Parquet in nanoseconds (default microseconds).")
+@click.option("--nanoseconds", is_flag=True, help="Write the times in Parquet in nanoseconds (default: microseconds).")
 def export(
     session: Path,
     csv: Path | None,
@@ -355,11 +358,12 @@ def export(
     *,
     nanoseconds: bool,
 ) -> None:
-    """Write a session as tidy tables, one file for each type of message, or for ROS 2 or Foxglove, to a new directory.
+    """Write a session to a new directory: as tidy tables, as a ROS 2 bag, or as a file for Foxglove.
 
-    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC, in Parquet in microseconds.
-    Units are in the columns' names, in Parquet also in the fields' metadata. Messages that are not protobuf are in
-    `other`. A bag has standard messages only (docs/how-to/look-at-a-recording.md).
+    There is one table for each type of message. Its columns are key, car, log_time, publish_time, sequence, then the
+    fields. Times are UTC, in Parquet in microseconds. The names of columns contain the units. In Parquet, the metadata
+    of the fields has them, too. Messages that are not protobuf are in the table `other`. A bag contains only standard
+    messages (docs/how-to/look-at-a-recording.md).
     """
     from fleet.commands.session_export import export_foxglove, export_ros2, export_tables
 

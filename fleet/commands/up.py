@@ -46,40 +46,47 @@ examples:
   fleet up --sim 8 --console     # with the web page
   fleet up --detach && fleet drive red forward --for 1s; fleet down
 
-Without FILE and --sim it takes ./fleet.yaml. The start ends with one line: all cars are ready, or who is missing and
-why. With --sim and --json, lines on stdin go to the simulator (gateway sim --help). If a car cannot be stopped at the
-end, fresh gateways try again until the next Ctrl-C.
+Without FILE and --sim, the file is ./fleet.yaml. The start ends with one line: all cars are ready, or which cars are
+missing and why. With --sim and --json, lines on stdin go to the simulator (`gateway sim --help`). If a car cannot be
+stopped at the end, new gateways try again until the next Ctrl-C.
 
---detach returns when all cars are ready. It also returns if no further car becomes ready for 30 s (10 s if only links
-cannot be opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log, `fleet down` ends it.
+With --detach the command returns when all cars are ready. It also returns if no further car becomes ready for 30 s
+(10 s if only links cannot be opened). In both cases the fleet goes on running: `fleet logs supervisor` shows its log,
+`fleet down` ends it.
 
-Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not, nothing came up, or not everything was
+Exit codes: 0 every car was stopped (--detach: all are ready), 1 a car was not, nothing started, or not everything was
 recorded, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--sim", "simulated", type=Number(int, 1, MAX_SIMULATED_CARS),
-              help="Simulate N cars: those of the file first, whatever their link.")  # fmt: skip
+              help="Simulate N cars: first the cars in the file, whatever their link.")  # fmt: skip
 @click.option(
     "--plan",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="What the cars shall do (default: as the file says).",
+    help="Run this plan (default: as in the fleet file).",
 )
-@click.option("--world", type=click.Path(path_type=Path, dir_okay=False), help="The simulated cars' world.")
-@click.option("--record/--no-record", default=None, help="Record everything (the default, unless the file says no).")
+@click.option(
+    "--world", type=click.Path(path_type=Path, dir_okay=False), help="Put the simulated cars into this world."
+)
+@click.option(
+    "--record/--no-record",
+    default=None,
+    help="Record everything, or nothing (default: as in the fleet file, or record).",
+)
 @click.option(
     "--sessions",
     "out",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Where sessions go (default: as the file says, or sessions).",
+    help="Write sessions to DIR (default: as in the fleet file, or sessions).",
 )
-@click.option("--console", is_flag=True, help="Serve the fleet as a web page on this computer, too.")
-@click.option("--console-port", type=Number(int, 1, 65535), help="The same on this port (default: 7480).")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object for each thing that happens.")
+@click.option("--console", is_flag=True, help="Also serve the fleet as a web page on this computer.")
+@click.option("--console-port", type=Number(int, 1, 65535), help="Serve the web page at this port (default: 7480).")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for each event.")
 @connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
 @fleet_option(default=None)
-@click.option("--insecure-lan", is_flag=True, help="Open the bus to a network: everyone there can drive the cars.")
-@click.option("--secure", is_flag=True, help="Give everybody a certificate: nobody else on this computer gets in.")
+@click.option("--insecure-lan", is_flag=True, help="Open the bus to a network. Everyone there can drive the cars.")
+@click.option("--secure", is_flag=True, help="Give everybody a certificate. No other user of this computer gets in.")
 @click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
 @click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")
 def up(
@@ -250,7 +257,7 @@ def _follow_start(child: "subprocess.Popen[str]", *, as_json: bool) -> int:
 
 
 def _append_output_to(path: Path) -> None:
-    """Append stdout and stderr to this file: nobody reads the pipe any more."""
+    """Append stdout and stderr to this file, because nobody reads the pipe any more."""
     sys.stdout.flush()
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     for stream in (sys.stdout, sys.stderr):

@@ -27,24 +27,26 @@ LAYOUT_DELAY_S: Final = 1.5
 
 
 @click.command(epilog="\b\nexamples:\n  fleet view\n  fleet view --web\n  fleet view --save now.rrd --for 30s")
-@click.option("--web", is_flag=True, help="Serve the viewer as a web page on this machine only, and print its address.")
+@click.option(
+    "--web", is_flag=True, help="Serve the viewer as a web page on this computer only, and print its address."
+)
 @click.option(
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="OUT.rrd",
-    help="Write a file that carries its layout instead of opening the viewer.",
+    help="Write a file (with its layout) instead of opening the viewer.",
 )
-@click.option("--for", "seconds", type=Duration(_DAY_S), help="End after this time.")
+@click.option("--for", "seconds", type=Duration(_DAY_S), help="End after DURATION.")
 @click.option(
     "--memory",
     default=MEMORY,
     show_default=True,
     metavar="SIZE",
-    help="Maximum memory of the viewer; the oldest data is dropped first.",
+    help="Maximum memory of the viewer. It drops the oldest data first.",
 )
 @bus_options
 def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
-    """Show the fleet live in Rerun, until you close its window or press Ctrl-C. Cars go on."""
+    """Show the fleet live in Rerun, until you close its window or press Ctrl-C. The cars go on."""
     if web and save is not None:
         raise click.UsageError("Give --web or --save, not both.")
     if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):

@@ -28,60 +28,65 @@ PARENT_CHECK_INTERVAL_S: Final = 0.1
 RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
-Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A link that comes back
-under another name is printed again: a plain pty after each link_drop; pty:PATH keeps its name.
+The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. A plain
+pty has another name after each link_drop: then the line is printed again. The link pty:PATH keeps its name.
 
-options of a platform, for the cars that people have; several are joined (--car red:arduino+arm+interval=0.71:pty):
-  +arm +imu                             an arm, a gyroscope
-  +text                                 prints the line EXEC:F after each general frame
-  +no_readings                          sends nothing at all
-  +3s                                   three battery cells: up to 12.6 V
+options of a platform that real cars have, too; join several with + (--car red:arduino+arm+interval=0.71:pty):
+  +arm +imu                             the car has an arm, a gyroscope
+  +text                                 the car prints the line EXEC:F after each general frame
+  +no_readings                          the car sends nothing at all
+  +3s                                   the battery has three cells: up to 12.6 V
   +fan_level                            the fan digit is a level: 0 turns the fan off in every frame
-  +ptz_direct                           the servo goes to the angle of the frame, not to 180 degrees minus it
-  +head=WORD                            another first word than 4WD in the frames, 2 to 8 letters and digits
+  +ptz_direct                           the servo goes to the angle in the frame, not to 180 degrees minus the angle
+  +head=WORD                            frames begin with WORD instead of 4WD: 2 to 8 letters and digits
 options of the simulator only:
-  +interval=S +spread=S                 S seconds from report to report (0.1 to 10), each up to +-S longer (0 to 1)
-  +timer                                reports come by a hardware timer: no frame delays them (arduino)
-  +close=S                              MODEx0 blocks for S seconds (0 to 10; arduino)
-  +last_frame                           of several frames in the buffer the last one counts (arduino)
-  +silent=MODE                          prints nothing in this mode; may be repeated (arduino, stm32)
-  +gray=MAX +constants                  the grayscale goes up to MAX; constants for line, obstacle, light and grayscale
-                                        (arduino, stm32)
-  +mission +no_encoder +quiet           its boot mission drives; the left encoder counts nothing; it repeats no line
-  +arm +gimbal                          it reports an arm in the place of angles; it searches a gimbal that is not there
-                                        (wave_rover, ugv01, ugv02, ugv_rover, ugv_beast; no other option)
-an stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows the frames of
-the motions, dies at any other and sends nothing.
-faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
-  --fault red:link_drop@5+2             gone for 2 s; without +2 until you end it
-  --fault red:rename@5+2                comes back as another device: pty:PATH points to a new one, a plain pty and TCP
-                                        have a new link; ,path=/tmp/other: back at that path instead
-  --fault red:cut_write@5+2,bytes=7     of the next frame to the car 7 bytes come through, then the link is gone for 2 s
-  --fault red:slow@5+10,factor=0.1      both ways at a tenth of 960 bytes/s, byte by byte
-  --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: one way only
-  --fault red:stuck@5+10                stops reading: writes block (pty), or pile up in the system's buffers (TCP)
-  --fault red:deaf@5+10                 reads every byte and ignores it
-  --fault red:mute@5+10                 obeys, and sends nothing
-  --fault red:echo@5+10                 sends every byte back, and obeys it
-  --fault red:firehose@5+10,rate=1e6    random bytes/s besides its readings; ,of=frame: a frame that never ends
-  --fault red:garbage@5+200             200 random bytes to the host; ,to=car: the other way
-  --fault brownout@10                   every car resets; only red with red: before it
-  --fault red:empty@5+20                its battery runs empty within 20 s; then it is off, and its link is gone
-faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends a fault (rename and
-cut_write end as link_drop does); without "for_s" a fault lasts until then:
+  +interval=S                           the time from report to report is S seconds (0.1 to 10)
+  +spread=S                             each time from report to report is up to S seconds longer or shorter (0 to 1)
+  +timer                                a hardware timer sends the reports, so no frame delays them (arduino)
+  +close=S                              MODEx0 blocks the car for S seconds (0 to 10; arduino)
+  +last_frame                           if several frames are in the buffer, only the last one counts (arduino)
+  +silent=MODE                          the car prints nothing in this mode; may be repeated (arduino, stm32)
+  +gray=MAX                             the grayscale values go up to MAX (arduino, stm32)
+  +constants                            the values of line, obstacle, light and grayscale never change (arduino, stm32)
+options of wave_rover, ugv01, ugv02, ugv_rover and ugv_beast, which have no others:
+  +mission                              the car drives in the mission that it runs after its boot
+  +no_encoder                           the left encoder counts nothing
+  +quiet                                the car does not repeat the lines that it gets
+  +arm                                  the car reports an arm instead of angles
+  +gimbal                               the car searches for a gimbal that is not there
+An stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows only the
+frames of the motions. It dies at any other frame, and sends nothing.
+faults on the command line (AMOUNT is seconds, but bytes for garbage; --fault may be repeated):
+  --fault red:link_drop@5+2             the link is gone for 2 s; without +2 until you end the fault
+  --fault red:rename@5+2                the car comes back as another device: pty:PATH points to it, a plain pty and TCP
+                                        have a new link; with ,path=/tmp/other it comes back at that path
+  --fault red:cut_write@5+2,bytes=7     only 7 bytes of the next frame reach the car, then the link is gone for 2 s
+  --fault red:slow@5+10,factor=0.1      both directions run at a tenth of 960 bytes/s, byte by byte
+  --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: only in this direction
+  --fault red:stuck@5+10                the car stops reading: writes block (pty), or fill the system's buffers (TCP)
+  --fault red:deaf@5+10                 the car reads every byte and ignores it
+  --fault red:mute@5+10                 the car obeys, but sends nothing
+  --fault red:echo@5+10                 the car obeys, and sends every byte back
+  --fault red:firehose@5+10,rate=1e6    the car sends so many random bytes/s beside its readings; with ,of=frame they
+                                        are a frame that never ends
+  --fault red:garbage@5+200             200 random bytes reach the host; with ,to=car they reach the car
+  --fault brownout@10                   every car resets; with red: before it, only red
+  --fault red:empty@5+20                the battery runs empty within 20 s; then the car is off, and its link is gone
+Faults on stdin are one JSON object per line. One line on stdout answers each. "for_s": 0 ends a fault (rename and
+cut_write end as link_drop does); without "for_s", a fault lasts until you end it:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
-infrared remote, which only an Arduino or STM32 car in mode remote_control obeys (of the ugv cars: their web page);
-buttons: forward, back, left, right, spin_left, spin_right, stop, whistle, faster, slower; it holds until the next:
-  --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
-worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
-other's way come from a file; `fleet example copy follow` writes one with a comment for each field. On stdin:
-  {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (of a carried one: ahead, left)
-  {"thing": "cart", "x_m": 1, "y_m": 0} stays there, off its path; or "speed_m_s" along it
-the true state:
-  {"car": "red", "ask": "truth"}        mode, motors, pose, ...; of a replay: bytes sent and ignored, rounds
-  {"ask": "world"}                      every lamp and thing: where, whether it is on, how large, how fast
-replay: a file of `gateway monitor --raw` plays as a car, with its timing. It ignores what you send to it. Over TCP it
-begins when a host connects, over a pty at once:
+The infrared remote: only an Arduino or STM32 car in mode remote_control obeys it. For a ugv car it is the web page.
+A button counts until the next one: forward, back, left, right, spin_left, spin_right, stop, whistle, faster, slower.
+  --ir red:forward@5                    on stdin {"car": "red", "ir": "forward"}
+Worlds from a file have lamps that light sensors see, things to bump into and to follow, and cars that see each other
+and are in each other's way. `fleet example copy follow` writes such a file with a comment for each field. On stdin:
+  {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (for a lamp on a car: ahead, left)
+  {"thing": "cart", "x_m": 1, "y_m": 0} puts it there, off its path; or "speed_m_s" for its speed along its path
+The true state, on stdin:
+  {"car": "red", "ask": "truth"}        mode, motors, pose, ...; for a replay: bytes sent and ignored, rounds
+  {"ask": "world"}                      every lamp and thing: where it is, whether it is on, its size and speed
+Replays: a file of `gateway monitor --raw` is played as a car, with its timing. It ignores what you send to it. Over TCP
+it begins when a host connects, over a pty at once:
   gateway sim --replay red.raw:red:tcp --loop --rate 2
 """
 
@@ -89,7 +94,7 @@ begins when a host connects, over a pty at once:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.description = (
-        "Simulated cars that behave as the real ones do, hazards included, in one world and one process."
+        "Run simulated cars that behave like real ones, with their hazards, in one world and one process."
     )
     parser.epilog = EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -98,49 +103,65 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:PLATFORM:LINK",
-        help="PLATFORM: arduino, stm32, raspberry_pi, course, wave_rover, ugv01, ugv02, ugv_rover or ugv_beast, with "
-        "options such as +arm, see below; LINK: pty, pty:PATH or tcp://HOST:PORT",
+        help="a simulated car; may be repeated. PLATFORM is arduino, stm32, raspberry_pi, course, wave_rover, ugv01, "
+        "ugv02, ugv_rover or ugv_beast, with options such as +arm (see below). LINK is pty, pty:PATH, tcp or "
+        "tcp://HOST:PORT",
     )
-    parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behavior (default: 0)")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of everything random: with the same seed and the same bytes, cars behave the same (default: 0)",
+    )
     parser.add_argument(
         "--world",
         metavar="WORLD",
         default="room",
-        help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
-        "and cars that meet, as `fleet example show follow` prints (default: room)",
+        help="room has walls and a line to track, open has nothing, so no ranging has an echo. Or a file with lamps, "
+        "things and cars that meet, as `fleet example show follow` prints it (default: room)",
     )
-    parser.add_argument("--check", action="store_true", help="only check the world, for these cars or (no --car) any")
+    parser.add_argument(
+        "--check", action="store_true", help="only check the world, for these cars, or without --car for any cars"
+    )
     parser.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="[CAR:]FAULT@S[+AMOUNT][,FIELD=VALUE]",
-        help="a fault S seconds after the start, see below",
+        help="cause a fault S seconds after the start (see below)",
     )
     parser.add_argument(
-        "--ir", action="append", default=[], metavar="[CAR:]BUTTON@S", help="press a button of the infrared remote"
+        "--ir",
+        action="append",
+        default=[],
+        metavar="[CAR:]BUTTON@S",
+        help="press a button of the infrared remote S seconds after the start (see below)",
     )
     parser.add_argument(
         "--replay",
         action="append",
         default=[],
         metavar="FILE[:NAME[:LINK]]",
-        help="a capture as a car (default: replay, on a pty)",
+        help="play a capture as a car. NAME is replay and LINK is pty unless you give others",
     )
-    parser.add_argument("--loop", action="store_true", help="play captures over and over, 1 s between two rounds")
+    parser.add_argument(
+        "--loop", action="store_true", help="play captures again and again, with 1 s between two rounds"
+    )
     parser.add_argument("--rate", type=float, metavar="FACTOR", help="speed of captures, as a factor (default: 1)")
     parser.add_argument(
-        "--fleet", default=keys.DEFAULT_FLEET, help="fleet under which the cars publish their true state"
+        "--fleet",
+        default=keys.DEFAULT_FLEET,
+        help="name of the fleet under which the cars publish their true state (default: fleet)",
     )
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="hub for the true state (default: FLEET_ENDPOINT, else loopback)"
+        "--connect", metavar="ENDPOINT", help="hub for the true state (default: FLEET_ENDPOINT, or loopback)"
     )
-    parser.add_argument("--no-truth", action="store_true", help="publish nothing, use no bus")
+    parser.add_argument("--no-truth", action="store_true", help="do not publish the true state, and do not use a bus")
     parser.add_argument("--parent", metavar="PID", type=int, help=argparse.SUPPRESS)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGINT or SIGTERM; return the exit code."""
+    """Run until SIGINT or SIGTERM, and return the exit code."""
     try:
         if args.check:
             _world(args.world, [spec.name for spec in parse_cars(args.car)] or None)
@@ -166,7 +187,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, CaptureCar]]:
-    """Read the captures whole, before any link opens; raise BadSpec."""
+    """Read all captures, before any link opens. Raises BadSpec if one cannot be read or played."""
     if not replays and not args.car:
         raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
     if not replays and (args.loop or args.rate is not None):
@@ -183,7 +204,7 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
         except OSError as error:
             raise BadSpec(f"{spec.path}: {error.strerror}: write FILE[:NAME[:LINK]]") from None
         except ValueError as error:  # a NUL in the path
-            raise BadSpec(f"{spec.path!r} is no path: {error}") from None
+            raise BadSpec(f"{spec.path!r} is not a path: {error}") from None
         if not pieces:
             raise BadSpec(f"{spec.path}: the capture has no bytes to play")
         found.append((spec, CaptureCar(pieces, rate=rate, loop=args.loop)))
@@ -191,7 +212,7 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
 
 
 def _world(words: str, cars: list[str] | None) -> World:
-    """Return a world by its name or from its file; raise BadSpec."""
+    """Return a world by its name or from its file. Raises BadSpec if the file is wrong."""
     if words in WORLDS:
         return WORLDS[words]()
     # Imported only for a world file: the simulator starts faster without YAML.

@@ -13,7 +13,7 @@ from gateway.link import BadUrl, LinkError, LinkUrl
 from schemas.duration import parse_duration
 from schemas.process import startup, stdio
 
-PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; with options as in arduino+arm (default unknown)"
+PLATFORM_HELP: Final = "the car: arduino, stm32 or raspberry_pi, with options as in arduino+arm (default: unknown)"
 _UNPRINTABLE: Final = re.compile(r"[^ -\[\]-~]")
 _COLORS: Final = {"red": "31", "yellow": "33", "cyan": "36", "dim": "2"}
 
@@ -55,7 +55,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def duration(option: str, text: str, min_s: float, max_s: float) -> float:
-    """Return the duration of an option in seconds; raise WrongUse."""
+    """Return the duration of an option in seconds. Raises WrongUse if it is not allowed."""
     try:
         return parse_duration(text, min_s, max_s)
     except ValueError as error:
@@ -63,7 +63,7 @@ def duration(option: str, text: str, min_s: float, max_s: float) -> float:
 
 
 def profile_of(text: str) -> Profile:
-    """Return the profile of `--platform`; raise WrongUse."""
+    """Return the profile of `--platform`. Raises WrongUse if there is no such platform."""
     try:
         return parse_platform(text)
     except ValueError as error:

@@ -24,15 +24,16 @@ from gateway.tools.statistics import LinkStatistics, describe
 from schemas.links import LINK_HELP
 from schemas.words import FrameVerdict, Platform
 
-DESCRIPTION: Final = "Show what a car sends, decoded beside the raw bytes. Send nothing; Ctrl-C ends."
+DESCRIPTION: Final = "Show what a car sends until Ctrl-C: the decoded readings beside the raw bytes. Send nothing."
 EPILOG: Final = """\
 examples:
   gateway monitor --link /dev/ttyUSB0 --platform arduino
   gateway monitor --link /dev/ttyUSB0 --raw morning.jsonl       save the bytes with their times
   gateway monitor --from morning.jsonl --json                   show them again
 
-A line has only what the frame's mode measures; the rest of the frame is filler. Times are seconds since the start.
-Opening a serial port can reset an Arduino that is on a USB cable; it sends again after about three seconds."""
+A line shows only what the car measures in the mode of the frame. The rest of a frame is filler. Times are seconds
+since the start. Opening a serial port can reset an Arduino that is on a USB cable. The Arduino sends again after about
+three seconds."""
 
 _RAW_WIDTH: Final = 46  # a sensors frame in its longest observed spelling
 
@@ -44,14 +45,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--link", metavar="URL", help=LINK_HELP)
     source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="show a file that --raw wrote")
     parser.add_argument(
-        "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + "; decides what is filler"
+        "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + ". It decides what is filler"
     )
     parser.add_argument("--raw", type=Path, metavar="FILE", help="save the bytes with their times in a new file")
-    parser.add_argument("--json", action="store_true", help="one JSON object per event, and a summary at the end")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per event, and a summary at the end")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Listen until Ctrl-C, or read the file; return the exit code."""
+    """Listen until Ctrl-C, or read the file, and return the exit code."""
     return cli_support.run_command("gateway monitor", lambda: _run(arguments))
 
 
@@ -159,7 +160,7 @@ class MonitorOutput:
         self.statistics.since = at
 
     def feed(self, piece: capture.CapturedBytes) -> None:
-        """Print the events that these bytes complete; raise OSError of the output."""
+        """Print the events that these bytes complete. Raises OSError if the output is closed."""
         self.statistics.bytes += len(piece.data)
         self.statistics.until = piece.at
         self._print(self._decoder.feed(piece.data, piece.at))

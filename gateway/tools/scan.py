@@ -26,13 +26,14 @@ from schemas.words import LinkVerdict
 DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
 EPILOG: Final = """\
 examples:
-  gateway scan                              list and listen; nothing is sent
-  gateway scan --json                       one JSON object a line
-  gateway scan --link /dev/ttyUSB0 --probe  stop the car there; wake a silent one
+  gateway scan                              list and listen, but send nothing
+  gateway scan --json                       print one JSON object per line
+  gateway scan --link /dev/ttyUSB0 --probe  stop the car there, and wake it if it is silent
 
-Opening a serial port can reset an Arduino that is on a USB cable. scan skips ports that another program uses. It
-lists Bluetooth devices without connecting. It never searches for TCP cars: a connection ends their program.
---probe stops every car that it finds and closes its mode. It sends nothing to ports that send other data."""
+Opening a serial port can reset an Arduino that is on a USB cable. `gateway scan` skips ports that another program uses.
+It lists Bluetooth devices without a connection to them. It never searches for TCP cars, because the end of a connection
+ends their program. With --probe it stops every car that it finds and closes its mode. It sends nothing to ports that
+send other data."""
 
 # Opening its port resets an Arduino, which starts within 2 s. In mode 0 a car reports once a second, and three readings
 # show its platform.
@@ -44,20 +45,20 @@ PROGRESS_INTERVAL_S: Final = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
-    parser.add_argument("--link", action="append", metavar="URL", help=f"check only this link; {LINK_HELP}")
+    parser.add_argument("--link", action="append", metavar="URL", help=f"check only this link, such as {LINK_HELP}")
     parser.add_argument(
         "--for",
         dest="listen",
         default=f"{DEFAULT_LISTEN_S:g}s",
         metavar="DURATION",
-        help=f"how long to listen (default {DEFAULT_LISTEN_S:g}s)",
+        help=f"how long to listen (default: {DEFAULT_LISTEN_S:g}s)",
     )
-    parser.add_argument("--probe", action="store_true", help="send a stop to cars and silent ports")
-    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    parser.add_argument("--probe", action="store_true", help="send a stop to cars and to silent ports")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """List, listen and print; return the exit code."""
+    """List the ports and devices, listen to the ports, print the result, and return the exit code."""
     return cli_support.run_command("gateway scan", lambda: _run(arguments))
 
 

@@ -1,6 +1,7 @@
-"""`gateway send`: checks one frame against the table, sends it, and prints what the car may do then.
+"""`gateway send`: checks one frame against the table, sends it, and prints what the car may do after it.
 
-For experiments with a car on the desk: it paces, repeats and stops nothing. `gateway run` drives a car safely.
+It is for experiments with a car on the desk. It does not pace or repeat frames, and does not stop the car.
+`gateway run` drives a car safely.
 """
 
 import argparse
@@ -29,17 +30,19 @@ from gateway.tools import cli_support
 from schemas.links import LINK_HELP
 from schemas.words import Mode, Motion, Platform
 
-DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
+DESCRIPTION: Final = (
+    "Check one frame against the table, send it to a car on the desk, and tell what the car may do then."
+)
 EPILOG: Final = """\
-examples (in single quotes: in double ones the shell replaces $0 and $4):
+examples (use single quotes, because in double quotes the shell replaces $0 and $4):
   gateway send --link /dev/ttyUSB0 '$0,0,1,0,0,0,0,0,0#'                        sound once
   gateway send --link /dev/ttyUSB0 '$1,0,0,0,0,0,0,0,0#'                        drive on, for ever
   gateway send --link /dev/ttyUSB0 '$0,0,0,0,0,0,0,0,0#'                        stop
   gateway send --link /dev/ttyUSB0 --platform arduino '$4WD,PTZ90#'             only some cars know it
 
-A car keeps its last motion for ever: put it on blocks. `gateway run` is what drives a car safely.
-Opening a serial port can reset an Arduino that is on a USB cable; it misses what comes in the two seconds of its start:
---wait 3s."""
+A car keeps its last motion for ever, so put it on blocks. To drive a car safely, use `gateway run`.
+Opening a serial port can reset an Arduino that is on a USB cable. Its start takes two seconds, in which it misses every
+frame. With --wait 3s the frame is sent after the start."""
 
 MAX_WAIT_S: Final = 60.0
 _STOP: Final = encode(General(Motion.STOP)).decode()
@@ -57,15 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
     parser.add_argument("--link", required=True, metavar="URL", help=LINK_HELP)
-    platform_help = cli_support.PLATFORM_HELP + "; decides which frames the command sends"
+    platform_help = cli_support.PLATFORM_HELP + ". It decides which frames are allowed"
     parser.add_argument("--platform", default=Platform.UNKNOWN, help=platform_help)
-    parser.add_argument("--wait", metavar="DURATION", help="time between opening the link and sending")
-    parser.add_argument("--raw", action="store_true", help="send the text unchecked")
-    parser.add_argument("frame", metavar="FRAME", help=f"for example '{_STOP}', in single quotes")
+    parser.add_argument("--wait", metavar="DURATION", help="how long to wait after opening the link (default: 0s)")
+    parser.add_argument("--raw", action="store_true", help="send the text without a check")
+    parser.add_argument("frame", metavar="FRAME", help=f"the frame in single quotes, for example '{_STOP}'")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the frame; return the exit code."""
+    """Send the frame and return the exit code."""
     return cli_support.run_command("gateway send", lambda: _run(arguments))
 
 
@@ -91,25 +94,25 @@ async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
 
 
 def raw_bytes(text: str) -> bytes:
-    """Return the text as bytes, one per character; raise WrongUse."""
+    """Return the text as bytes, one per character. Raises WrongUse if a character is not a byte."""
     try:
         data = text.encode("latin-1")
     except UnicodeEncodeError as error:
-        raise cli_support.WrongUse(f"frame {text!r}: {text[error.start]!r} is no byte: use ASCII") from None
+        raise cli_support.WrongUse(f"frame {text!r}: {text[error.start]!r} is not a byte: use ASCII") from None
     if not data:
         raise cli_support.WrongUse(f"frame '' is empty: give one as '{_STOP}'")
     return data
 
 
 def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
-    """Return the bytes of a frame that is in the table and that this car knows; raise WrongUse with the reason."""
+    """Return the bytes of the frame. Raises WrongUse if it is not in the table, or if this car does not know it."""
     frame = profile.parse_sent(raw_bytes(text))
     if frame is None:
         raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
     refusal = profile.refusal(frame)
     if refusal is not None:
         raise cli_support.WrongUse(
-            f"frame {text!r}: {refusal} (--platform says what the car is, --raw sends it anyway)"
+            f"frame {text!r}: {refusal} (--platform tells what the car is, --raw sends it anyway)"
         )
     if url.harm and moves(frame) and profile.stop_style is not StopStyle.MODE_FRAME:
         raise cli_support.WrongUse(
@@ -120,7 +123,7 @@ def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
 
 
 def why_not(text: str) -> str:
-    """Return for a person why a text is no frame of the table."""
+    """Return the reason why a text is not a frame of the table, for a person."""
     if expanded := _EXPANDED.fullmatch(text):
         rest = expanded["rest"]
         # `$1`..`$4` are empty in a shell, `$0` is its name.

@@ -59,7 +59,7 @@ def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
     [
         ("run --cra red", "No such option '--cra'. Did you mean --car? (see gateway run --help)"),
         ("scan --proeb", "No such option '--proeb'. Did you mean --probe? (see gateway scan --help)"),
-        ("sim 3", 'gateway sim takes no "3". (see gateway sim --help)'),
+        ("sim 3", '"3". (see gateway sim --help)'),
         ("run --on-battery-low wran", '"wran" is not allowed. Did you mean warn? (see gateway run --help)'),
     ],
 )

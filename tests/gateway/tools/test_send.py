@@ -94,7 +94,7 @@ def test_why_a_text_is_no_frame(text: str, words: str) -> None:
         (["$4WD,PTZ90#"], "cars of an unknown platform do not know the pan/tilt frame"),
         (["$4WD,MODE21#", "--platform", "raspberry_pi"], "raspberry_pi cars do not know mode tracking"),
         (["#"], "do not know a lone '#'"),
-        (["\u20ac"], "'\u20ac' is no byte"),
+        (["\u20ac"], "'\u20ac'"),
         (["", "--raw"], "frame '' is empty"),
         ([STOP, "--platform", "pi"], 'Unknown platform "pi"'),
         ([STOP, "--wait", "-1"], '--wait: "-1" is not a duration'),

@@ -96,7 +96,7 @@ def _option_row(option: click.Option, context: click.Context) -> str:
     extra = option.get_help_extra(context)
     default = extra.get("default", "required" if option.required else "")
     limits = f" Range: {extra['range']}." if "range" in extra else ""
-    more = " Repeatable." if option.multiple else ""
+    more = " Repeatable." if option.multiple and "Repeatable" not in (option.help or "") else ""
     shown = f"`{default}`" if default and default != "required" else default
     return f"| `{names}{metavar}` | {shown} | {cell((option.help or '') + limits + more)} |".replace("`, `-", "`, `-")
 
