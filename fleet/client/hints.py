@@ -1,7 +1,7 @@
-"""Puts the options that select a fleet into the commands that messages propose. Pure.
+"""Adds the options that select a fleet to the commands that messages propose. Pure.
 
-Messages propose commands in backticks: `fleet stop red`. They come from gateways, services and this computer. Only the
-command that prints them knows how its user reaches the fleet.
+Messages propose commands in backticks, such as `fleet stop red`. The messages come from gateways, services and this
+computer. Only the command that prints a message knows with which options its user reaches the fleet.
 """
 
 import re
@@ -30,14 +30,15 @@ WITHOUT_BUS: Final = frozenset(
         "sim",
     )
 )
-"""Commands that take no --fleet."""
+"""Commands that do not accept --fleet."""
 _PROPOSED: Final = re.compile(r"`(fleet [a-z][^`]*)`")
 
 
 def fleet_options(connect: str | None, fleet: str, *, is_one_of_several: bool = False) -> str:
-    """Return the options that select a fleet. connect: its bus; None: the one that is taken without an option.
+    """Return the options that select a fleet.
 
-    is_one_of_several: True to name the fleet also if it is the default.
+    `connect` is its bus, or None for the bus that commands use without an option. With `is_one_of_several`, the options
+    name the fleet even if it is the default.
     """
     bus = f"--connect {connect}" if connect else ""
     name = f"--fleet {fleet}" if is_one_of_several or fleet != DEFAULT_FLEET else ""
@@ -45,15 +46,18 @@ def fleet_options(connect: str | None, fleet: str, *, is_one_of_several: bool = 
 
 
 def complete_hints(words: str, options: str) -> str:
-    """Add the options to each command in backticks that needs them. options: such as `--fleet two`; may be empty."""
+    """Add options such as `--fleet two` to each command in backticks that needs them. `options` may be empty."""
     if not options or "`fleet " not in words:
         return words
     return _PROPOSED.sub(lambda found: f"`{complete_command(found[1], options)}`", words)
 
 
 def complete_command(command: str, options: str) -> str:
-    """Add the options to one command such as `fleet stop red`, unless it takes none or has one of them already."""
-    _, verb, *more = command.split()
-    is_without = verb in WITHOUT_BUS or f"{verb} {more[0] if more else ''}" in WITHOUT_BUS
-    has_one = any(word.startswith("--") and word in more for word in options.split())
-    return command if is_without or has_one or not options else f"{command} {options}"
+    """Add the options to a command such as `fleet stop red`.
+
+    A command that accepts no such option, or has one already, stays as it is.
+    """
+    _, verb, *arguments = command.split()
+    has_no_bus = verb in WITHOUT_BUS or f"{verb} {arguments[0] if arguments else ''}" in WITHOUT_BUS
+    has_one = any(word.startswith("--") and word in arguments for word in options.split())
+    return command if has_no_bus or has_one or not options else f"{command} {options}"

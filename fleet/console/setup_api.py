@@ -1,6 +1,6 @@
-"""Requests of the pages to set up a fleet: scan, let a car blink, write its link into the fleet file.
+"""Answers the requests of pages that set up a fleet: scan, make a car blink, write its link into the fleet file.
 
-Only pages of this computer may do it. A file is never replaced: links are inserted, and all else stays as it is.
+Only pages that are open on this computer may set up a fleet. An existing file keeps everything but the links.
 """
 
 import asyncio
@@ -32,17 +32,17 @@ MAX_SETUP_LINKS: Final = 64
 
 
 class SetupApi:
-    """The routes. file: the fleet file."""
+    """Answers the set-up requests. `file` is the fleet file, which need not exist."""
 
     def __init__(self, fleet: Fleet, file: Path) -> None:
         self._fleet = fleet
         self._file = file
         self._busy = asyncio.Lock()
-        """A scan and a gateway cannot have the same port."""
+        """Held during a request, because a scan and a gateway cannot have the same port."""
         self._blinks = 0
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
+        """Return the routes of the requests."""
         steps = {"file": self._show, "scan": self._scan, "blink": self._blink, "write": self._write}
         return [Route(f"/setup/{name}", self._answer(work), methods=["POST"]) for name, work in steps.items()]
 
@@ -62,8 +62,8 @@ class SetupApi:
 
         return alone
 
-    def _cars(self) -> Mapping[str, str]:
-        """Return the links of the cars in the file, by name; an empty one if it has none."""
+    def _read_links(self) -> Mapping[str, str]:
+        """Return the link of each car in the file, by the car's name. The link of a car without a link is empty."""
         if not self._file.exists():
             return {}
         file = read_fleet(self._file, unbound=True)
@@ -71,30 +71,30 @@ class SetupApi:
 
     def _show(self, _: Mapping[str, Any]) -> dict[str, Any]:
         exists = self._file.exists()
-        return {"file": str(self._file), "exists": exists, "cars": [*self._cars().items()], "words": ""}
+        return {"file": str(self._file), "exists": exists, "cars": [*self._read_links().items()], "words": ""}
 
     def _scan(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         links = _texts(fields.get("links", []))
         for link in links:
             validate_link(link)
-        cars = self._cars()
+        links_in_file = self._read_links()
         found = [
             {
                 "url": each.url,
                 "verdict": each.verdict,
                 "words": each.words,
                 "platform": each.platform,
-                "car": _car_at(each.url, cars),
+                "car": _find_car_at(each.url, links_in_file),
             }
             for each in scan(links, None)
         ]
         return {"found": found, "words": "" if found else "No car was found. Is it on? Is another program at its port?"}
 
     def _blink(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Let the car at a link blink: by its own gateway if it has one, else by one of a moment."""
+        """Make the car at a link blink, through its own gateway if it has one, else through a temporary gateway."""
         link = validate_link(str(fields.get("url", "")))
         client = self._fleet.sync
-        car = _car_at(link, self._cars())
+        car = _find_car_at(link, self._read_links())
         if car and car in client.cars():
             outcome = client.car(car).find()
         else:
@@ -107,19 +107,21 @@ class SetupApi:
         return {"ok": outcome.ok, "words": outcome.words or outcome.reason or outcome.phase}
 
     def _write(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Write links of cars. `replace`: also of cars that have another link."""
+        """Write the links of cars into the file. With `replace`, overwrite other links of these cars."""
         entries = fields.get("cars")
-        if not isinstance(entries, list) or not 0 < len(entries) <= MAX_SETUP_LINKS:
+        if not isinstance(entries, list) or not entries:
             raise ValueError("Give at least one car a name.")
+        if len(entries) > MAX_SETUP_LINKS:
+            raise ValueError(f"{len(entries)} cars are too many: set up at most {MAX_SETUP_LINKS} at once.")
         cars = [_new_car(each, index) for index, each in enumerate(entries)]
         if len({car.name for car in cars}) < len(cars):
             raise ValueError("Two cars have the same name.")
-        known = self._cars()
-        other = [
-            f"{car.name} is at {known[car.name]}" for car in cars if known.get(car.name, car.link) not in ("", car.link)
+        links = self._read_links()
+        other_links = [
+            f"{car.name} is at {links[car.name]}" for car in cars if links.get(car.name, car.link) not in ("", car.link)
         ]
-        if other and fields.get("replace") is not True:
-            return {"ok": False, "confirm": True, "words": f"The file says: {'; '.join(other)}."}
+        if other_links and fields.get("replace") is not True:
+            return {"ok": False, "confirm": True, "words": f"In the file, {'; '.join(other_links)}."}
         if self._file.exists():
             text = read_text(self._file)
             for car in cars:
@@ -128,7 +130,8 @@ class SetupApi:
             text = format_new_file(cars)
             parse_fleet(text, self._file)
         write_atomically(self._file.resolve(), text.encode())
-        return {"words": f"{self._file} has {', '.join(car.name for car in cars)}. Type: fleet reload, or fleet up"}
+        names = ", ".join(car.name for car in cars)
+        return {"words": f"{self._file} now has {names}. Type: fleet reload, or fleet up"}
 
 
 def _new_car(entry: Any, index: int) -> NewCar:
@@ -138,13 +141,13 @@ def _new_car(entry: Any, index: int) -> NewCar:
     return NewCar(name, validate_link(link), validate_platform(platform or AUTO), default_color(name, index))
 
 
-def _car_at(url: str, cars: Mapping[str, str]) -> str:
-    """Return the car of the file that may be at this link. Empty if there is none."""
+def _find_car_at(url: str, links: Mapping[str, str]) -> str:
+    """Return the name of the car in the file that may be at this link, or an empty text."""
     link = parse_fleet_link(url)
-    return next((car for car, each in cars.items() if each and may_be_same(link, parse_fleet_link(each))), "")
+    return next((car for car, each in links.items() if each and may_be_same(link, parse_fleet_link(each))), "")
 
 
 def _texts(values: Any) -> Sequence[str]:
     if not isinstance(values, list) or len(values) > MAX_SETUP_LINKS or not all(isinstance(e, str) for e in values):
-        raise ValueError(f"links is not a list of at most {MAX_SETUP_LINKS} texts")
+        raise ValueError(f"`links` is not a list of at most {MAX_SETUP_LINKS} texts")
     return values

@@ -1,7 +1,7 @@
-"""The code with which a computer joins a hub: a secret, and what tells the right hub from another. Pure.
+"""The code with which a computer joins a hub: a secret, then a pin that identifies the right hub. Pure.
 
-Who joins connects to a computer whose certificate it does not know. The second half of the code is the begin of the
-fingerprint of the hub's authority, so nobody between the two can pretend to be the hub.
+A computer that joins connects to a hub whose certificate it does not know. The pin, the second half of the code, is the
+beginning of the fingerprint of the hub's authority. So nobody between the two computers can pretend to be the hub.
 """
 
 import base64
@@ -11,18 +11,20 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
-"""Letters and digits that nobody confuses."""
+"""Letters and digits that people do not confuse."""
 _BASE32: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ234567"
 _HALF: Final = 12
-"""Length of each half: 60 bits. The hub takes five guesses; a false authority with this begin costs 10^18 tries."""
+"""Characters of each half, 60 bits. The hub allows five guesses. To forge an authority with this pin takes 10^18 tries.
+"""
 _GROUP: Final = 4
+"""Characters between two hyphens."""
 JOIN_CODE_LIFETIME_S: Final = 600.0
 MAX_GUESSES: Final = 5
-"""Wrong codes after which an invitation ends."""
+"""Number of wrong codes after which an invitation ends."""
 
 
 class BadCode(ValueError):
-    """A text that is no code."""
+    """A text that is not a code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +36,17 @@ class JoinCode:
 
     @classmethod
     def new(cls, fingerprint: bytes) -> Self:
-        """Return a new code for the authority with this SHA-256."""
+        """Return a new code for the authority with this SHA-256 fingerprint."""
         return cls("".join(secrets.choice(CODE_ALPHABET) for _ in range(_HALF)), pin_of(fingerprint))
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Return the code in a text as a person types it. Raises BadCode."""
+        """Return the code that a person typed. Raises BadCode if the text is not a code."""
         letters = "".join(each for each in text.upper() if not (each in "-_." or each.isspace()))
         if len(letters) != 2 * _HALF or set(letters) - set(CODE_ALPHABET):
             raise BadCode(
-                f"{text!r} is not a code: it has {2 * _HALF} characters of {CODE_ALPHABET}, in groups of {_GROUP}"
+                f"{text!r} is not a code. A code has {2 * _HALF} of the characters {CODE_ALPHABET}, "
+                f"in groups of {_GROUP}"
             )
         return cls(letters[:_HALF], letters[_HALF:])
 
@@ -52,15 +55,15 @@ class JoinCode:
         return "-".join(letters[at : at + _GROUP] for at in range(0, len(letters), _GROUP))
 
     def fits(self, fingerprint: bytes) -> bool:
-        """Return True if the authority with this SHA-256 made the code."""
+        """Return True if the code is for the authority with this SHA-256 fingerprint."""
         return hmac.compare_digest(self.pin, pin_of(fingerprint))
 
     def is_secret(self, guess: str) -> bool:
-        """Return True for the secret half. Takes as long for any guess."""
+        """Return True if the guess is the secret half. The comparison takes the same time for every guess."""
         return hmac.compare_digest(self.secret.encode(), guess.encode(errors="replace"))
 
 
 def pin_of(fingerprint: bytes) -> str:
-    """Return the half of a code that names an authority."""
+    """Return the half of a code that identifies an authority."""
     letters = base64.b32encode(fingerprint).decode()[:_HALF]
     return letters.translate(str.maketrans(_BASE32, CODE_ALPHABET))

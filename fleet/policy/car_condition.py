@@ -48,7 +48,7 @@ class CarCondition:
         return self._holding.span
 
     def add(self, topic: str, message: Any, at_ns: int) -> HeldStep | None:
-        """Take in a message of a topic that it takes. None: it is older than the newest one, and does not count.
+        """Take in a message of a topic that it takes. None means that the message is older than the newest one.
 
         at_ns: its own time. If it is older by more than CLOCK_STEP_S, somebody has set the clock back, and all begins
         again.

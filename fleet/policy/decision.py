@@ -40,7 +40,7 @@ class Decision:
     car: str | None = None
     role: str | None = None
     mode: Mode | None = None
-    """The mode that the car should be in; None: the car is left alone."""
+    """The mode that the car should be in, or None if the car is left alone."""
     since: float = 0.0
     """Time at which the cause became the current one, s on the step's clock."""
 

@@ -12,7 +12,7 @@ _ALL: Final = "all"
 
 @dataclass(frozen=True, slots=True)
 class PlanChange:
-    """One part that differs: such as `role guide`, its fields before and after. Empty: it is not in that plan."""
+    """One part that differs, such as `role guide`: its fields before and after, empty if that plan lacks the part."""
 
     part: str
     before: tuple[tuple[str, str], ...] = ()

@@ -51,7 +51,7 @@ def explain_phase(plan: Plan, state: PhaseState, snapshot: FleetSnapshot) -> Dec
 
 
 def _unmeasured_part(condition: PlanCondition, snapshot: FleetSnapshot) -> str:
-    """Name what no present car measures of a condition; empty if one of them can."""
+    """Name what no present car measures of a condition, or an empty text if one of them can."""
     cars = [known for car, known in snapshot.cars.items() if known.present and condition.car in (None, car)]
     return describe_unmeasured(condition.expression, [(known, known.mode) for known in cars])
 

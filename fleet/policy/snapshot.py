@@ -116,16 +116,16 @@ class CarSnapshot:
     present: bool = False
     """True if its gateway is on the bus."""
     mode: str = ""
-    """The last mode that it was commanded into, by its gateway's state; empty: no state yet."""
+    """The last mode that it was commanded into, as its gateway reports. Empty if there is no report yet."""
     verdict: str = ""
     evidence: str = ""
     motors: str = ""
     doubted: bool = False
     """True if it has shown its stops before, and did not show the last one. A car that cannot show them is not."""
     link: str = ""
-    """The state of its link, by its gateway; empty: no state yet."""
+    """The state of its link, as its gateway reports. Empty if there is no report yet."""
     platform: str = ""
-    """From its gateway or the fleet file; empty: not known."""
+    """From its gateway or the fleet file. Empty if it is not known."""
     capabilities: frozenset[str] = frozenset()
     estopped_by: str | None = None
     paused_by: str | None = None
@@ -135,7 +135,7 @@ class CarSnapshot:
     driven_by: str | None = None
     """The holder of a motion or a lease; never a coordinator."""
     roles: frozenset[str] | None = None
-    """The roles that the fleet file lets it take; None: any."""
+    """The roles that the fleet file lets it take, or None if it may take any role."""
     listed: bool = False
     """True if the fleet file lists it."""
     refused: Refusal | None = None
@@ -144,12 +144,12 @@ class CarSnapshot:
 
     @property
     def taken_by(self) -> str | None:
-        """Return who keeps the coordinator from the car until a person or a lead gives it back; None: nobody."""
+        """Return who keeps the coordinator from the car until a person or a lead gives it back, or None."""
         return self.estopped_by or self.paused_by or self.lent_to or self.held_by
 
     @property
     def profile(self) -> CarProfile | None:
-        """The profile of its platform; None if that is not known."""
+        """The profile of its platform, or None if that is not known."""
         return _profile(self.platform)
 
     def lacks(self, mode: str) -> bool:
@@ -178,7 +178,7 @@ class FleetSnapshot:
     """By car and topic."""
 
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:
-        """Return whether the expression is true of this car; None: not known.
+        """Return whether the expression is true for this car, or None if that is not known.
 
         Stale values count as not measured, unless `old`. `old` is for values that change slowly: in a mode that does
         not measure them, their last value counts.

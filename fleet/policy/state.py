@@ -57,7 +57,7 @@ class PersistedPolicy:
     """Start of the phase on the wall clock."""
     rules: Mapping[int, str] = field(default_factory=dict)
     stopped_by: str = ""
-    """Sender who stopped the plan; empty: the plan runs."""
+    """Sender who stopped the plan. Empty if the plan runs."""
     to_rest: tuple[str, ...] = ()
     """Cars to be brought to rest since then."""
 
@@ -71,7 +71,7 @@ class LedRequest:
     """Position of the rule in the plan, and of the effect in the rule."""
     trigger: str | None
     car: str | None
-    """None: every car, by the coordinator before a restart."""
+    """The cars, or None for every car that the coordinator had before its restart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class PolicyState:
     decisions: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
     stopped_by: str = ""
-    """Sender who stopped the plan; empty: the plan runs. All cars are left alone then, except `to_rest`."""
+    """Sender who stopped the plan. Empty if the plan runs. Else only cars in `to_rest` get commands."""
     to_rest: frozenset[str] = frozenset()
     """Cars that the stopped plan has commanded, until they are at rest or a person has taken them."""
 

@@ -26,10 +26,10 @@ class CarTrial:
 
     car: str
     role_before: str
-    """Empty: none."""
+    """Empty means none."""
     role: str
     mode_before: str
-    """Empty: not known."""
+    """Empty means not known."""
     decision: Decision
 
     @property

@@ -2,8 +2,8 @@
 
 `python -m fleet.replay.foxglove_layout [CAR ...] > LAYOUT.json` writes it.
 
-`deploy/foxglove.json` is the layout for the cars of `make demo`. Foxglove draws only fields of messages: everything
-that lenses.py or drawings.py derive is left out, and messages with text lines in Rerun are shown raw.
+`deploy/foxglove.json` is the layout for the cars of `make demo`. Foxglove draws only fields of messages. So the layout
+leaves out everything that lenses.py or drawings.py derives. It shows messages raw that Rerun shows as lines of text.
 """
 
 import json
@@ -21,12 +21,12 @@ from schemas.topics import TOPICS
 DEMO_CARS: Final = ("red", "green", "blue")
 GRID_COLUMNS: Final = 2
 LOG: Final = "foxglove.Log"
-_PLAIN: Final = re.compile(r"[A-Za-z0-9_/]+")
+_UNQUOTED: Final = re.compile(r"[A-Za-z0-9_/]+")
 """Topic names that need no quotes in a message path."""
 
 
 class _FoxgloveLayout:
-    """Builder of a layout. `panels` collects its panels by id."""
+    """Builds a layout. `panels` collects its panels by id."""
 
     def __init__(self, fleet: str, cars: Sequence[str]) -> None:
         self._fleet = fleet
@@ -41,18 +41,17 @@ class _FoxgloveLayout:
         return panel
 
     def key(self, car: str, topic: str) -> str:
-        """Return the key of a topic. The topic of a service begins with its name."""
+        """Return the key of a car's topic, or of a service's: such a topic begins with `@` and the service's name."""
         return f"{self._fleet}/{topic}" if topic.startswith("@") else keys.topic_key(self._fleet, car, topic)
 
     def path(self, car: str, part: Curve | StateTrack) -> str:
         """Return the message path of a field in Foxglove's syntax."""
-        key = self.key(car, part.topic)
-        return f"{key if _PLAIN.fullmatch(key) else json.dumps(key)}.{part.field.rstrip('!')}"
+        return f"{_quote_if_needed(self.key(car, part.topic))}.{part.field.rstrip('!')}"
 
-    def plot(self, name: str, lines: Iterable[tuple[str, Curve, str]]) -> str:
+    def add_plot(self, name: str, lines: Iterable[tuple[str, Curve, str]]) -> str:
         """Add a plot of curves, given as (car, curve, label)."""
         every = list(lines)
-        # With one curve per car, each has the color of its car. Else Foxglove picks the colors.
+        # With one curve per car, each curve has the color of its car. Otherwise Foxglove picks the colors.
         tinted = len({car for car, _, _ in every}) == len(every)
         paths = [
             {**_series(self.path(car, curve), label), **(self._tints.get(car, {}) if tinted else {})}
@@ -60,47 +59,48 @@ class _FoxgloveLayout:
         ]
         return self.add("Plot", name, {"paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"})
 
-    def states(self, name: str, tracks: Iterable[tuple[str, StateTrack, str]]) -> str:
+    def add_states(self, name: str, tracks: Iterable[tuple[str, StateTrack, str]]) -> str:
         """Add a view of states over time, given as (car, track, label)."""
         paths = [_series(self.path(car, track), label) for car, track, label in tracks]
         return self.add("StateTransitions", name, {"paths": paths, "isSynced": True})
 
-    def messages(self, name: str, key: str) -> str:
-        """Add a view of raw messages."""
-        path = key if _PLAIN.fullmatch(key) else json.dumps(key)
-        return self.add("RawMessages", name, {"topicPath": path, "diffEnabled": False})
+    def add_messages(self, name: str, topic: str, car: str = "") -> str:
+        """Add a view of a topic's messages: of a log its lines, of other topics the raw messages."""
+        key = self.key(car, topic)
+        if TOPICS[topic].message == LOG:
+            return self.add("RosOut", name, {"topicToRender": key, "minLogLevel": 1, "searchTerms": []})
+        return self.add("RawMessages", name, {"topicPath": _quote_if_needed(key), "diffEnabled": False})
 
-    def log(self, name: str, key: str) -> str:
-        """Add a log view of foxglove.Log messages."""
-        return self.add("RosOut", name, {"topicToRender": key, "minLogLevel": 1, "searchTerms": []})
-
-    def panel(self, car: str, panel: Panel) -> list[str]:
-        """Add the views that Foxglove can show of a panel of a car (empty: of a service), and return their ids."""
+    def add_panel(self, car: str, panel: Panel) -> list[str]:
+        """Add the parts of a panel that Foxglove can show, and return their ids. An empty `car` means a service."""
         name = f"{car} {panel.name}".strip()
-        tracks = [(car, track, track.name) for track in panel.tracks if plain(track)]
-        curves = [(car, curve, curve.name) for curve in panel.curves if plain(curve)]
-        found = [self.states(name, tracks)] if tracks else [self.plot(name, curves)] if curves else []
-        for topic in panel.texts:
-            add = self.log if TOPICS[topic].message == LOG else self.messages
-            found.append(add(f"{car} {topic}", self.key(car, topic)))
-        return found
+        tracks = [(car, track, track.name) for track in panel.tracks if _can_draw(track)]
+        curves = [(car, curve, curve.name) for curve in panel.curves if _can_draw(curve)]
+        added = []
+        if tracks:
+            added.append(self.add_states(name, tracks))
+        elif curves:
+            added.append(self.add_plot(name, curves))
+        added += [self.add_messages(f"{car} {topic}", topic, car) for topic in panel.texts]
+        return added
 
 
 def layout(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> dict[str, Any]:
-    """Return the layout of a fleet: a tab for the fleet, one for each car, one for the services."""
+    """Return the layout of a fleet: a tab for the fleet, a tab for each car and a tab for the services."""
     builder = _FoxgloveLayout(fleet, cars)
-    glance = [
-        builder.states(name, [(car, track, f"{car} {track.name}") for car in cars for track in tracks if plain(track)])
+    overview = [
+        builder.add_states(
+            name, [(car, track, f"{car} {track.name}") for car in cars for track in tracks if _can_draw(track)]
+        )
         for name, tracks in panels.FLEET_TRACKS
     ]
-    glance += [builder.plot(name, [(car, curve, car) for car in cars]) for name, curve in panels.FLEET_CURVES]
-    services = [each for panel in panels.SERVICE_PANELS for each in builder.panel("", panel)]
-    for topic in (topic for topic in TOPICS if topic.startswith("@")):
-        add = builder.log if TOPICS[topic].message == LOG else builder.messages
-        services.append(add(topic, builder.key("", topic)))
-    each_car = [[each for panel in panels.CAR_PANELS for each in builder.panel(car, panel)] for car in cars]
-    tabs = zip(("Fleet", *cars, "Services"), map(_grid, (glance, *each_car, services)), strict=True)
-    root = builder.add("Tab", "tabs", {"activeTabIdx": 0, "tabs": [{"title": name, "layout": at} for name, at in tabs]})
+    overview += [builder.add_plot(name, [(car, curve, car) for car in cars]) for name, curve in panels.FLEET_CURVES]
+    services = [each for panel in panels.SERVICE_PANELS for each in builder.add_panel("", panel)]
+    services += [builder.add_messages(topic, topic) for topic in TOPICS if topic.startswith("@")]
+    each_car = [[each for panel in panels.CAR_PANELS for each in builder.add_panel(car, panel)] for car in cars]
+    grids = map(_grid, (overview, *each_car, services))
+    tabs = [{"title": title, "layout": grid} for title, grid in zip(("Fleet", *cars, "Services"), grids, strict=True)]
+    root = builder.add("Tab", "tabs", {"activeTabIdx": 0, "tabs": tabs})
     return {
         "configById": builder.panels,
         "globalVariables": {},
@@ -111,11 +111,15 @@ def layout(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> 
 
 
 def layout_text(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> str:
-    """Return the file of the layout of a fleet."""
+    """Return a fleet's layout as the text of the file that Foxglove imports."""
     return json.dumps(layout(cars, fleet), indent=1) + "\n"
 
 
-def plain(part: Curve | StateTrack) -> bool:
+def _quote_if_needed(key: str) -> str:
+    return key if _UNQUOTED.fullmatch(key) else json.dumps(key)
+
+
+def _can_draw(part: Curve | StateTrack) -> bool:
     """Return True if Foxglove can draw the part from a field of the message."""
     return part.derivation in (None, Derivation.TEXT_OR_NOTHING) and not (isinstance(part, StateTrack) and part.drawn)
 
@@ -125,7 +129,7 @@ def _series(path: str, label: str) -> dict[str, Any]:
 
 
 def _grid(names: Sequence[str]) -> Any:
-    """Arrange panels in rows of GRID_COLUMNS of equal size."""
+    """Arrange panels of equal size in rows of GRID_COLUMNS panels."""
     rows = [_split("row", names[at : at + GRID_COLUMNS]) for at in range(0, len(names), GRID_COLUMNS)]
     return _split("column", rows)
 

@@ -2,8 +2,8 @@
 
 The supervisor kills a process that sends no heartbeat for its `Patience`, unless there is another explanation:
 - The supervisor itself stalled (`WatchClock`) and could not receive heartbeats.
-- Many processes are silent at once (`are_many`): the hub or the machine stalls.
-- The process is slow (`Pulse`). A hung gateway uses no CPU time, or a whole CPU.
+- Many processes are silent at once (`have_common_cause`), because the hub or the machine stalls.
+- The process is only slow (`Pulse`). A hung process uses no CPU time, or a whole CPU.
 """
 
 from collections import deque
@@ -16,17 +16,20 @@ MAX_POLL_GAP_S: Final = 0.5
 MANY_SHARE: Final = 0.25
 """Minimum share of silent processes that indicates a common cause."""
 MANY_SILENT_S: Final = 30.0
-"""Maximum silence of a process while many are silent. A blocked hub is replaced after 8 s."""
+"""Maximum silence of a process while many are silent: longer than the 8 s after which a blocked hub is replaced."""
 SLOW_SILENT_S: Final = 30.0
 """Maximum silence of a slow process."""
 MOVING_SILENT_S: Final = 300.0
-"""Maximum silence of a slow gateway whose car may move. Only this gateway stops the car when a drive ends."""
+"""Maximum silence of a slow gateway whose car may move: long, because only this gateway can stop the car."""
 CPU_WINDOW_S: Final = 3.0
+"""How far back the samples of a process's CPU time go."""
+SAMPLE_INTERVAL_S: Final = CPU_WINDOW_S / 6
 MIN_CPU_WINDOW_S: Final = 0.9
+"""Minimum time from the first sample to the last one. A shorter time shows nothing."""
 SPINNING_SHARE: Final = 0.8
 """Share of a CPU that only an endless loop uses for seconds."""
 RUNNING_SHARE: Final = 1e-4
-"""Minimum share of a CPU of a process that is not blocked. An idle gateway uses 0.5 %, a blocked one nothing."""
+"""Minimum share of a CPU that a process uses if it is not blocked. An idle gateway uses 0.5 %, a blocked one 0."""
 
 
 class Sign(StrEnum):
@@ -40,12 +43,14 @@ class Sign(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CpuTime:
-    """CPU time since the start of a process, s: running, and waiting for a CPU while ready to run."""
+    """What the system reports about the CPU time of a process since its start."""
 
     run_s: float
+    """Time on a CPU."""
     wait_s: float = 0.0
+    """Time in which the process was ready to run and waited for a CPU."""
     ready: bool = False
-    """True if the process is now ready to run or waits for the disk."""
+    """True if the process is ready to run or waits for the disk at this moment."""
 
 
 @dataclass(slots=True)
@@ -55,7 +60,7 @@ class Pulse:
     _samples: deque[tuple[float, CpuTime]] = field(default_factory=deque)
 
     def add(self, now: float, time: CpuTime | None) -> None:
-        """Add a sample. None if the system does not report the CPU time."""
+        """Add a sample. `time` is None if the system does not report the CPU time."""
         if time is None:
             self._samples.clear()
             return
@@ -64,32 +69,36 @@ class Pulse:
             self._samples.popleft()
 
     def clear(self) -> None:
-        """Drop all samples: the process sent a heartbeat or was replaced."""
+        """Drop all samples, because the process sent a heartbeat or was replaced."""
         self._samples.clear()
 
     def is_due(self, now: float) -> bool:
         """Return True if it is time for the next sample."""
-        return not self._samples or now - self._samples[-1][0] >= CPU_WINDOW_S / 6
+        return not self._samples or now - self._samples[-1][0] >= SAMPLE_INTERVAL_S
 
     @property
     def sign(self) -> Sign:
         """The state that the samples indicate."""
         if not self._samples:
             return Sign.UNKNOWN
-        (began, first), (ended, last) = self._samples[0], self._samples[-1]
-        seconds = ended - began
+        (first_at, first), (last_at, last) = self._samples[0], self._samples[-1]
+        seconds = last_at - first_at
         if seconds < MIN_CPU_WINDOW_S:
             return Sign.UNKNOWN
-        run, wait = (last.run_s - first.run_s) / seconds, (last.wait_s - first.wait_s) / seconds
-        if run >= SPINNING_SHARE:
+        run_share = (last.run_s - first.run_s) / seconds
+        wait_share = (last.wait_s - first.wait_s) / seconds
+        if run_share >= SPINNING_SHARE:
             return Sign.SPINNING
-        if run + wait >= RUNNING_SHARE or any(time.ready for _, time in self._samples):
+        if run_share + wait_share >= RUNNING_SHARE or any(time.ready for _, time in self._samples):
             return Sign.SLOW
         return Sign.BLOCKED
 
 
 def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
-    """Return the allowed silence if it is longer than the process's own patience, else 0."""
+    """Return how long a process may be silent, apart from its own patience. The longer of the two times counts.
+
+    The result is 0 if nothing but a hang explains the silence: then only the process's own patience counts.
+    """
     longest = MANY_SILENT_S if many else 0.0
     if sign is Sign.SLOW:
         longest = max(longest, MOVING_SILENT_S if may_move else SLOW_SILENT_S)
@@ -97,14 +106,14 @@ def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
 
 
 def longest_hub_silence_s(sign: Sign) -> float:
-    """Return the allowed silence of a hub if it is longer than the hub's own patience, else 0."""
-    # A hub that works is not hung: after it stood still, a hundred sessions come back at once. Its threads then use a
-    # whole CPU or more. A hub of which only the main thread still polls may look the same.
+    """Return how long a hub may be silent, as `longest_silence_s` does for the other processes."""
+    # A hub that uses a whole CPU is not hung: after a stall, a hundred sessions reconnect at once and keep its threads
+    # busy. A hub in which only the main thread still polls may look the same.
     return SLOW_SILENT_S if sign in (Sign.SLOW, Sign.SPINNING) else 0.0
 
 
-def are_many(silent: int, total: int) -> bool:
-    """Return True if the silent processes are so many that they have a common cause."""
+def have_common_cause(silent: int, total: int) -> bool:
+    """Return True if so many of the processes are silent that the cause must lie outside them."""
     return silent >= 2 and silent >= MANY_SHARE * total
 
 
@@ -115,7 +124,7 @@ class WatchClock:
         self._shown = self._last = now
 
     def advance(self, now: float) -> float:
-        """Advance to `now` of the machine and return the clock's time."""
+        """Advance to the machine's time `now`, and return this clock's time."""
         self._shown += min(now - self._last, MAX_POLL_GAP_S)
         self._last = now
         return self._shown

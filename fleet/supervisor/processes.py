@@ -13,7 +13,7 @@ from typing import Final
 
 from fleet.supervisor import cpu_time
 from fleet.supervisor.child import Child, Log
-from fleet.supervisor.hang import Pulse, WatchClock, are_many, longest_hub_silence_s, longest_silence_s
+from fleet.supervisor.hang import Pulse, WatchClock, have_common_cause, longest_hub_silence_s, longest_silence_s
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, HUNG, WRONG_USE_RETRY_S, ProcessState, RestartAction
 from fleet.supervisor.spec import PATIENCE
 from fleet.supervisor.start_limit import Admission
@@ -134,13 +134,13 @@ class ProcessSet:
     ) -> None:
         """Start the due processes and kill the hung ones.
 
-        since: start of uninterrupted reception of a process's heartbeats, None if there is no reception.
-        may_move: True if a gateway's car may be moving.
+        `since` returns since when a process's heartbeats could be received without a break, or None if they cannot be.
+        `may_move` returns True if a gateway's car may be moving.
         """
         now = self.now
         silent = {process.name: process.status.silent_s(now, since(process)) for process in self}
         judged = [process for process in self.of(*_HEARTBEAT_KINDS) if process.status.state is RunState.RUNNING]
-        many = are_many(sum(silent[process.name] > MISSED_HEARTBEAT_S for process in judged), len(judged))
+        many = have_common_cause(sum(silent[process.name] > MISSED_HEARTBEAT_S for process in judged), len(judged))
         # The process that has waited longest comes first. So a few that crash repeatedly do not delay the others.
         for process in sorted(self, key=lambda each: each.status.due):
             if silent[process.name] > CPU_CHECK_SILENCE_S and process.child is not None and process.pulse.is_due(now):

@@ -1,10 +1,10 @@
-"""A serial port through pyserial. One thread finds, opens and closes it, as these calls can block.
+"""A serial port through pyserial. One thread finds, opens and closes the port, because these calls can block.
 
 The event loop reads and writes. On Windows it cannot watch a port, so there the thread reads as well.
-A write never waits. A port buffers far more than one frame, so a port that does not accept a whole frame at once is
-stuck, and the link is lost.
-Every use of the descriptor needs `_lock`. The thread may close a dead port at any moment, and another car's port may
-get the same descriptor number a moment later.
+A write never waits. A port can buffer far more than one frame. So if a port does not accept a whole frame at once, it
+is stuck, and the link counts as lost.
+Every use of the descriptor needs `_lock`, because the thread may close a dead port at any moment. Another car's port
+may get the same descriptor number a moment later.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from schemas.process.usb_bus import explain_missing_port
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
 """Timeout of pyserial's own write, used on Windows only."""
 MAX_BUFFERED_CHUNKS: Final = 256
-"""Maximum of buffered chunks. When it is reached, the link stops reading the port."""
+"""Maximum number of buffered chunks. With so many of them, the link stops reading the port."""
 READ_BYTES: Final = 4096
 CAN_WATCH: Final = os.name == "posix"
 """True if the event loop can watch the port."""
@@ -37,7 +37,7 @@ CAN_WATCH: Final = os.name == "posix"
 try:
     import termios
 
-    # tcflush and tcsetattr of an unplugged port raise termios.error, which is no OSError.
+    # tcflush and tcsetattr of an unplugged port raise termios.error, which is not an OSError.
     _GONE: tuple[type[Exception], ...] = (OSError, termios.error)
 except ImportError:  # Windows
     _GONE = (OSError,)
@@ -46,29 +46,30 @@ except ImportError:  # Windows
 _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
 _BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
 _UNPLUGGED: Final = frozenset({errno.EIO, errno.ENXIO, errno.ENODEV})
-"""Errors of an open port while it is being unplugged. Afterwards a read returns end of file."""
+"""Errors of an open port while it is being unplugged. After that, a read returns an end of file."""
 _RFCOMM: Final = re.compile(r"rfcomm\d+")
 _RFCOMM_FAR: Final = frozenset(
     {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ETIMEDOUT, errno.EIO, getattr(errno, "EHOSTDOWN", errno.EIO)}
 )
-"""Errors of opening the port of a Bluetooth Classic module that is off, out of range or not paired."""
-# A second reader causes an empty read for each byte at most, 500 of them. A port that fails in this way spins.
+"""Errors when opening the port of a Bluetooth Classic module that is off, out of range or not paired."""
+# A second reader causes at most one empty read for each byte, so at most 500 within the time. A port that is broken
+# returns empty reads without end.
 _MAX_EMPTY_READS: Final = 2000
+"""Number of empty reads within _EMPTY_READS_S after which the port counts as gone."""
 _EMPTY_READS_S: Final = 0.5
-"""Maximum empty reads within this time. After more of them, the port counts as gone."""
 
 
 _opening: Final[set[str]] = set()
-"""URLs that a thread is opening now."""
+"""URLs whose port a thread is opening now."""
 # After a replug, the same path may lead to another car, which would then get this car's commands.
-_first: Final[dict[str, UsbSerialPort]] = {}
-"""The first device opened for each URL."""
-# The system knows nothing about pseudo terminals, and `gateway run` starts faster without listing the ports.
+_first_device: Final[dict[str, UsbSerialPort]] = {}
+"""The device that was opened first for each URL."""
+# The system does not list pseudo terminals, and `gateway run` starts faster if it does not list the ports.
 _PSEUDO: Final = re.compile(r"/dev/(pts/|ttys)\d+")
 
 
 class SerialLink(Link):
-    """One open port, created by `SerialKind.open`."""
+    """One serial port. `SerialKind.open` creates and opens it."""
 
     def __init__(self, url: SerialUrl | UsbUrl, loop: asyncio.AbstractEventLoop) -> None:
         self._url = url
@@ -89,11 +90,12 @@ class SerialLink(Link):
         self._empty_since = 0.0
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
-        # A daemon thread: opening or closing a port can block (a Bluetooth tty does) and must not keep the process.
+        # A daemon thread, because opening or closing a port can block (on a Bluetooth tty). That must not keep the
+        # process from ending.
         self._thread = threading.Thread(target=self._run, name=f"read {url}", daemon=True)
 
     async def open(self, timeout_s: float) -> None:
-        """Start the thread and wait until the port is open; raise CannotOpen."""
+        """Start the thread and wait until the port is open. Raises CannotOpen if it does not open in time."""
         self._thread.start()
         try:
             await asyncio.wait_for(asyncio.shield(self._opened), timeout_s)
@@ -108,17 +110,17 @@ class SerialLink(Link):
 
     @property
     def trouble(self) -> str:
-        """Say that another program reads the port, and which one."""
+        """The text that another program uses the port, and which program. Empty if none was found."""
         return self._trouble
 
     def look_for_trouble(self) -> None:
-        """Find out which other program has the port open, in a thread: it takes some 10 ms."""
+        """Find out in a thread which other program has the port open. The search takes some 10 ms."""
         if not self._trouble and not self._is_searching:
             self._is_searching = True
             threading.Thread(target=self._find_users, name=f"who reads {self._url}", daemon=True).start()
 
     async def read(self) -> bytes:
-        """Return the next bytes as they arrived; raise LinkLost."""
+        """Wait for bytes and return them as they arrived. Raises LinkLost if the link ends."""
         while not self._chunks:
             if self._lost is not None:
                 raise LinkLost(self._lost)
@@ -133,7 +135,7 @@ class SerialLink(Link):
         return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
     async def write(self, data: bytes) -> None:
-        """Write these bytes; raise LinkLost, in which case some of them may have been sent."""
+        """Write these bytes. Raises LinkLost if the port does not accept all of them: some may have been sent."""
         if self._lost is not None:
             raise LinkLost(self._lost)
         try:
@@ -144,15 +146,15 @@ class SerialLink(Link):
         except _GONE as error:
             raise self._lose(f"{self._url} is gone: {_why_gone(error)}") from None
         if written is None:
-            raise self._lose(f"{self._url} is gone: unplugged")  # the thread has closed it and is about to report that
+            raise self._lose(f"{self._url} is gone: unplugged")  # the thread has closed the port and reports that soon
         self._stuck = written != len(data)
         if written == 0 and data:
-            raise self._lose(f"{self._url} takes no bytes: unplugged, or stuck?")
+            raise self._lose(f"{self._url} accepts no bytes: unplugged, or stuck?")
         if written != len(data):
-            raise self._lose(f"{self._url} took {written} of {len(data)} bytes: unplugged, or stuck?")
+            raise self._lose(f"{self._url} accepted {written} of {len(data)} bytes: unplugged, or stuck?")
 
     async def close(self) -> None:
-        """Close the port and wait for that. If it does not close in time, leave it to the thread."""
+        """Close the port and wait until it is closed. If that takes too long, leave the rest to the thread."""
         self._lose(f"{self._url} was closed")
         if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
             with contextlib.suppress(TimeoutError):
@@ -160,14 +162,14 @@ class SerialLink(Link):
                 self._thread.join()
 
     def _lose(self, reason: str) -> LinkLost:
-        """Mark the link as lost and return the error. The first reason stays."""
+        """Mark the link as lost and return the error. If the link is lost already, the first reason stays."""
         self._lost = self._lost or reason
         self._came.set()
         self._end()
         return LinkLost(self._lost)
 
     def _end(self) -> None:
-        """Stop the thread. If it is still opening the port, it closes the port afterwards."""
+        """Stop the thread. A thread that is still opening the port closes it afterwards."""
         with self._lock, contextlib.suppress(*_GONE):
             if self._port is not None:
                 if CAN_WATCH:
@@ -191,8 +193,9 @@ class SerialLink(Link):
                     return
                 descriptor = self._port.fileno()
                 data = os.read(descriptor, READ_BYTES)
-                # An unplugged port has no settings. One that has, and had bytes a moment ago, was read by another.
-                is_there = bool(data) or bool(termios.tcgetattr(descriptor))
+                if not data:
+                    # Fails with EIO if the port is unplugged. If it succeeds, another program has read the bytes.
+                    termios.tcgetattr(descriptor)
                 self._paused = len(self._chunks) >= MAX_BUFFERED_CHUNKS
                 if self._paused:
                     self._loop.remove_reader(self._port.fileno())
@@ -204,19 +207,17 @@ class SerialLink(Link):
             return
         if data:
             self._on_data(data)
-        elif is_there:
-            self._on_empty_read()
         else:
-            self._lose(f"{self._url} is gone: unplugged")
+            self._on_empty_read()
 
     def _on_empty_read(self) -> None:
-        """Find out who has read the bytes. The link stays: a stop still reaches the car."""
+        """Find out which program has read the bytes. The link stays open, because a stop still reaches the car."""
         now = self._loop.time()
         if now - self._empty_since > _EMPTY_READS_S:
             self._empty_reads, self._empty_since = 0, now
         self._empty_reads += 1
         if self._empty_reads > _MAX_EMPTY_READS:
-            self._lose(f"{self._url} is gone: it has bytes and returns none")
+            self._lose(f"{self._url} is gone: it reports bytes and returns none")
         else:
             self.look_for_trouble()
 
@@ -228,14 +229,16 @@ class SerialLink(Link):
 
     def _on_found(self, path: str, users: list[str]) -> None:
         self._is_searching = False
-        verb, missing = ("reads", "are") if self._empty_reads else ("has", "may be")
-        fact = f"another program {verb} {self._url}{'' if self._empty_reads else ' open'}, too, so bytes of the car"
+        if self._empty_reads:
+            fact = f"another program reads {self._url}, too, so bytes from the car are missing"
+        else:
+            fact = f"another program has {self._url} open, too, so bytes from the car may be missing"
         if users:
             stop = "Stop that program." if len(users) == 1 else "Stop those programs."
-            self._trouble = f"{fact} {missing} missing: {', '.join(users)}. {stop}"
+            self._trouble = f"{fact}: {', '.join(users)}. {stop}"
         elif path and self._empty_reads:
-            how = port_lock.how_to_find_users(path)
-            self._trouble = f"{fact} {missing} missing. `{how}` names it: stop that program."
+            command = port_lock.how_to_find_users(path)
+            self._trouble = f"{fact}. `{command}` shows which program: stop it."
 
     # ------------------------------------------------------------------ in the thread
 
@@ -279,8 +282,8 @@ class SerialLink(Link):
             self._call_on_loop(self._on_closed, reason)
 
     def _open_port(self) -> serial.Serial:
-        """Find the port anew and open it; raise CannotOpen."""
-        first = _first.get(str(self._url))
+        """Find the port again and open it. Raises CannotOpen if there is no such port, or if it does not open."""
+        first = _first_device.get(str(self._url))
         found: UsbSerialPort | None
         if isinstance(self._url, SerialUrl):
             path = self._url.path
@@ -290,7 +293,8 @@ class SerialLink(Link):
             path = found.device
         check_same_device(self._url, path, first, found)
         try:
-            # `exclusive` locks the port against a second gateway. Windows always does, and pyserial refuses it there.
+            # `exclusive` locks the port against a second gateway. Windows always locks it, and pyserial refuses the
+            # argument there.
             exclusive = os.name == "posix" or None
             port = serial.Serial(
                 path, self._url.baud, timeout=None, write_timeout=SERIAL_WRITE_TIMEOUT_S, exclusive=exclusive
@@ -299,7 +303,7 @@ class SerialLink(Link):
             kind = Busy if _code(error) in _BUSY else CannotOpen
             raise kind(why_not_open(self._url, path, error)) from None
         if found is not None:
-            _first.setdefault(str(self._url), found)
+            _first_device.setdefault(str(self._url), found)
         return port
 
     def _call_on_loop(self, method: object, *arguments: object) -> None:
@@ -311,7 +315,7 @@ class SerialLink(Link):
     def _on_open_failed(self, error: CannotOpen) -> None:
         if not self._opened.done():
             self._opened.set_exception(error)
-            self._opened.exception()  # retrieved, in case `open` has timed out meanwhile
+            self._opened.exception()  # counts as retrieved, in case `open` has timed out meanwhile
 
     def _on_opened(self) -> None:
         if not self._opened.done():
@@ -334,18 +338,16 @@ class SerialKind(LinkKind[SerialUrl | UsbUrl]):
     """Serial ports, by path or by USB device."""
 
     async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
-        """Open a serial port; raise CannotOpen. Each call searches for a USB device anew."""
-        if str(url) in _opening:  # each further attempt would be one more hanging thread
-            raise CannotOpen(
-                f"{url}: the port still hangs in an earlier try to open it: unplug it, and plug it in again"
-            )
+        """Open a serial port. Each call searches for a USB device again. Raises CannotOpen if it does not open."""
+        if str(url) in _opening:  # another attempt would leave another hanging thread
+            raise CannotOpen(f"{url}: an earlier attempt to open the port still hangs: unplug it, and plug it in again")
         _opening.add(str(url))
         link = SerialLink(url, asyncio.get_running_loop())
         await link.open(timeout_s)
         return link
 
     def ports(self) -> Sequence[SerialPort]:
-        """Return the serial ports; raise CannotOpen."""
+        """Return the serial ports. Raises CannotOpen if the system cannot list them."""
         return serial_ports()
 
 
@@ -353,8 +355,8 @@ KIND: Final = SerialKind()
 
 
 def _write_now(port: serial.Serial, data: bytes) -> int:
-    """Write as much as the port accepts at once; return the number of bytes."""
-    # Not pyserial's write: if the port is full it spins for ever without a write_timeout, and blocks the loop with one.
+    """Write as much as the port accepts at once. Return the number of bytes."""
+    # Not with pyserial's write: on a full port, it spins for ever without a write_timeout, or blocks the loop with one.
     if os.name != "posix":
         return port.write(data) or 0
     try:
@@ -364,37 +366,39 @@ def _write_now(port: serial.Serial, data: bytes) -> int:
 
 
 def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
-    """Return one line for a person: the trouble with the port at this path, and what to do."""
+    """Return one line for a person: why the port at this path does not open, and what to do."""
     code = _code(error)
     which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
     if code in _RFCOMM_FAR and _is_rfcomm(path):
-        what = "Switch it on and bring it near. If it was never paired here: `bluetoothctl pair ADDRESS`."
+        what = "Switch it on and bring it near. If it was never paired with this computer: `bluetoothctl pair ADDRESS`."
         return f"{which}the car is off, out of range or not paired ({_cause(error)}). {what}"
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        windows = " (COM... is Windows)" if path.upper().startswith("COM") and os.name == "posix" else ""
-        return f"{which}no such port on this computer{windows}. {_ports()}"
+        is_windows_name = path.upper().startswith("COM") and os.name == "posix"
+        windows = " (COM... is a name on Windows)" if is_windows_name else ""
+        return f"{which}no such port on this computer{windows}. {_list_ports_text()}"
     if code in (errno.EACCES, errno.EPERM):
-        return f"{which}no permission. {_group(path)}"
+        return f"{which}no permission. {_permission_hint(path)}"
     if code in _BUSY:
-        return f"{which}in use by {_holder(path)}. Stop that first."
+        return f"{which}in use by {_find_holder(path)}. Stop that program first."
     if code == errno.EISDIR or os.path.isdir(path):  # noqa: PTH112 - a device path, not a file to work with
-        return f"{which}this is a directory, not a serial port. {_ports()}"
+        return f"{which}this is a directory, not a serial port. {_list_ports_text()}"
     if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - likewise
-        return f"{which}this is not a serial port ({_cause(error)}). {_ports()}"
-    return f"{which}the port cannot be opened ({_cause(error)}). {_ports()}"
+        return f"{which}this is not a serial port ({_cause(error)}). {_list_ports_text()}"
+    return f"{which}the port cannot be opened ({_cause(error)}). {_list_ports_text()}"
 
 
 def _is_rfcomm(path: str) -> bool:
-    """Return True for the port of a Bluetooth Classic module, also behind a symlink."""
+    """Return True if the path, or what it links to, is the port of a Bluetooth Classic module."""
     return any(_RFCOMM.fullmatch(os.path.basename(each)) for each in (path, os.path.realpath(path)))  # noqa: PTH119
 
 
-def _holder(path: str) -> str:
+def _find_holder(path: str) -> str:
+    """Return the program that has locked the port, else the programs that have it open."""
     try:
         holder = port_lock.find_holder(os.stat(path))  # noqa: PTH116 - a device path
     except (OSError, ValueError):
         holder = None
-    # A terminal program locks a port in another way (TIOCEXCL), or with a file.
+    # A terminal program locks a port in another way (TIOCEXCL, or a lock file), which `find_holder` does not see.
     return holder or ", ".join(port_lock.find_users(path)) or "another program"
 
 
@@ -403,7 +407,7 @@ def _why_gone(error: Exception) -> str:
 
 
 def _code(error: Exception) -> int | None:
-    """Return the error number, which termios.error has in its first argument only. None if there is none."""
+    """Return the error number, or None if the error has none. termios.error has the number only in its arguments."""
     code = getattr(error, "errno", None)
     if code is None and isinstance(error, _GONE) and error.args:
         code = error.args[0]
@@ -420,7 +424,10 @@ def _cause(error: Exception) -> str:
 
 
 def _device(path: str, *, required: bool) -> UsbSerialPort | None:
-    """Return the port at this path. None if it is unknown, or if the ports cannot be listed and it is not required."""
+    """Return the USB port at this path, or None if there is none.
+
+    If the system cannot list the ports, return None as well. Raises CannotOpen instead if the port is `required`.
+    """
     if _PSEUDO.fullmatch(path):
         return None
     try:
@@ -431,7 +438,8 @@ def _device(path: str, *, required: bool) -> UsbSerialPort | None:
         return None
 
 
-def _ports() -> str:
+def _list_ports_text() -> str:
+    """Return a sentence about the serial ports of this computer, or about why the port may be missing."""
     try:
         found = sorted(port.device for port in list_usb_ports())
     except CannotOpen as error:
@@ -441,7 +449,8 @@ def _ports() -> str:
     return f"Found: {', '.join(found)}. `fleet scan` checks them." if found else "No serial port is plugged in."
 
 
-def _group(path: str) -> str:
+def _permission_hint(path: str) -> str:
+    """Return a sentence about how to get permission for the port."""
     try:
         import grp
 

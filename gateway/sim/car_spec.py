@@ -1,4 +1,4 @@
-"""Parses the description of a simulated or replayed car, with one-line errors. Opens nothing. Pure."""
+"""Parses the description of a simulated or replayed car. Errors are one line. Pure: it does not open any link."""
 
 import re
 from collections.abc import Sequence
@@ -15,19 +15,22 @@ _REPLAY: Final = re.compile(r"(?P<file>.+?)(?::(?P<name>[a-z0-9_-]+)(?::(?P<link
 
 
 class BadSpec(ValueError):
-    """A description that is not allowed. The message names the place, the value and what is allowed."""
+    """A description that is not allowed. The message tells the place, the value and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class PtyPath:
-    """A pseudo terminal. `path`: a symlink to it that stays the same when the link returns."""
+    """A pseudo terminal.
+
+    `path` is a symlink to it, which keeps its name when the link is lost and returns. Without a path, there is none.
+    """
 
     path: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class TcpListen:
-    """A listening TCP port; 0 lets the system choose."""
+    """A listening TCP port. With port 0, the system chooses a free one."""
 
     host: str = "127.0.0.1"
     port: int = 0
@@ -40,10 +43,10 @@ class CarSpec:
     name: str
     platform: str
     options: frozenset[str]
-    """As the user writes them, each with its value."""
+    """The options as the user writes them, each with its value."""
     link: PtyPath | TcpListen
     traits: CarTraits | None = None
-    """None: those of the platform."""
+    """The traits of this car, or None if it has the traits of its platform."""
 
     @property
     def platform_words(self) -> str:
@@ -53,7 +56,7 @@ class CarSpec:
 
 @dataclass(frozen=True, slots=True)
 class ReplaySpec:
-    """A capture of `gateway monitor --raw` that plays as a car."""
+    """A capture of `gateway monitor --raw` that is played as a car."""
 
     name: str
     path: str
@@ -61,7 +64,7 @@ class ReplaySpec:
 
 
 def parse_car(text: str) -> CarSpec:
-    """Parse NAME:PLATFORM[+OPTION...]:LINK; raise BadSpec."""
+    """Parse NAME:PLATFORM[+OPTION...]:LINK. Raises BadSpec if a part is not allowed."""
     parts = text.split(":", 2)
     if len(parts) != 3:
         raise BadSpec(f"car {text!r} is not allowed: write NAME:PLATFORM:LINK, for example red:arduino:pty")
@@ -81,7 +84,7 @@ def parse_car(text: str) -> CarSpec:
 
 
 def parse_replay(text: str) -> ReplaySpec:
-    """Parse FILE[:NAME[:LINK]], by default with the name `replay` and a pty; raise BadSpec."""
+    """Parse FILE[:NAME[:LINK]]. The defaults are `replay` and a pty. Raises BadSpec if a part is not allowed."""
     match = _REPLAY.fullmatch(text)
     if match is None:
         raise BadSpec(f"replay {text!r} is not allowed: write FILE[:NAME[:LINK]], for example red.raw:red:tcp")
@@ -104,13 +107,13 @@ def _parse_link(what: str, link: str) -> PtyPath | TcpListen:
     if match and int(match["port"]) < 65536:
         return TcpListen(match["host"].strip("[]"), int(match["port"]))
     raise BadSpec(
-        f"{what}: link {link!r} is not allowed: use pty, pty:PATH (a symlink is made there) or "
-        "tcp://HOST:PORT with port 0 to 65535 (0: any free one)"
+        f"{what}: link {link!r} is not allowed: use pty, pty:PATH (for a symlink at PATH), tcp or "
+        "tcp://HOST:PORT with port 0 to 65535 (0 and tcp: any free port)"
     )
 
 
 def parse_cars(texts: Sequence[str]) -> list[CarSpec]:
-    """Parse several cars; raise BadSpec, also for two cars with one name, port or path."""
+    """Parse several cars. Raises BadSpec if a part is not allowed, or if two cars share a name, port or path."""
     cars = [parse_car(text) for text in texts]
     refuse_twins(cars)
     return cars
@@ -118,13 +121,13 @@ def parse_cars(texts: Sequence[str]) -> list[CarSpec]:
 
 def refuse_twins(cars: Sequence[CarSpec | ReplaySpec]) -> None:
     """Raise BadSpec if two cars have the same name, port or path."""
-    _refuse("name", [car.name for car in cars])
-    _refuse("path", [car.link.path for car in cars if isinstance(car.link, PtyPath) and car.link.path])
+    _refuse_duplicates("name", [car.name for car in cars])
+    _refuse_duplicates("path", [car.link.path for car in cars if isinstance(car.link, PtyPath) and car.link.path])
     tcp = [car.link for car in cars if isinstance(car.link, TcpListen)]
-    _refuse("port", [f"{link.host}:{link.port}" for link in tcp if link.port])
+    _refuse_duplicates("port", [f"{link.host}:{link.port}" for link in tcp if link.port])
 
 
-def _refuse(what: str, values: list[str]) -> None:
+def _refuse_duplicates(what: str, values: list[str]) -> None:
     for value in values:
         if values.count(value) > 1:
             raise BadSpec(f"two cars have the {what} {value}: give each its own")

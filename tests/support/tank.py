@@ -100,7 +100,7 @@ class TankDriver(PlainDriver):
 
 
 def profile_of(name: str) -> PlainProfile:
-    """Return what a tank can do; raise ValueError."""
+    """Return what a tank can do. Raises ValueError for a wrong name."""
     if name != "tank":
         raise ValueError(f'There is no platform "{name}" here. There is: tank.')
     return PROFILE

@@ -87,7 +87,7 @@ def _asked_for(mode: Mode) -> Expression:
 
 
 def _contradiction(effect: Effect, other: Effect) -> str:
-    """Return what the other effect gives in contradiction to this one; empty: nothing."""
+    """Return what the other effect gives in contradiction to this one, or an empty text if nothing."""
     wish, others = effect.mode or effect.role, other.mode or other.role
     if wish is not None and others is not None and (effect.mode, effect.role) != (other.mode, other.role):
         return str(others)

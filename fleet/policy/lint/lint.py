@@ -58,7 +58,10 @@ class Faults:
     warnings: tuple[PlanFault, ...] = ()
 
     def refusal(self, source: str = "plan") -> str:
-        """Return all errors, one per line; empty: the plan may be put in force. `source`: its name or path."""
+        """Return all errors, one per line. If there are none, the plan may be put in force.
+
+        `source` is the name or path of the plan.
+        """
         return "\n".join(each.at(source) for each in self.errors)
 
     def raise_errors(self, source: str) -> None:
@@ -72,8 +75,9 @@ def find_faults(
 ) -> Faults:
     """Return the faults of a plan that should be put in force.
 
-    `cars`: those of the fleet file (observer.listed_cars), None: there is none. Then each car of the plan that is not
-    among `present` (on the bus; None: not known) is a warning, as it may still come.
+    `cars` has the cars of the fleet file (observer.listed_cars), or is None if there is no such file. Then each car of
+    the plan that is not among `present`, the cars on the bus, gives a warning and no error, because it may still come.
+    If `present` is None, nobody knows which cars are on the bus.
     """
     findings = check(plan, cars)
     reported = {each.part for each in findings}
@@ -94,7 +98,7 @@ def _named(plan: Plan) -> set[str]:
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
-    """Return the faults of a plan by line; `fleet`: the cars of the fleet file, None: there is none."""
+    """Return the faults of a plan by line. `fleet` has the cars of the fleet file, or is None if there is no file."""
     found = dict.fromkeys(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
     return tuple(sorted(found, key=_position))
 
@@ -153,7 +157,9 @@ class _Check:
             can_have = [car for car in self._reach.cars if self._reach.can_have(car, role)]
             unknown = self._unknown.intersection(role.cars or ())
             if not can_have and not unknown:
-                whys = "; ".join(f"{car}: {self._reach.why_not(car, role)}" for car in list(self._reach.cars)[:4])
+                whys = "; ".join(
+                    f"{car}: {self._reach.explain_barrier(car, role)}" for car in list(self._reach.cars)[:4]
+                )
                 yield PlanFault(Severity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
             elif (
                 role.count is not None
@@ -162,8 +168,8 @@ class _Check:
             ):
                 words = f"it wants {role.count} cars, and only {', '.join(sorted(can_have))} can have it"
                 yield PlanFault(Severity.WARNING, part, words)
-            if can_have and (blind := self._reach.blind_to(role)):
-                yield PlanFault(Severity.WARNING, part, f"it may never get a car: {blind}")
+            if can_have and (why := self._reach.explain_blindness(role)):
+                yield PlanFault(Severity.WARNING, part, f"it may never get a car: {why}")
             if role.by_rules and not self._is_called(role):
                 yield PlanFault(
                     Severity.ERROR,
@@ -189,11 +195,11 @@ class _Check:
             yield from out_of_phase
             for condition, word in ((rule.when, "fires"), (rule.until, "ends by `until`")):
                 skip = condition is None or out_of_phase or condition.car in self._unknown
-                assess = Outlook() if skip or condition is None else self._reach.assess(condition, rule.during)
-                if assess.never:
-                    yield PlanFault(Severity.ERROR, rule.name, f"it never {word}. {assess.never}")
-                elif assess.only:
-                    yield PlanFault(Severity.WARNING, rule.name, f"it {word} only by {assess.only}")
+                outlook = Outlook() if skip or condition is None else self._reach.assess(condition, rule.during)
+                if outlook.never:
+                    yield PlanFault(Severity.ERROR, rule.name, f"it never {word}. {outlook.never}")
+                elif outlook.only_when:
+                    yield PlanFault(Severity.WARNING, rule.name, f"it {word} only when {outlook.only_when}")
                 elif condition is rule.when and (words := self._blind(rule)):
                     yield PlanFault(Severity.WARNING, rule.name, words)
             if rule.until is not None and implies(rule.when, rule.until):
@@ -205,7 +211,7 @@ class _Check:
         yield from self._self_ending()
 
     def _blind(self, rule: Rule) -> str:
-        """Say which cars a rule never sees, because their role's mode does not measure what it looks at."""
+        """Describe the cars that a rule never sees, because they do not measure its readings in their role's mode."""
         when = rule.when
         topics = {topic_of(name) for name in when.expression.names}
         for role in self._plan.roles.values():
@@ -226,7 +232,7 @@ class _Check:
         return ""
 
     def _out_of_phase(self, rule: Rule) -> Iterator[PlanFault]:
-        """Report a rule about a role, or for one, that counts in none of the rule's phases."""
+        """Report a rule about a role (or one that gives a role) that counts in none of the rule's phases."""
         for role in (rule.when.role, *(effect.role for effect in rule.effects)):
             if role is not None and not self._in_some_phase(self._plan.roles[role], rule.during):
                 where = f"phase {' or '.join(sorted(rule.during))}" if rule.during is not None else "any phase"
@@ -245,7 +251,7 @@ class _Check:
         cars = [car for car in cars if car in self._reach.cars]
         if effect.role is not None:
             role = self._plan.roles[effect.role]
-            whys = {car: self._reach.why_not(car, role) for car in cars}
+            whys = {car: self._reach.explain_barrier(car, role) for car in cars}
             if certain and cars and all(whys.values()):
                 yield PlanFault(Severity.ERROR, rule.name, f"{who} can never have role {role.name}: {whys[who]}")
         mode = effect.mode
@@ -255,7 +261,7 @@ class _Check:
         yield PlanFault(Severity.ERROR, rule.name, words)
 
     def _cannot(self, car: str, mode: Mode) -> str:
-        """Return why a car is never in this mode; empty if it can be."""
+        """Return the reason why a car is never in this mode, or an empty text if it can be."""
         profiles = self._reach.profiles(car)
         if not any(mode in profile.modes for profile in profiles):
             return f"a {profiles[0].name} car, which does not know mode {mode}"
@@ -267,7 +273,7 @@ class _Check:
             yield PlanFault(Severity.ERROR if always else Severity.WARNING, rule.name, words)
 
     def _self_ending(self) -> Iterator[PlanFault]:
-        """Report a rule that ends itself, as its mode does not measure the readings of its condition."""
+        """Report a rule that ends itself, because cars do not measure its readings in the mode that it gives them."""
         for rule in self._plan.rules:
             if rule.until is not None:
                 continue
@@ -311,7 +317,7 @@ class _Check:
             yield from self._endless(phase)
 
     def _endless(self, phase: PlanPhase) -> Iterator[PlanFault]:
-        """Report a phase that its condition does not end."""
+        """Report a phase that does not end by its condition."""
         if phase.until is None:
             if phase.next is not None and phase.timeout_s is None and not self._jumps_out(phase):
                 words = "only `fleet plan next` ends it: it has neither until nor timeout_s."
@@ -319,8 +325,8 @@ class _Check:
             return
         if phase.until.car in self._unknown:
             return
-        assess, jumps = self._reach.assess(phase.until, {phase.name}), self._jumps_out(phase)
-        why = self._no_role(phase) or assess.never
+        outlook, jumps = self._reach.assess(phase.until, {phase.name}), self._jumps_out(phase)
+        why = self._no_role(phase) or outlook.never
         if phase.timeout_s is not None and phase.until.for_s >= phase.timeout_s:
             why = why or f"Its `until` takes {phase.until.for_s:g} s, and timeout_s is {phase.timeout_s:g}."
         part = f"phase {phase.name}"
@@ -329,8 +335,8 @@ class _Check:
         elif why:
             other = " or ".join([*(["its timeout"] if phase.timeout_s is not None else []), *jumps])
             yield PlanFault(Severity.WARNING, part, f"only {other} ends it. {why}")
-        elif assess.only:
-            yield PlanFault(Severity.WARNING, part, f"it ends only by {assess.only}")
+        elif outlook.only_when:
+            yield PlanFault(Severity.WARNING, part, f"it ends only when {outlook.only_when}")
 
     def _jumps_out(self, phase: PlanPhase) -> list[str]:
         """List the rules that can end a phase."""

@@ -47,7 +47,7 @@ _MISSING: Final = {"mode": Mode.MANUAL, "when": "true", "then": []}
 
 
 def parse(text: str, source: str = "plan") -> Plan:
-    """Parse a plan; raises BadPlan with all faults. `source` is its name in errors, usually its path."""
+    """Parse a plan. Raises BadPlan with all faults, if any. `source` is its name in errors, usually its path."""
     return parse_entry(text, source)[1]
 
 

@@ -66,10 +66,10 @@ class Role:
     mode: Mode
     needs: Expression | None = None
     count: int | None = 1
-    """Number of cars; None: any number."""
+    """Number of cars, or None for any number."""
     priority: int = 0
     cars: tuple[str, ...] | None = None
-    """The only cars that may have it, best first; None: any."""
+    """The only cars that may have the role, best first, or None if any car may."""
     capabilities: frozenset[str] = frozenset()
     platforms: tuple[str, ...] | None = None
     if_none: str | None = None
@@ -91,7 +91,7 @@ class Effect:
     mode: Mode | None = None
     led: Rgb | None = None
     blink_s: float | None = None
-    """Time for which the LED is on, and then off; None: it does not blink."""
+    """Time for which the LED is on, and then off, or None if it does not blink."""
     phase: str | None = None
 
 
@@ -112,7 +112,7 @@ class PlanPhase:
 
     name: str
     roles: frozenset[str] | None = None
-    """The roles that count; None: all."""
+    """The roles that count, or None if all count."""
     until: PlanCondition | None = None
     timeout_s: float | None = None
     next: str | None = None
@@ -129,7 +129,7 @@ class Plan:
     rules: tuple[Rule, ...]
     phases: Mapping[str, PlanPhase]
     idle: Mode | None
-    """The mode of a car without a role; None: the car is left alone."""
+    """The mode of a car without a role, or None if such a car is left alone."""
     text: str
     places: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
     """Line and column of each role, rule, phase and fixed car in the text, by its name in findings."""
@@ -141,7 +141,7 @@ class Plan:
 
     @property
     def first(self) -> str:
-        """The first phase; empty if there are none."""
+        """The first phase, or an empty text if there are none."""
         return next(iter(self.phases), "")
 
     @property

@@ -1,4 +1,4 @@
-"""Runs the programs of cars that meet in the order of their events, so that all see the same moment. Pure."""
+"""Runs the programs of cars that meet. Their events run in the order of time, so all cars see the same moment. Pure."""
 
 from typing import Protocol
 
@@ -7,7 +7,7 @@ class Member(Protocol):
     """A car's program."""
 
     def due(self) -> float:
-        """Return the time at which the program next runs; inf if it never does."""
+        """Return the time at which the program runs next, or inf if it never runs again."""
 
     def run_alone(self, now: float) -> None:
         """Run this program up to `now`."""
@@ -24,11 +24,13 @@ class EventScheduler:
         self._members.append(member)
 
     def run(self, now: float) -> None:
-        """Run all programs up to `now`. Of two simultaneous events, that of the earlier member runs first."""
-        if not self._members:
-            return
-        while (due := (first := min(self._members, key=_due)).due()) <= now:
-            first.run_alone(due)
+        """Run all programs up to `now`. If two events are simultaneous, the program that joined first runs first."""
+        while self._members:
+            next_member = min(self._members, key=_due)
+            due = next_member.due()
+            if due > now:
+                break
+            next_member.run_alone(due)
         for member in self._members:
             member.run_alone(now)
 

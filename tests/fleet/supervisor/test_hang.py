@@ -18,7 +18,7 @@ from fleet.supervisor.hang import (
     Pulse,
     Sign,
     WatchClock,
-    are_many,
+    have_common_cause,
     longest_hub_silence_s,
     longest_silence_s,
 )
@@ -93,7 +93,7 @@ def test_a_hub_that_works_is_not_hung(sign: Sign, seconds: float) -> None:
     [(0, 0, False), (1, 1, False), (1, 4, False), (2, 2, True), (2, 8, True), (2, 9, False), (24, 100, False)],
 )
 def test_when_many_are_silent(silent: int, total: int, many: bool) -> None:
-    assert are_many(silent, total) is many
+    assert have_common_cause(silent, total) is many
 
 
 @pytest.mark.parametrize("slept_s", [12.0, 3600.0, 1e6])

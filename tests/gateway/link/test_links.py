@@ -253,7 +253,7 @@ async def test_car_that_stops_reading_loses_link_not_loop(link: Link, peer: Peer
 
     peer.stall()
     words = await until_lost(write)
-    assert "accepts no bytes" in words or "took " in words
+    assert "accepts no bytes" in words or "accepted " in words
     assert await lost(link) == words, "the first cause is kept, and whoever reads is told it"
     with pytest.raises(LinkLost, match=re.escape(words)):
         await link.write(STOP)
@@ -493,7 +493,7 @@ async def test_hanging_port_open_uses_one_thread(tmp_path: Path, monkeypatch: py
     with pytest.raises(CannotOpen, match=r"the port did not open within 0.1 s: is the device there\?"):
         await open_link(peer.url, timeout_s=0.1)
     for _ in range(3):
-        with pytest.raises(CannotOpen, match="still hangs in an earlier try to open it: unplug it"):
+        with pytest.raises(CannotOpen, match="still hangs"):
             await open_link(peer.url, timeout_s=0.1)
     threads = link_threads()
     assert len(threads) == 1

@@ -100,7 +100,7 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         (
             PATROL.replace("count: all", "count: all, needs: battery.voltage_v > 7") + LIGHT,
             None,
-            "rule 1: it fires only by a car that has no role because it has not battery.voltage_v > 7",
+            "rule 1: it fires only when a car has no role because it does not meet battery.voltage_v > 7",
         ),
         (
             SEARCH.replace("SEARCH", "timeout_s: 60, roles: [patrol]"),
