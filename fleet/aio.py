@@ -160,7 +160,7 @@ class Fleet:
     async def resume(
         self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False
     ) -> list[Outcome]:
-        """End the e-stops of these ids. Without ids, end the hold. None: of every car."""
+        """End the e-stops with these ids, or without ids the hold. If `cars` is None, do so for every car."""
         return await self.ask(resume_request(ids, everything=everything), cars)
 
     async def pause(self, why: str = "") -> list[Outcome]:

@@ -19,7 +19,7 @@ FleetLink = LinkUrl | SimLink
 
 
 def parse_fleet_link(text: str) -> FleetLink:
-    """Return the link with this text; raise BadLink."""
+    """Return the link with this text. Raises BadLink if it is not a link."""
     return SimLink() if text == LINK_SIM else parse_link(text)
 
 

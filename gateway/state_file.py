@@ -71,7 +71,7 @@ class SafetyStateFile:
         return state
 
     def save(self, state: PersistedSafety) -> None:
-        """Replace the file atomically; raise OSError."""
+        """Replace the file atomically. Raises OSError if that fails."""
         content = asdict(state) | {"link": self._link, "others": [asdict(each) for each in self._others]}
         write_state(self.path, json.dumps(content), sync=True)
 
@@ -104,7 +104,7 @@ def _exchanged(
 
 
 def _parse(content: Any, now_ns: int) -> PersistedSafety:
-    """Return the state in a file; raise ValueError, TypeError or KeyError. Older versions only have the hold."""
+    """Return the state in a file, or raise ValueError, TypeError or KeyError. Older versions only wrote the hold."""
     return PersistedSafety(
         _hold(content["hold"], now_ns),
         _estops(content, now_ns),
@@ -119,7 +119,7 @@ def _parse(content: Any, now_ns: int) -> PersistedSafety:
 
 
 def _parse_others(content: Any, now_ns: int) -> Iterator[_OfLink]:
-    """Yield what belongs to other links; raise as `_parse` does."""
+    """Yield what belongs to other links. Raises what `_parse` raises."""
     for each in content.get("others", ()):
         hold, loan = _hold(each["hold"], now_ns), _loan(each["loan"], now_ns)
         if not (other := _OfLink(_text(each["link"]), hold, _estops(each, now_ns), loan)).is_empty:
@@ -144,7 +144,7 @@ def _who_and_why(content: Any) -> tuple[str, str, str]:
 
 
 def _loan(content: Any, now_ns: int) -> Loan | None:
-    """Return the loan; None if there is none, or if it is over."""
+    """Return the loan, or None if there is none, or if it is over."""
     if content is None:
         return None
     to, by, since_ns = _text(content["to"]), _text(content["by"]), _past(content["since_ns"], now_ns)

@@ -53,7 +53,7 @@ class CarProfile(Protocol):
 
     @property
     def dead_man_s(self) -> float | None:
-        """The time after which the car stops by itself if nothing drives it; None if it drives on."""
+        """The time after which the car stops by itself if nothing drives it, or None if it drives on."""
 
     @property
     def not_observed(self) -> tuple[str, ...]:

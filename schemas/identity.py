@@ -74,7 +74,7 @@ class NotTheSender(Exception):
 
 
 def parse(identity: str) -> tuple[IdentityRole, str] | None:
-    """Return the role and the name of an identity; None if it is none. A service has its name at every site."""
+    """Return the role and the name of an identity, or None if it is not one. A service has its name at every site."""
     role, _, name = identity.partition(".")
     if role == IdentityRole.SERVICE:
         name, at, site = name.partition(_AT)
@@ -86,7 +86,7 @@ def parse(identity: str) -> tuple[IdentityRole, str] | None:
 
 
 def role_of(identity: str) -> IdentityRole | None:
-    """Return the role of an identity; None if it is none."""
+    """Return the role of an identity, or None if it is none."""
     known = parse(identity)
     return None if known is None else known[0]
 

@@ -92,7 +92,7 @@ def command_keys(fleet: str, car: str, verb: str = "*") -> tuple[str, str]:
 
 
 def identity_of(key: str) -> str:
-    """Return the identity in the key of a command; empty if it has none."""
+    """Return the identity in the key of a command, or an empty text if it has none."""
     before, by, rest = key.rpartition(f"/@cmd/{BY}/")
     return rest.partition("/")[0] if before and by else ""
 

@@ -74,7 +74,7 @@ class LinkUrl(ABC):
     @classmethod
     @abstractmethod
     def parse(cls, text: str) -> "LinkUrl | None":
-        """Return the link with this URL, None if it is none after all; raise BadLink."""
+        """Return the link with this URL, or None if it is not a link after all. Raises BadLink if a part is wrong."""
 
     @classmethod
     def guess(cls, text: str) -> str:  # noqa: ARG003 - a kind may have no such texts
@@ -213,7 +213,7 @@ class TcpUrl(LinkUrl):
 
     @classmethod
     def parse(cls, text: str) -> LinkUrl | None:
-        """Return the link with this URL; raise BadLink."""
+        """Return the link with this URL. Raises BadLink if a part is wrong."""
         parts = _split(text)
         try:
             port = parts.port
@@ -269,7 +269,7 @@ class BleUrl(LinkUrl):
 
     @classmethod
     def parse(cls, text: str) -> LinkUrl | None:
-        """Return the link with this URL; raise BadLink."""
+        """Return the link with this URL. Raises BadLink if a part is wrong."""
         # Not by urlsplit, which would take the colons of an address for a port.
         return _ble(text[6:]) if text[3:6] == "://" else None
 
@@ -303,7 +303,7 @@ def car_link(url: LinkUrl) -> str:
 
 
 def parse_link(text: str) -> LinkUrl:
-    """Return the link with this URL or bare device path; raise BadLink."""
+    """Return the link with this URL or bare device path. Raises BadLink if it is not a link."""
     if not text.isprintable():  # urlsplit drops a line feed without an error
         raise BadLink("it has characters that cannot be printed")
     if text.startswith("/") or _WINDOWS_PORT.fullmatch(text):
@@ -317,7 +317,7 @@ def parse_link(text: str) -> LinkUrl:
 
 
 def _likely_link(text: str) -> str:
-    """Return the link that a text without a scheme probably means, as a question; empty if unknown."""
+    """Return the link that a text without a scheme probably means, as a question, or an empty text if unknown."""
     scheme, colon, rest = text.partition("://")
     if colon and rest and (near := nearest(scheme, _BY_SCHEME)):
         return f"Did you mean {near}://{rest}? "

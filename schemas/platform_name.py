@@ -37,7 +37,7 @@ def kind_of(name: str) -> str:
 
 
 def parse_name(text: str) -> tuple[Platform, frozenset[str]]:
-    """Return platform and options of a name such as `raspberry_pi+arm+imu` in any case; raise ValueError."""
+    """Return platform and options of a name such as `raspberry_pi+arm+imu` in any case. Raises ValueError if wrong."""
     kind, *options = normalize_name(text).split("+")
     if kind not in set(Platform):
         hint = did_you_mean(kind, Platform) or f"There are {', '.join(Platform)}."

@@ -80,7 +80,7 @@ class People:
 
     @classmethod
     def of(cls, message: Any) -> Self:
-        """Return the people of a fleet.v1.CarPeople. None: the fleet has no people."""
+        """Return the people in a fleet.v1.CarPeople, or None if the fleet has no people."""
         if message is None:
             return cls()
         roles = dict.fromkeys(message.others, PersonRole.OTHER) | dict.fromkeys(message.drivers, PersonRole.DRIVER)
@@ -243,7 +243,7 @@ Mark = Hold | Estop | FleetPause | Loan | LeaseState
 
 
 def binding_pause(pauses: Iterable[Any]) -> Any:
-    """Return the pause that binds: the newest of the highest rank. None: there is no pause.
+    """Return the pause that binds: the newest of the highest rank. Returns None if there is no pause.
 
     pauses: FleetPause, or those of a fleet.v1.Safety; oldest first.
     """
@@ -345,7 +345,7 @@ class Authority:
         )
 
     def may(self, sender: Sender, right: Right) -> Denial | None:
-        """Return why this sender may not do it; None if it may. The sender has its rank, see `People.ranked`."""
+        """Return why this sender may not do it, or None if it may. The sender has its rank, see `People.ranked`."""
         people = self.people
         match right:
             case Right.MOVE | Right.TAKE:

@@ -18,7 +18,7 @@ _HASH_LENGTH: Final = 8
 
 
 def joined_endpoint() -> str:
-    """Return the endpoint of the hub that this user has joined (`fleet join`, `fleet up --secure`); empty if none."""
+    """Return the endpoint of the hub that this user has joined (`fleet join`, `fleet up --secure`), or empty."""
     try:
         return (default_directory() / JOINED_FILE).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):

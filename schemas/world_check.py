@@ -19,9 +19,9 @@ MIN_SIZE_M: Final = 0.02
 
 
 def check_world(text: str, source: str, cars: Sequence[str] | None = None) -> WorldEntry:
-    """Return the fields of the world in a text; raise BadFile with every fault.
+    """Return the fields of the world in a text. Raises BadFile with every fault, if any.
 
-    `source`: the name of the file in errors. `cars`: the cars that can carry something; None: any car.
+    `source` is the name of the file in errors. `cars` has the cars that can carry something. None means any car.
     """
     document = Document(text, source)
     # Other faults are searched in what remains without the faulty values.

@@ -60,7 +60,7 @@ class Entity:
     """Its field of the state, and the last part of its id."""
     title: str
     value: Callable[[CarState, float], Any]
-    """The value at a time. None: it was not measured, or is stale."""
+    """The value at a time. None means that it was not measured, or is stale."""
     config: Mapping[str, Any]
     """Its settings for Home Assistant. In a template, {0} is its name."""
     of_absent: bool = False
@@ -85,7 +85,7 @@ def is_available(state: CarState, now: float) -> bool:
 
 
 def _of(topic: str, read: Callable[[Any], Any]) -> Callable[[CarState, float], Any]:
-    """Return the value of a field of a topic's newest message; None if it is stale."""
+    """Return the value of a field of a topic's newest message, or None if it is stale."""
     return lambda state, now: None if (found := state.fresh(topic, now)) is None else read(found)
 
 

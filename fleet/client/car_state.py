@@ -206,13 +206,13 @@ class CarState:
 
     @property
     def driver(self) -> str:
-        """The client that drives it: the owner of its motion, or the holder of its lease. Empty: none, or a plan."""
+        """The client that drives it: the owner of its motion, or the holder of its lease. Empty if none, or a plan."""
         lease = self.safety.lease
         return self.motion.owner or ("" if lease.kind == Rank.COORDINATOR else lease.holder)
 
     @property
     def last_rx_s(self) -> float | None:
-        """Time since the last byte of the car, when its gateway last said so. None: none came over this link."""
+        """Time since the last byte from the car, by its gateway's last report. None if no byte came over this link."""
         return self.link.last_rx_s if self.link.HasField("last_rx_s") else None
 
     @property
@@ -251,7 +251,7 @@ class CarState:
         return None if heard else NEVER_HEARD
 
     def why_missing(self, now: float) -> str:
-        """Return why a car is missing from a start, in words; empty if it is ready."""
+        """Return why a car is missing from a start, in words, or an empty text if it is ready."""
         why = self.why_not_ready(now)
         if why is None or why:
             return why or ""

@@ -78,7 +78,7 @@ class CarClaim:
 
 
 def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the motors. safety: the newest fleet.v1.Safety; None: there is none."""
+    """Return what is claimed of the motors. `safety` is the newest fleet.v1.Safety, or None if there is none."""
     if safety is None or not safety.motors:
         return CarClaim(UNKNOWN)
     since_s = safety.trust_since_s if safety.HasField("trust_since_s") else None
@@ -87,7 +87,7 @@ def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> Ca
 
 
 def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the mode. mode: the newest fleet.v1.Mode; None: there is none."""
+    """Return what is claimed of the mode. `mode` is the newest fleet.v1.Mode, or None if there is none."""
     if mode is None or not mode.asked:
         return CarClaim(UNKNOWN)
     since_s = mode.since_s if mode.HasField("since_s") else None
@@ -96,7 +96,7 @@ def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
 
 
 def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the link. link: the newest fleet.v1.Link; None: there is none."""
+    """Return what is claimed of the link. `link` is the newest fleet.v1.Link, or None if there is none."""
     if link is None or not link.state:
         return CarClaim(UNKNOWN if present else NO_GATEWAY)
     claim = _claim("state/link", age_s, link.state, "", link.since_s, link.reason)

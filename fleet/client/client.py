@@ -319,7 +319,7 @@ class Fleet:
         return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
-        """End the e-stops of these ids. Without ids, end the hold. None: of every car.
+        """End the e-stops with these ids, or without ids the hold. If `cars` is None, do so for every car.
 
         everything: end the hold and every e-stop that this sender may end. The outcome is not ok if something stays.
         """
@@ -342,7 +342,7 @@ class Fleet:
         return self.ask(end_loan_request(), cars)
 
     def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Send a command to the cars (None: to all, with one wildcard query). Wait and return their outcomes.
+        """Send a command to the cars, or to all with one wildcard query if `cars` is None. Return their outcomes.
 
         A missing or silent car has its own outcome and does not delay the others.
         """

@@ -39,7 +39,7 @@ class CommandRequest:
     take: bool = False
     """True if a person takes the car over from another person."""
     sender: str = ""
-    """Its sender. Empty: the client."""
+    """The sender of the command. If it is empty, the client is the sender."""
 
     @property
     def effect_verb(self) -> str:

@@ -74,7 +74,7 @@ class CarEvidence:
     coordinated: bool = False
     """True if a coordinator is on the bus."""
     clock_off_s: float | None = None
-    """Time by which the clock of its gateway's computer is ahead of ours; negative: behind. None: not known."""
+    """How far the clock of its gateway's computer is ahead of ours, negative if behind, or None if not known."""
     asked: bool = False
     """True if the states are answers. Then a gateway answers, also one that says old things, such as a replay."""
 

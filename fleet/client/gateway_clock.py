@@ -37,7 +37,7 @@ class GatewayClock:
 
     @property
     def off_s(self) -> float | None:
-        """Return how far it is ahead of ours, s; negative: behind. None: not known yet."""
+        """Return how far it is ahead of ours, s. The result is negative if it is behind, and None if not known yet."""
         if len({stamp for stamp, _ in self._leads}) < _MIN_STAMPS:
             return None
         return max(lead for _, lead in self._leads)

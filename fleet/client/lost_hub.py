@@ -13,7 +13,7 @@ class LostHub(BusError):
 
 
 def describe_running(endpoint: str) -> str:
-    """Return words that gateways of this bus run on this computer. Empty: none does."""
+    """Return a text that tells which gateways of this bus run on this computer, or an empty text if none does."""
     cars = running_cars(endpoint)
     more = f" and {len(cars) - _MAX_CARS_NAMED} more" if len(cars) > _MAX_CARS_NAMED else ""
     return f"gateways run here ({', '.join(cars[:_MAX_CARS_NAMED])}{more}): cars may move" if cars else ""

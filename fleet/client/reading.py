@@ -99,7 +99,7 @@ class Reading:
         return exact((since // timedelta(microseconds=1)) * 1000)
 
     def _fields(self) -> Iterator[tuple[str, str | None]]:
-        """Yield the fields with their values as text and their units; None if not measured."""
+        """Yield the fields with their values as text and their units, or None if not measured."""
         topic = topics.of_key(self.key)
         values = self.as_dict()
         for field in self.value.DESCRIPTOR.fields:

@@ -27,7 +27,7 @@ class _LastMatch:
 
     at: datetime
     arrived_s: float | None
-    """When it was published, s, monotonic; None if a query returned it."""
+    """When it was published, s, monotonic, or None if a query returned it."""
     message: str
     """Its type. Another one has other fields."""
     holding: Holding | None

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeAlias
 
 Value: TypeAlias = bool | int | float | str
 Lookup: TypeAlias = Callable[[str], object | None]
-"""Returns the value of a name; None: not measured."""
+"""Returns the value of a name, or None if it was not measured."""
 
 
 class ValueKind(StrEnum):
@@ -151,7 +151,7 @@ class Expression:
         return tuple(dict.fromkeys(each.name for each in names_in(self.root)))
 
     def value(self, lookup: Lookup) -> bool | None:
-        """Return whether it is true; None: not known, as a value was not measured (None or NaN).
+        """Return whether it is true, or None if that is not known because a value was not measured (None or NaN).
 
         Raises TypeError for a value that is not of its name's type: the caller's mistake.
         """

@@ -19,7 +19,7 @@ class ConditionFunction:
 
     name: str
     evaluate: Callable[[Measured], float | None]
-    """Returns its value. None: not known."""
+    """Returns the value of the function, or None if it is not known."""
     readings: int = 1
     """Number of the newest readings that it needs."""
     range: tuple[float, float] = (-inf, inf)

@@ -33,7 +33,7 @@ class HeldStep(NamedTuple):
     """Changes by one reading."""
 
     value: bool | None
-    """The condition now; None if it is not decided."""
+    """The condition now, or None if it is not decided."""
     ended: HeldSpan | None
     """The span that has ended with this reading, or before it."""
     has_begun: bool

@@ -52,7 +52,7 @@ def parse(
     aliases: Mapping[str, str] = MappingProxyType({}),
     functions: Collection[str] = (),
 ) -> Expression:
-    """Parse a condition over these names (of type float, int, str or bool); raises BadExpression.
+    """Parse a condition over these names (of type float, int, str or bool). Raises BadExpression if it is wrong.
 
     `aliases`: other spellings of names, each with the name that it stands for. `functions`: those that may be applied
     to a number.
@@ -277,7 +277,7 @@ class _Parser:
         return [name for name, kind in self._names.items() if expected in (None, KINDS[kind])] or list(self._names)
 
     def _expected_kind(self) -> ValueKind | None:
-        """Return the kind that the name before the next token must have by its neighbors; None: any."""
+        """Return the kind that the name before the next token must have by its neighbors, or None for any kind."""
         before, after = self._at - 2, self._at
         for sign, other in ((after, after + 1), (before, before - 1)):
             if 0 <= sign < len(self._tokens) and self._tokens[sign].text in tuple(Op):

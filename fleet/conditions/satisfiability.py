@@ -37,7 +37,7 @@ def is_contradictory(expression: Expression) -> bool:
 
 
 def explain_impossible(expression: Expression, of: str = "") -> str:
-    """Return why it can never be true by the words and ranges of schemas/topics.py; empty if it can.
+    """Return why it can never be true by the words and ranges of schemas/topics.py, or an empty text if it can.
 
     `of`: the last word of the topic, if the names are the fields of one message.
     """

@@ -62,7 +62,7 @@ class _Budget:
 
 @dataclass(slots=True)
 class Budgets:
-    """The budgets of persons by name, of devices by id (None: this computer), and of strangers by address."""
+    """The budgets of persons by name, of devices by id (None means this computer), and of strangers by address."""
 
     _all: dict[Hashable, _Budget] = field(default_factory=dict)
     _open: Counter[Hashable] = field(default_factory=Counter)
@@ -128,7 +128,7 @@ class StopMerge:
     _open_at: float = float("-inf")
 
     def delay_s(self, now: float) -> float | None:
-        """Return after which time to send this STOP, 0 for at once. None: one that waits stands for it."""
+        """Return the delay of this STOP, which may be 0. None means that a STOP that already waits replaces it."""
         if now >= self._open_at:
             self._open_at = now + MERGE_S
             return 0.0

@@ -89,7 +89,7 @@ class CarView:
         self._heard_at: float | None = None
         """When the newest message came."""
         self._changed_at: float | None = None
-        """When the gateway joined or left the bus. None: nobody has said yet if it is there."""
+        """When the gateway joined or left the bus, or None if it is not known yet whether it is there."""
 
     @property
     def last_sign_at(self) -> float:
@@ -283,7 +283,7 @@ class FleetView:
         self._cars: dict[str, CarView] = {}
         self._listed: frozenset[str] = frozenset()
         self.left_out = ""
-        """The car that had no place first, or gave its place up. Empty: none."""
+        """The first car without a place, or the car that gave its place up. Empty if there is no such car."""
 
     def list_cars(self, names: Iterable[str]) -> None:
         """Set the cars that the running fleet lists. Those over the maximum are as any other."""

@@ -23,7 +23,7 @@ class _OpenConnection:
     address: str
     since_s: float
     device: str = ""
-    """The paired device whose cookie it has shown; empty: none."""
+    """The paired device whose cookie the connection has shown. Empty if it has shown none."""
 
 
 @dataclass(slots=True)
@@ -83,7 +83,7 @@ class LogLimit:
     _left_out: int = 0
 
     def words(self, words: str, now: float) -> str | None:
-        """Return what to log: the words, with the number of messages left out before. None: nothing."""
+        """Return what to log: the words, with the number of messages left out before. None means nothing."""
         if self._last is not None and now - self._last < self.interval_s:
             self._left_out += 1
             return None

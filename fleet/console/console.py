@@ -335,7 +335,7 @@ class Console:
         return self._operators.own
 
     def operator_of(self, person: PagePerson | None) -> ConsoleOperator:
-        """Return the operator of a request (None: from this computer)."""
+        """Return the operator of a request, or None if it comes from this computer."""
         return self.operator if person is None else self._operators.of(person.name)
 
     def sender_of(self, person: PagePerson | None) -> str:
@@ -349,7 +349,7 @@ class Console:
         return self._view.people
 
     def management_refusal(self, person: PagePerson | None) -> str:
-        """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
+        """Return why this person may not start and stop the recorder and plans. None stands for this computer."""
         return management_refusal(self._view.authority, (person or self.person).name)
 
     def _check_room(self, person: PagePerson | None, device: str) -> None:
@@ -369,7 +369,7 @@ class Console:
     async def add_page(
         self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None, device: str = ""
     ) -> PageLink:
-        """Add a page of a person (None: of this computer). Raises TooManyPages and BusError.
+        """Add a page of a person, or of this computer if `person` is None. Raises TooManyPages and BusError.
 
         device: the id of the device on the network.
         """
@@ -420,7 +420,7 @@ class Console:
 
         Without an id, every call counts.
 
-        operator: of the page (None: of this computer). request: an e-stop or a pause (None: a stop).
+        `operator` is the page's, or None for this computer. `request` is an e-stop, a pause, or None for a stop.
         """
         if stop_id in self._stop_ids:
             return
@@ -548,7 +548,7 @@ class Console:
         return ""
 
     def _count(self, page: PageLink, command: "asyncio.Task[None] | None") -> None:
-        """Count a command (None: nothing was sent) of this page's device until it has an outcome."""
+        """Count a command of this page's device until it has an outcome. None means that nothing was sent."""
         if command is not None:
             device = page.device or None
             self.budgets.on_command_begun(device)
@@ -597,7 +597,7 @@ class Console:
             self._end(press, words)
 
     def _end(self, press: HeldPress, words: str, cars: Sequence[str] | None = None) -> None:
-        """End a press: stop its cars (None: all), and tell its page why."""
+        """End a press: stop its cars, or all cars if `cars` is None, and tell its page why."""
         page = self._pages[press.client]
         page.operator.end_press(press, cars)
         page.answer(t="over", press=press.id, words=words)

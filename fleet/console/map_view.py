@@ -123,7 +123,7 @@ class MapView:
         return {car: points for car, points in found.items() if points}
 
     def world(self, now: float) -> dict[str, Any] | None:
-        """Return the floor of a simulation as JSON values. None: there is none, or nobody has told of it for long."""
+        """Return the floor of a simulation as JSON values, or None if no simulation has reported it lately."""
         world = self._world
         if world is None or now - self._world_at > (WORLD.stale_after_s or math.inf):
             return None

@@ -333,7 +333,7 @@ class Lan:
 
 
 def _names_of(listed: People) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
-    """Return the people and the leads for the people file. None: the fleet lists nobody."""
+    """Return the people and the leads for the people file, or None if the fleet lists nobody."""
     return (None, None) if listed.roles is None else (tuple(sorted(listed.roles)), listed.leads)
 
 

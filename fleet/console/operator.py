@@ -137,7 +137,7 @@ class ConsoleOperator:
     def command(
         self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> "asyncio.Task[None]":
-        """Send one command to some cars (None: to all) and report the outcomes. Return the task that waits for them."""
+        """Send a command to these cars (None: all), and report the outcomes. Return the task that waits for them."""
         return self.spawn(self._command(request, cars, on_outcomes))
 
     async def _command(
@@ -166,7 +166,7 @@ class ConsoleOperator:
         cars: Iterable[str] | None = None,
         on_outcomes: Callable[[list[dict[str, Any]]], object] = lambda _: None,
     ) -> "asyncio.Task[None] | None":
-        """Give cars back (None: all that this page has taken).
+        """Give these cars back, or all cars that this page has taken if `cars` is None.
 
         Return the task that waits for the outcomes, None if there are no such cars.
         """
@@ -192,7 +192,7 @@ class ConsoleOperator:
             self._renewals.discard(car)
 
     async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str] | None:
-        """Send a request to the coordinator. Return whether it was carried out, and words. None: no plan is running.
+        """Send a request to the coordinator. Return whether it was carried out, and words. None if no plan is running.
 
         text: of a plan to set.
         """

@@ -7,7 +7,7 @@ from fleet.console.page_link import PageLink
 from fleet.console.page_requests import PageMessage
 
 Handler = Callable[[PageLink, PageMessage], None]
-"""Handles one message of a page; raises BadPageMessage, and then has changed nothing."""
+"""Handles one message of a page. Raises BadPageMessage if the message is wrong, and then has changed nothing."""
 
 
 class PageFeed(ABC):

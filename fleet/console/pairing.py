@@ -137,9 +137,9 @@ class PeopleBook:
     address: str = ""
     """Where the console last served the network."""
     people: tuple[str, ...] | None = None
-    """The people of the fleet, as the console knows them. None: the fleet lists nobody, so everybody may come."""
+    """The people of the fleet, as the console knows them. None if the fleet lists nobody: then everybody may come."""
     leads: tuple[str, ...] | None = None
-    """The leads among them. None: the fleet lists nobody, so a code may make anybody a lead."""
+    """The leads among them, or None if the fleet lists nobody. Then a code may make anybody a lead."""
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
         """Add a code for a person. Raises UnknownPerson, and ValueError for what is no name or no rank."""

@@ -33,7 +33,7 @@ class PlanQuestion:
     samples: tuple[tuple[float, Sample], ...] = ()
     """The newest messages of the cars, each with its age."""
     before: str = ""
-    """The plan in force. Empty: none runs."""
+    """The plan in force. Empty if none runs."""
     roles: Mapping[str, str] = field(default_factory=dict)
     """The role of each car under it."""
     phase: str = ""

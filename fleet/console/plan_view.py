@@ -45,7 +45,7 @@ class PlanView:
 
     @property
     def in_force(self) -> tuple[str, dict[str, str], str]:
-        """The text of the running plan (empty: none), the role of each car, and the phase."""
+        """The text of the running plan (empty if there is none), the role of each car, and the phase."""
         if self._plan is None or not self._running:
             return "", {}, ""
         if self._assignment is None:

@@ -52,7 +52,7 @@ class PlotBuffer:
         return list(self._numbers)
 
     def add(self, car: str, topic: str, message: Any, at_ms: int | None = None) -> None:
-        """Add the values of a message. A field that was not measured has none. at_ms: their time (None: its stamp)."""
+        """Add the values of a message, at its stamp if `at_ms` is None. A field that was not measured has no value."""
         for number, field in self._numbers.get((car, topic), ()):
             value = value_in(message)(field)
             if isinstance(value, int | float) and self._count < MAX_BUFFERED_VALUES:

@@ -39,7 +39,7 @@ _MAX_REQUEST_BYTES: Final = 8192
 class SessionsApi:
     """The routes, and the processes that they started.
 
-    place: the sessions folder. refusal: returns why a person (None: of this computer) may not start and stop the
+    `place` is the sessions folder. `refusal` returns why a person (None: this computer) may not start and stop the
     recorder, empty if allowed.
     """
 

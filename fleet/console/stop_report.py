@@ -27,7 +27,7 @@ class StopReport:
         self.number = number
         self.sender = sender
         self.command_id = ""
-        """The id of its command. Events of other commands say nothing about this STOP. Empty: not sent yet."""
+        """The id of its command, empty if it is not sent yet. Events of other commands do not concern this STOP."""
         self._verb = verb
         self._asked_at = now
         self._at_ms = at_ms

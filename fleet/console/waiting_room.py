@@ -80,7 +80,7 @@ class WaitingRoom:
             line.ready.pop(key, None)
 
     def take(self, now: float) -> Hashable | None:
-        """Return the connection whose handshake begins now. None: nobody may begin. The addresses take turns."""
+        """Return the connection whose handshake begins now, or None if nobody may begin. The addresses take turns."""
         if not self._total.has(now):
             return None
         for address, line in self._lines.items():

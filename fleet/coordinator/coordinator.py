@@ -50,7 +50,7 @@ class Coordinator:
     """Commands cars by a plan. `client` is of kind coordinator, its sender begins with SENDER.
 
     The coordinator calls `on_decision` for each changed decision, and `on_failure` for each failed command and each
-    warning about a plan from the bus. `listed`: the cars of the fleet file; empty: there is none. The caller has
+    warning about a plan from the bus. `listed` has the cars in the fleet file (empty without one). The caller has
     checked `plan` by lint.find_faults().
     """
 
@@ -60,7 +60,7 @@ class Coordinator:
     on_failure: Callable[[str], None]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     people: People | None = None
-    """The people of the fleet file, who may change the plan. None: those that the gateways know."""
+    """The people in the fleet file, who may change the plan. If it is None, the people of the gateways may."""
     run_name: str = ""
     """Name of its `fleet up` run: in a new run the plan begins anew."""
     sleep: SleepWatch = field(default_factory=lambda: SleepWatch(clock_pair()))
@@ -80,7 +80,7 @@ class Coordinator:
         self._commands = OpenCommands(self.client, self.on_failure)
 
     def run(self, has_ended: Callable[[], bool]) -> None:
-        """Coordinate until `has_ended()`; raises AnotherCoordinator. The cars keep their modes afterwards."""
+        """Coordinate until `has_ended()`. Afterwards the cars keep their modes. Raises AnotherCoordinator."""
         bus, fleet = self.client.bus, self.client.name
         declare_alone(self.client)
         observer = FleetObserver(self.listed)

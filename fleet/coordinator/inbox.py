@@ -47,7 +47,7 @@ class Heard:
     gateways: Mapping[str, bool]
     """The cars whose gateways arrived (True) or left."""
     samples: Sequence[tuple[Sample, float | None]]
-    """Each with the wall clock, s, if a query returned it (it may be old); None: just published."""
+    """Messages, each with its wall clock, s, if a query returned it (it may be old), or None if just published."""
 
 
 class Inbox:

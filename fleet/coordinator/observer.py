@@ -26,7 +26,7 @@ MAX_UNCONFIRMED_CARS: Final = 256
 
 @dataclass(slots=True)
 class FleetObserver:
-    """The cars as last observed. `listed`: the cars of the fleet file; empty: there is none."""
+    """The cars as last observed. `listed` has the cars in the fleet file, and is empty if there is no file."""
 
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     cars: dict[str, CarSnapshot] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class FleetObserver:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Take a message in. `wall_s`: the wall clock if a query returned it (it may be old); None: just published."""
+        """Take a message in. `wall_s` is the wall clock if a query returned it (it may be old), else None."""
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:

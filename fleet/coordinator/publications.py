@@ -55,7 +55,7 @@ class Publications:
                 publisher.put(message, time.time_ns())
 
     def forget(self, subjects: Collection[str] | None = None) -> None:
-        """Forget the decisions about these subjects (None: all)."""
+        """Forget the decisions about these subjects, or all decisions if `subjects` is None."""
         for name, subject in [*self._last]:
             if name == "decision" and (subjects is None or subject in subjects):
                 del self._last[name, subject]

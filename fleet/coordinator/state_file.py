@@ -19,7 +19,7 @@ MAX_CLOCK_NOISE_S: Final = 1.0
 
 
 class CoordinatorStateFile:
-    """The file of one fleet at one endpoint. `run`: name of its `fleet up` run; empty: none."""
+    """The file of one fleet at one endpoint. `run` is the name of its `fleet up` run, or empty without such a run."""
 
     def __init__(self, fleet: str, endpoint: str, run: str) -> None:
         self._endpoint = endpoint

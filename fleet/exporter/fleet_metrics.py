@@ -38,7 +38,7 @@ class FleetMetrics:
         self._recorder_at = 0.0
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None = None) -> None:
-        """Take a message in. `wall_s`: the wall clock if a query returned it (it may be old); None: just published."""
+        """Take a message in. `wall_s` is the wall clock if a query returned it (it may be old), else None."""
         key = keys.parse(sample.key)
         if key is None:
             return

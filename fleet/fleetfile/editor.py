@@ -19,7 +19,7 @@ class CannotEdit(ValueError):
 
 
 def set_link(text: str, path: Path, car: str, link: str) -> str:
-    """Return the text with this link for a listed or a new car; raises BadFile for a bad file, and CannotEdit."""
+    """Return the text with this link for a listed or a new car. Raises BadFile or CannotEdit if it cannot be done."""
     before = parse_fleet(text, path, unbound=True)
     document = Document(text, str(path))
     cars = document.node(("cars",))

@@ -60,7 +60,7 @@ class FleetCar:
 
     link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
     parts. A car of platform `auto` has those of all platforms until its gateway detects the platform. roles: the roles
-    that it may take; None: any.
+    that it may take. None means any.
     """
 
     name: str
@@ -74,7 +74,7 @@ class FleetCar:
 
 @dataclass(frozen=True, slots=True)
 class FleetPerson:
-    """One person with their rank and the cars that they may drive; None: all."""
+    """One person with their rank and the cars that they may drive. If `cars` is None, they may drive all."""
 
     rank: PersonRank = PersonRank.PERSON
     drives: tuple[str, ...] | None = None
@@ -97,7 +97,7 @@ class PinRule:
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: no limit.
+    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: maximum size of all sessions, empty for no limit.
     console_port: the port of the web page; 0: the default. groups: cars by group. people: the only ones who may drive;
     None: everyone may. unlinked: cars without a link, if they are allowed. pins: what is pinned in recordings.
     """
@@ -126,7 +126,7 @@ class FleetFile:
 
 
 def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
-    """Read a fleet file; raises BadFile. `unbound`: allow cars without a link.
+    """Read a fleet file. Raises BadFile if it has mistakes. `unbound` allows cars without a link.
 
     `moved`: the file is a session's copy, so its plan and its world need not be beside it.
     """
@@ -160,7 +160,7 @@ def read_people(path: Path) -> Mapping[str, FleetPerson] | None:
 
 
 def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
-    """Parse the text of a fleet file at this path; raises BadFile."""
+    """Parse the text of a fleet file at this path. Raises BadFile if it has mistakes."""
     document = Document(text, str(path))
     file = document.validate(FileEntry)
     tree = _as_mapping(document.tree)

@@ -99,7 +99,7 @@ def check_device(path: str) -> tuple[bool, str]:
         return False, f"no permission: join the group {group} (sudo usermod -aG {group} $USER), then log in again"
     holder = port_lock.find_holder(file_stat)
     if holder is not None:
-        return False, f"in use by {holder}. Stop that first."
+        return False, f"in use by {holder}. Stop that program first."
     free = "free" if port_lock.LOCKS.exists() else "whether it is free is not known here"
     users = ", ".join(port_lock.find_users(path))
     shared = f", but {users} has it open and may take its bytes: stop that" if users else ""

@@ -38,24 +38,24 @@ class PersonRank(StrEnum):
 
 
 def validate_name(name: str) -> str:
-    """Return the name of a car, type, role or fleet if it is valid; raises ValueError."""
+    """Return the name of a car, type, role or fleet. Raises ValueError if it is not valid."""
     return keys.check_name(name, "name")
 
 
 def validate_car_name(name: str) -> str:
-    """Return the name of a car if it is valid; raises ValueError."""
+    """Return the name of a car. Raises ValueError if it is not valid."""
     if name == "all":
         raise ValueError("no car can be called all: `fleet stop all` stops every car")
     return validate_name(name)
 
 
 def validate_driven(name: str) -> str:
-    """Return a car or @group if it is valid; raises ValueError."""
+    """Return a car or @group. Raises ValueError if it is not valid."""
     return f"@{validate_name(name[1:])}" if name.startswith("@") else validate_car_name(name)
 
 
 def validate_link(text: str) -> str:
-    """Return a link if parse_fleet_link accepts it; raises ValueError."""
+    """Return a link. Raises ValueError if parse_fleet_link does not accept it."""
     try:
         parse_fleet_link(text)
     except BadLink as error:
@@ -64,13 +64,13 @@ def validate_link(text: str) -> str:
 
 
 def validate_platform(text: str) -> str:
-    """Return a platform (or auto) if it is valid; raises ValueError."""
+    """Return a platform (or auto). Raises ValueError if it is not valid."""
     drivers.check_platform(text)
     return text
 
 
 def validate_endpoint(text: str) -> str:
-    """Return the bus endpoint if it is valid; raises ValueError."""
+    """Return the bus endpoint. Raises ValueError if it is not valid."""
     if not text:
         raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
     try:
@@ -80,27 +80,27 @@ def validate_endpoint(text: str) -> str:
 
 
 def validate_color(text: str) -> str:
-    """Return a color if it is a name, or #rrggbb; raises ValueError."""
+    """Return a color. Raises ValueError if it is neither a name nor #rrggbb."""
     parse_color(text)
     return text
 
 
 def validate_size(text: str) -> str:
-    """Return a size such as 20GB if it is valid; raises ValueError."""
+    """Return a size such as 20GB. Raises ValueError if it is not valid."""
     if _SIZE.match(text) is None:
         raise ValueError(f"{quote_value(text)} is not a size. Write 500MB or 20GB.")
     return text
 
 
 def validate_path(text: str) -> str:
-    """Return a path if it is printable; raises ValueError."""
+    """Return a path. Raises ValueError if it is not printable."""
     if not text or not text.isprintable():
         raise ValueError(f"{quote_value(text)} is not allowed: a path, from the place of this file")
     return text
 
 
 def validate_pin_time(text: str) -> str:
-    """Return the time before or after a pinned moment if it is valid; raises ValueError."""
+    """Return the time before or after a pinned moment. Raises ValueError if it is not valid."""
     parse_duration(text, MIN_PIN_S, MAX_PIN_S)
     return text
 

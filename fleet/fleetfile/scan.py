@@ -35,7 +35,7 @@ class FoundLink:
 
 
 def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
-    """Scan these links, or all ports and Bluetooth devices, for cars; raises ScanFailed.
+    """Scan these links, or all ports and Bluetooth devices, for cars. Raises ScanFailed if the scan cannot run.
 
     Typed TCP and Bluetooth links are not scanned: closing a TCP connection may end the car's program.
     """

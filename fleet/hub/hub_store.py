@@ -122,7 +122,7 @@ class HubStore:
     ) -> None:
         """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
 
-        addresses: IP addresses and names under which others reach the hub. listens: its endpoints; empty: as before.
+        `addresses` are IP addresses and names under which others reach the hub. `listens` are its endpoints, if new.
         take: more identities, also if another computer has their certificate, which is worthless then.
         Raises OSError, BrokenHub.
         """

@@ -128,7 +128,7 @@ class Catalog:
         self._casts.clear()
 
     def _define(self, words: str | None) -> None:
-        """Define the views whose names are in a text, and those that they need. None: all views."""
+        """Define the views whose names are in a text, and those that they need. None means all views."""
         text = None if words is None or _ASKS_FOR_VIEWS.search(words.lower()) else words.lower()
         named = {topic.name for topic in TOPICS.values() if text is None or view_name(topic.name) in text}
         contexts = {
@@ -308,7 +308,7 @@ def _empty(topic: Topic) -> "pa.Table":
 
 
 def _column(name: str, kind: str, there: str | None) -> str:
-    """Return the expression of a column of ours. there: its type in the files; None if they lack it."""
+    """Return the expression of a column of ours. there: its type in the files, or None if they lack it."""
     quoted = _quoted(name)
     if there is None:
         return f"NULL::{kind} AS {quoted}"

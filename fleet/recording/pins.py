@@ -39,7 +39,7 @@ class Pin:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self | None:
-        """Return the pin of JSON values; None if they are none."""
+        """Return the pin of JSON values, or None if they are none."""
         try:
             begin_ns, end_ns = iso_ns(values["from"]), iso_ns(values["to"])
             cars = tuple(str(car) for car in values.get("cars", ()))

@@ -13,7 +13,7 @@ from schemas.topics import TOPICS
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Selection by keys and by time from `start_ns` (included) to `end_ns` (excluded). None: no limit."""
+    """Selection by keys and by time from `start_ns` (included) to `end_ns` (excluded). None means no limit."""
 
     keys: tuple[str, ...] | None = None
     start_ns: int | None = None

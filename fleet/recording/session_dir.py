@@ -87,11 +87,11 @@ class SessionInfo:
     gone: Sequence[Mapping[str, Any]] = ()
     """Segments that the quota has taken: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
     origin: Mapping[str, Any] = field(default_factory=dict)
-    """Source session, tool (`recover`, `cut`) and losses; empty if the session was recorded."""
+    """Source session, tool (`recover`, `cut`) and losses. Empty if the session was recorded."""
 
     @classmethod
     def read(cls, directory: Path) -> Self | None:
-        """Read the description in a directory; None if missing or invalid. Ignore unknown fields."""
+        """Read the description in a directory, or None if missing or invalid. Ignore unknown fields."""
         path = directory / SESSION_FILE
         try:
             values: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
@@ -102,7 +102,7 @@ class SessionInfo:
             return None
 
     def write(self, directory: Path) -> None:
-        """Replace the description in a directory atomically; raises OSError.
+        """Replace the description in a directory atomically. Raises OSError if that fails.
 
         If the disk is full, use the reserved space.
         """
@@ -127,7 +127,7 @@ def gone_of(info: SessionInfo) -> list[Mapping[str, Any]]:
 
 
 def gone_messages(info: SessionInfo) -> int | None:
-    """Return how many messages the quota has taken; None if nobody has counted them."""
+    """Return how many messages the quota has taken, or None if nobody has counted them."""
     counts = [each.get("messages") for each in info.gone]
     known = [count for count in counts if isinstance(count, int)]
     return sum(known) if len(known) == len(counts) else None
@@ -151,14 +151,14 @@ def removed_sessions(place: Path) -> list[dict[str, Any]]:
 
 
 def indexed_segments(directory: Path) -> list[dict[str, Any]]:
-    """Return the entries of `index.json`; empty if there is none."""
+    """Return the entries of `index.json`, or none if there is no such file."""
     indexed = read_json(directory / INDEX_FILE).get("segments") if directory.is_dir() else None
     named = [one for one in indexed if isinstance(one, dict)] if isinstance(indexed, list) else []
     return [one for one in named if isinstance(one.get("file"), str) and fnmatch(one["file"], SEGMENTS)]
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; empty if there is none."""
+    """Return the JSON object in a file, or an empty one if there is no file."""
     try:
         values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
@@ -205,13 +205,13 @@ def is_full(error: OSError) -> bool:
 
 
 def reserve(directory: Path) -> None:
-    """Reserve space for one more description; raises OSError, and then keeps the space reserved so far."""
+    """Reserve space for one more description. If that raises OSError, the space reserved so far stays reserved."""
     with (directory / SPARE_FILE).open("ab", buffering=0) as file:
         write_all(file, bytes(max(0, SPARE_BYTES - file.tell())))
 
 
 def release(directory: Path) -> None:
-    """Free the reserved space; raises OSError."""
+    """Free the reserved space. Raises OSError if that fails."""
     (directory / SPARE_FILE).unlink(missing_ok=True)
 
 
@@ -224,7 +224,7 @@ def write_all(file: FileIO, data: bytes) -> int:
 
 
 def replace(path: Path, values: object, indent: int | None = None) -> None:
-    """Write JSON to a file atomically; raises OSError."""
+    """Write JSON to a file atomically. Raises OSError if that fails."""
     write_atomically(path, f"{json.dumps(values, indent=indent)}\n".encode())
 
 
@@ -264,7 +264,7 @@ def is_session(path: Path) -> bool:
 
 
 def create(directory: Path, description: SessionInfo) -> Path:
-    """Create the directory of a session, under another name if taken; raises OSError without leaving a directory."""
+    """Create the directory of a session, under another name if its name is taken. An OSError leaves no directory."""
     directory.parent.mkdir(parents=True, exist_ok=True)
     while True:
         try:

@@ -25,7 +25,7 @@ class Curve:
     """Selector inside the message. With ! at the end, values that were not measured are left out, not drawn as zero."""
     name: str
     derivation: "Derivation | None" = None
-    """None: the viewer reads the field from the message itself."""
+    """How the part is derived, or None if the viewer reads the field from the message itself."""
 
 
 class Derivation(StrEnum):
@@ -312,7 +312,7 @@ def parts() -> Iterator[Curve | StateTrack]:
 
 
 def topic_of(key: str) -> str:
-    """Return the topic name of a key of a car or service; empty if the key belongs to no fleet."""
+    """Return the topic name of a key of a car or service, or an empty text if the key belongs to no fleet."""
     found = keys.parse(key)
     if found is None:
         return ""

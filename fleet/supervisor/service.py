@@ -84,7 +84,7 @@ class SupervisorService:
         """Declare everything. Raises AnotherSupervisor.
 
         on_message: called with car, topic and message. refusal: returns why a person with a certificate may not send a
-        command; empty if they may.
+        command. The text is empty if they may.
         """
         loop = asyncio.get_running_loop()
         singleton = Singleton(self.bus, self._key("status"), self._another_supervisor)

@@ -65,7 +65,7 @@ class CoordinatorCar:
     without: tuple[str, ...] = ()
     """The modes and parts of its platform that it does not use."""
     roles: tuple[str, ...] | None = None
-    """None: any role."""
+    """None means any role."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class FleetSpec:
     record: bool = True
     recordings: Path = RECORDINGS
     quota: str = ""
-    """Maximum size of all sessions, as 20GB; empty: none."""
+    """Maximum size of all sessions, such as 20GB. Empty for no limit."""
     pins: tuple[PinRule, ...] = ()
     """What is pinned in recordings. The recorder reads it from the file."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class FleetSpec:
     listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
     """The coordinator's entries, by car."""
     people: Mapping[str, FleetPerson] | None = None
-    """The people who may drive, and change the plan. None: everyone may."""
+    """The people who may drive, and change the plan, or None if everyone may."""
     console: bool = False
     console_port: int = 0
     """Port of the web page. 0: the default of `fleet console`."""
@@ -111,7 +111,7 @@ class FleetSpec:
 
 @dataclass(frozen=True, slots=True)
 class UpOptions:
-    """The options of `fleet up`. None: as in the fleet file."""
+    """The options of `fleet up`. If one is None, the fleet file decides."""
 
     simulated: int = 0
     plan: Path | None = None

@@ -458,7 +458,7 @@ class Supervisor:
     def _set_unrecorded(self, why: str, over: str = "") -> None:
         """Say once that nothing is recorded any more, and that everything is again. The cars drive on.
 
-        over: what to say if it is over. Empty: that recording goes on.
+        `over` tells why recording is over, and is empty if recording goes on.
         """
         if bool(why) is not bool(self._unrecorded):
             self._say("process", RECORDER, f"NOT RECORDED: {why}" if why else over or "records again")
@@ -578,7 +578,7 @@ class Supervisor:
         return message
 
     def _refusal(self, person: str) -> str:
-        """Return why a person with a certificate may not end or reload the fleet; empty if they may."""
+        """Return why a person with a certificate may not end or reload the fleet, or an empty text if they may."""
         return fleet_refusal(people_table(self._spec.people), person) if self._spec.people is not None else ""
 
     async def _down(self, sender: str) -> str:

@@ -49,7 +49,7 @@ class Request:
     by_wildcard: bool = False
     """True if one key expression addressed several cars."""
     unread: str = ""
-    """Why the payload was not read; empty if it was."""
+    """Why the payload was not read, or an empty text if it was."""
     identity: str = ""
     """Who sent it, proven by a certificate; empty on a bus without certificates."""
     sampled_ns: int | None = None

@@ -44,7 +44,7 @@ class BatteryPolicy:
         return replace(self, low_v=self.low_v * cells / 2, critical_v=self.critical_v * cells / 2)
 
     def action(self, level: BatteryLevel | None) -> BatteryAction | None:
-        """Return the reaction to a level; None if it is ok or unknown."""
+        """Return the reaction to a level, or None if it is ok or unknown."""
         match level:
             case BatteryLevel.LOW:
                 return self.low
@@ -114,7 +114,7 @@ class Battery:
 
     @property
     def words(self) -> str:
-        """Return the level in words; empty if no voltage was measured."""
+        """Return the level in words, or an empty text if no voltage was measured."""
         if self.level is None or self.voltage_v is None:
             return ""
         share, error = charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
@@ -122,7 +122,7 @@ class Battery:
 
     @property
     def refusal(self) -> str:
-        """Return why new drives and modes are refused; empty if they are allowed."""
+        """Return why new drives and modes are refused, or an empty text if they are allowed."""
         refuses = self.action in (BatteryAction.REFUSE, BatteryAction.STOP)
         return f"{self.words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
 

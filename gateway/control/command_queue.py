@@ -25,7 +25,7 @@ class HeldMotion:
     duration_s: float = 0.0
     """How long it lasts from its frame on; 0 of a stream, whose samples are valid for a time from their arrival."""
     began_at: float | None = None
-    """When its frame was written; None if it waits."""
+    """When its frame was written, or None if it waits."""
     range_cm: float | None = None
     """The distance before it was written, if one is known."""
 

@@ -178,7 +178,7 @@ class Command:
     sender: Sender
     what: Action
     age_s: float | None = None
-    """Seconds from sending to arrival; None if the command has no time, which counts as fresh."""
+    """Seconds from sending to arrival, or None if the command has no time, which counts as fresh."""
     ttl_s: float = 2.0
     take: bool = False
     """True if a person takes the car from another person."""

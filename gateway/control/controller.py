@@ -83,16 +83,16 @@ class Controller(Generic[D_co]):
 
     @property
     def owner(self) -> str:
-        """Return the sender of the held motion; empty if none is held."""
+        """Return the sender of the held motion, or an empty text if none is held."""
         return self._queue.held.sender.name if self._queue.held else ""
 
     def expires_in_s(self, now: float) -> float | None:
-        """Return the remaining time of the held motion; None if none is held."""
+        """Return the remaining time of the held motion, or None if none is held."""
         return max(0.0, self._queue.held.ends_at - now) if self._queue.held else None
 
     @property
     def asked(self) -> Mode | None:
-        """Return the commanded mode, also one that still waits; None if unknown."""
+        """Return the commanded mode, also one that still waits, or None if unknown."""
         pending = self._queue.mode_change
         if pending is not None and isinstance(pending.command.what, SetMode):
             return pending.command.what.mode
@@ -115,7 +115,7 @@ class Controller(Generic[D_co]):
         self.driver.link_up(now)
 
     def waits_for(self, now: float) -> str:
-        """Return what a command would wait for now, in words; empty if the car is ready."""
+        """Return what a command would wait for now, in words, or an empty text if the car is ready."""
         model = self.driver.model
         if not model.link_open:
             return f"its link: {model.link_reason}"
@@ -452,7 +452,7 @@ class Controller(Generic[D_co]):
         return max(self.driver.free_at(now) - now, 0.0)
 
     def _too_busy(self, command: Command, now: float) -> str:
-        """Return why a sample of a stream would expire before its frame could go out; empty if it would not.
+        """Return why a sample of a stream would expire before its frame could go out, or an empty text if it would not.
 
         Any other drive waits, and counts its duration from its frame on.
         """
@@ -465,7 +465,7 @@ class Controller(Generic[D_co]):
         return f"{self.car} is busy for another {busy_s:.1f} s. The next samples of this stream drive it then."
 
     def _lapsed(self, command: Command) -> str:
-        """Return that the drive which this one continues is over; empty if it lasts, or if this one may begin one.
+        """Return a text if the drive that this one continues is over. Empty if it goes on, or if this may begin one.
 
         A hub that stood still delivers the newest samples of a press when it goes on. The car has stopped meanwhile.
         """
@@ -498,7 +498,7 @@ class Controller(Generic[D_co]):
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:
-        """Return how long a drive or a mode waits for its frame, in words; empty if it does not."""
+        """Return how long a drive or a mode waits for its frame, in words, or an empty text if it does not."""
         command = pending.command
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""

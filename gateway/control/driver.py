@@ -105,11 +105,11 @@ class ModeClaims(Protocol):
 
     @property
     def asked(self) -> Mode | None:
-        """The last commanded mode; None if unknown."""
+        """The last commanded mode, or None if unknown."""
 
     @property
     def inferred(self) -> Mode | None:
-        """The mode that the readings show; None if they show none."""
+        """The mode that the readings show, or None if they show none."""
 
     @property
     def verdict(self) -> Verdict:
@@ -138,7 +138,7 @@ class ModeClaims(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The estimated state of what the gateway has set. None: not known, or the car has none."""
+    """The estimated state of what the gateway has set. None if it is not known, or if the car has no such part."""
 
     speed: float = 0.0
     """Share of full speed, 0..1."""
@@ -192,11 +192,11 @@ class DriverClaims(Protocol):
 
     @property
     def basis(self) -> Basis | None:
-        """What the claim that the motors are off rests on; None if they are not."""
+        """What the claim that the motors are off rests on, or None if they are not."""
 
     @property
     def motion(self) -> Motion | None:
-        """The last motion sent; None if the state is unknown or the car drives by itself."""
+        """The last motion sent, or None if the state is unknown or the car drives by itself."""
 
     @property
     def outputs(self) -> Outputs:
@@ -204,7 +204,7 @@ class DriverClaims(Protocol):
 
     @property
     def range_cm(self) -> float | None:
-        """The last distance measured; None if the car measures none."""
+        """The last distance measured, or None if the car measures none."""
 
     @property
     def shows(self) -> Shows:
@@ -224,7 +224,7 @@ class DriverClaims(Protocol):
 
     @property
     def silence_limit_s(self) -> float | None:
-        """The longest normal silence now; None if silence says nothing."""
+        """The longest normal silence now, or None if silence says nothing."""
 
     @property
     def why_quiet(self) -> str:
@@ -234,11 +234,11 @@ class DriverClaims(Protocol):
         """Return for how long the car has sent nothing."""
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words what shows that a drive moved the car; empty if nothing does."""
+        """Return in words what shows that a drive moved the car, or an empty text if nothing does."""
 
 
 def describe_way(before_cm: float | None, now_cm: float | None) -> str:
-    """Return in words how the distance has changed in a drive; empty if it shows no movement."""
+    """Return in words how the distance has changed in a drive, or an empty text if it shows no movement."""
     if before_cm is None or now_cm is None or abs(now_cm - before_cm) < MOVED_CM:
         return ""
     return f"its distance changed from {before_cm / 100:.2f} m to {now_cm / 100:.2f} m"
@@ -384,7 +384,7 @@ class Driver(ABC):
 
     @abstractmethod
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state; None if it can."""
+        """Return why this car cannot do it in any state, or None if it can."""
 
     @abstractmethod
     def frames(self, what: Action) -> tuple[Any, ...]:
@@ -423,7 +423,7 @@ class Driver(ABC):
     @property
     @abstractmethod
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
 
     @property
     @abstractmethod
@@ -513,7 +513,7 @@ class Driver(ABC):
 
     @property
     def doubt_of_drive(self) -> str:
-        """Return why the car may have ignored a drive; empty if there is no reason to think so."""
+        """Return why the car may have ignored a drive, or an empty text if there is no reason to think so."""
         return ""
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:

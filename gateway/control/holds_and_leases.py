@@ -161,7 +161,7 @@ class Safety:
     # ------------------------------------------------------------------ loan
 
     def loan_at(self, now: float) -> Loan | None:
-        """Return the loan; None if it is over."""
+        """Return the loan, or None if it is over."""
         return self.loan if now < self.loan_until else None
 
     def lend(self, loan: Loan, now: float) -> None:
@@ -171,7 +171,7 @@ class Safety:
     # ------------------------------------------------------------------ lease
 
     def lease_at(self, now: float) -> LeaseState | None:
-        """Return the lease; None if it is over."""
+        """Return the lease, or None if it is over."""
         return self.lease if self.lease is not None and now < self.lease.until else None
 
     def grant(self, sender: Sender, until: float) -> None:

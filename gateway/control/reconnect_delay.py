@@ -31,7 +31,7 @@ class Attempts:
         self._failures = 0
         self._logged: set[str] = set()
         self._opened_at: float | None = None
-        """When the link was opened that is not proven yet; None if there is none."""
+        """When the link was opened that is not proven yet, or None if there is none."""
         self._log_when_proven = False
 
     def on_open(self, now: float) -> bool:

@@ -52,10 +52,10 @@ class CommandContext:
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
     battery: str
-    """Why the battery allows no new drive; empty if it does."""
+    """Why the battery allows no new drive, or an empty text if it does."""
     queued: int
     unsupported: str | None = None
-    """Why this car cannot do it in any state, by its driver; None if it can."""
+    """Why this car cannot do it in any state, by its driver, or None if it can."""
     loan_until: float = 0.0
     """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")
@@ -67,7 +67,7 @@ class Needs:
     """The conditions for a command."""
 
     right: Right | None = Right.ACT
-    """The right that the sender needs; None: everybody may."""
+    """The right that the sender needs, or None if everybody may."""
     battery: bool = False
     link: bool = True
     manual: bool = False
@@ -123,7 +123,7 @@ def needs(what: Action) -> Needs:
 
 
 def refuse(command: Command, context: CommandContext) -> Refusal | None:
-    """Return why the command is refused; None if it is accepted. The words name the car, the state, and what to do."""
+    """Return why the command is refused, or None if it is not. The words tell the car, the state, and what to do."""
     what, sender = command.what, command.sender
     if isinstance(what, Stop | EmergencyStop):
         return None
@@ -139,7 +139,7 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
 
 
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
-    """Return why the time of the command is no time of now; None if it is, or if the command has no time."""
+    """Return why the time of the command is no time of now, or None if it is, or if the command has no time."""
     age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
     if age_s is None:
         if context.now < context.slept_at + AFTER_SLEEP_S:
@@ -181,7 +181,7 @@ def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal 
 
 
 def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal | None:
-    """Return the first need that is not met; None if all are."""
+    """Return the first need that is not met, or None if all are."""
     car, right = context.car, needed.right
     if right is not None:
         if right is Right.MOVE and command.take:

@@ -36,7 +36,7 @@ class Family(Protocol):
     """The names that `platform:` of the fleet file may have, without options."""
 
     def profile_of(self, name: str) -> CarProfile:
-        """Return what cars of a platform can do, with its options; raise ValueError for a wrong name."""
+        """Return what cars of a platform (with its options) can do. Raises ValueError for a wrong name."""
 
     def profiles(self) -> tuple[CarProfile, ...]:
         """Return the profile of each platform that is known, with all parts that such a car may have."""
@@ -46,7 +46,7 @@ class Family(Protocol):
 
 
 def check_platform(text: str) -> str:
-    """Return the name of a platform in its usual spelling; raise ValueError if there is none of this name."""
+    """Return the name of a platform in its usual spelling. Raises ValueError if there is no such platform."""
     name = normalize_name(text)
     try:
         if kind_of(name) in (AUTO, *Platform):
@@ -59,7 +59,7 @@ def check_platform(text: str) -> str:
 
 
 def profile_of(name: str) -> CarProfile:
-    """Return what cars of this platform can do; raise ValueError. `auto` has no profile of its own."""
+    """Return what cars of this platform can do. Raises ValueError for a wrong name, and for `auto`."""
     name = normalize_name(name)
     return _family_of(kind_of(name)).profile_of(name)
 
@@ -72,7 +72,7 @@ def profiles_of(name: str) -> tuple[CarProfile, ...]:
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
-    """Return the driver of a car of this platform, or of `auto`; raise ValueError."""
+    """Return the driver of a car of this platform, or of `auto`. Raises ValueError for a wrong name."""
     name = normalize_name(name)
     kind = kind_of(name)
     return _family_of(AUTO_PLATFORMS[0] if kind == AUTO else kind).driver_of(name, kept)
@@ -96,7 +96,7 @@ def built_in_profiles() -> tuple[CarProfile, ...]:
 
 
 def family_name(platform: str) -> str:
-    """Return the name of the family of a platform, such as `yahboom`; raise ValueError."""
+    """Return the name of the family of a platform, such as `yahboom`. Raises ValueError for a wrong name."""
     kind = kind_of(normalize_name(platform))
     if kind == AUTO:
         return YAHBOOM

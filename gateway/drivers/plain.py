@@ -181,7 +181,7 @@ class PlainModel:
 
     @property
     def motion(self) -> Motion | None:
-        """The last motion sent; None if the state is unknown."""
+        """The last motion sent, or None if the state is unknown."""
         return self.sent_motion if self.known else None
 
     @property
@@ -199,7 +199,7 @@ class PlainModel:
         return now - max(self.link_since, self.link_since if self.heard_at is None else self.heard_at)
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words what shows that a drive moved the car since it began; empty if no reading does."""
+        """Return in words what shows that a drive moved the car since it began, or an empty text if no reading does."""
         if self.turned_at > since:
             return "its wheels turned"
         return "" if self.range_at < since else describe_way(range_cm, self.range_cm)
@@ -242,9 +242,9 @@ class PlainDriver(Driver):
     EVIDENCE_S: ClassVar[float] = 5.0
     """Time after the last frame in which a car that can show its stop has shown it."""
     RESEND_S: ClassVar[float | None] = None
-    """Interval at which a held motion is sent again: well under the dead-man. None: it is sent once."""
+    """Interval at which a held motion is sent again: well under the dead-man. None if it is sent only once."""
     SILENCE_S: ClassVar[float | None] = None
-    """The longest normal silence; None if silence says nothing."""
+    """The longest normal silence, or None if silence says nothing."""
 
     def __init__(self, desk: Desk, profile: CarProfile) -> None:
         super().__init__(desk)
@@ -274,7 +274,7 @@ class PlainDriver(Driver):
 
     @abstractmethod
     def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
-        """Return the frames of an action on a part of the car; None if the car cannot do it."""
+        """Return the frames of an action on a part of the car, or None if the car cannot do it."""
 
     @property
     def can_show(self) -> bool:
@@ -533,7 +533,7 @@ class PlainDriver(Driver):
     # ------------------------------------------------------------------ commands
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state; None if it can."""
+        """Return why this car cannot do it in any state, or None if it can."""
         car, model = self.desk.car, self._model
         match what:
             case SetMode(mode) if mode not in model.profile.modes:
@@ -606,7 +606,7 @@ class PlainDriver(Driver):
 
     @property
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
         return self._not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:

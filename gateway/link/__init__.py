@@ -43,7 +43,7 @@ def kind_of(scheme: str) -> LinkKind[Any]:
 
 
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
-    """Open the link within this time; raise CannotOpen, whose message says what is wrong and what to do.
+    """Open the link within this time. The message of CannotOpen tells what is wrong and what to do.
 
     The connects through one Bluetooth adapter take turns. `first`: the car may be moving, so it goes first.
     """

@@ -27,11 +27,11 @@ class Link(ABC):
 
     @abstractmethod
     async def read(self) -> bytes:
-        """Return the next bytes as they arrived, at least one; raise LinkLost at the end."""
+        """Wait for bytes and return them as they arrived, at least one. Raises LinkLost when the link ends."""
 
     @abstractmethod
     async def write(self, data: bytes) -> None:
-        """Send these bytes, with nothing between them; raise LinkLost.
+        """Send these bytes, with nothing between them. Raises LinkLost if the link does not accept them.
 
         Serial and TCP: in one write of their own, without waiting. Bluetooth: in pieces, within a second.
         """
@@ -68,12 +68,12 @@ class LinkKind(ABC, Generic[Url]):
 
     @abstractmethod
     async def open(self, url: Url, timeout_s: float, *, first: bool) -> Link:
-        """Open the link within this time; raise CannotOpen. `first`: before the cars that wait for the same adapter."""
+        """Open the link, or raise CannotOpen. With `first`, do so before cars that wait for the same adapter."""
 
     def ports(self) -> Sequence[SerialPort]:
-        """Return the ports that can be listened to without harm; raise CannotOpen if the system does not list them."""
+        """Return the ports that can be listened to without harm. Raises CannotOpen if the system does not list them."""
         return ()
 
     async def devices(self, seconds: float) -> Sequence[Device]:  # noqa: ARG002 - few kinds advertise
-        """Return the devices that advertise within this time, likely cars first; raise CannotList."""
+        """Return the devices that advertise in this time, likely cars first. Raises CannotList if it cannot look."""
         return ()

@@ -92,7 +92,7 @@ class BleLink(BufferedLink):
     # ------------------------------------------------------------------ opening
 
     async def open(self, timeout_s: float) -> None:
-        """Find the device within this time, connect when it is this gateway's turn, and subscribe; raise CannotOpen."""
+        """Find the device, connect when it is this gateway's turn, and subscribe. Raises CannotOpen on a timeout."""
         began = time.monotonic()
         try:
             found = await _within(timeout_s, self._search())
@@ -139,7 +139,7 @@ class BleLink(BufferedLink):
         return True
 
     def _allowed(self, adapters: list[str]) -> list[str | None]:
-        """Return the adapters that may be used, by name. None stands for the system's choice; raise CannotOpen."""
+        """Return the usable adapters by name. None means the system's choice. Raises CannotOpen if there is none."""
         wanted = self._url.adapter
         if sys.platform != "linux" and wanted not in (None, AUTO_ADAPTER):
             raise CannotOpen(f"{self._url}: this system has one Bluetooth adapter: leave adapter= out")
@@ -188,7 +188,7 @@ class BleLink(BufferedLink):
         return next(iter(found.values()))
 
     async def _connect(self, devices: _Devices, timeout_s: float) -> None:
-        """Connect through the first adapter that has room, when it is this gateway's turn; raise CannotOpen."""
+        """Connect through the first adapter with room, at this gateway's turn. Raises CannotOpen if all are full."""
         turns = {adapter: Turn(adapter or "default", first=self._first) for adapter in devices}
         try:
             async with asyncio.timeout(TURN_TIMEOUT_S):
@@ -234,7 +234,7 @@ class BleLink(BufferedLink):
                 await asyncio.sleep(ble_adapters.TURN_POLL_S)
 
     async def _use(self, device: BLEDevice, adapter: str | None) -> None:
-        """Connect to the device and subscribe; raise CannotOpen."""
+        """Connect to the device and subscribe. Raises CannotOpen if the device refuses."""
         self._claim = self._claim or _claim(self._url, device.address)
         client = BleakClient(device, self._on_disconnected)
         self._stage = (
@@ -280,7 +280,7 @@ class BleLink(BufferedLink):
     # ------------------------------------------------------------------ writing
 
     async def write(self, data: bytes) -> None:
-        """Send the frame in pieces, with nothing between them; raise LinkLost, after which some may have been sent.
+        """Send the frame in pieces, with nothing between them. After LinkLost, some pieces may have been sent.
 
         A truncated frame ends the link: the car would read the next frame as the rest of it.
         """
@@ -357,13 +357,13 @@ class BleKind(LinkKind[BleUrl]):
     open_timeout_s = 20.0
 
     async def open(self, url: BleUrl, timeout_s: float, *, first: bool) -> Link:
-        """Find a module and connect to it; raise CannotOpen. `first`: do so before other gateways."""
+        """Find a module and connect to it, or raise CannotOpen. With `first`, do so before other gateways."""
         link = BleLink(url, first=first)
         await link.open(timeout_s)
         return link
 
     async def devices(self, seconds: float) -> Sequence[Device]:
-        """Return the modules and other devices that advertise; raise CannotList."""
+        """Return the modules and other devices that advertise. Raises CannotList if Bluetooth does not work."""
         return await list_devices(seconds, UART_SERVICES)
 
 
@@ -415,7 +415,7 @@ def _scanner(
 
 
 async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
-    """Return the result of the work; raise TimeoutError on time even if the work resists cancellation."""
+    """Return the result of the work. Raises TimeoutError on time, even if the work resists cancellation."""
     task = asyncio.ensure_future(work)
     try:
         await asyncio.wait({task}, timeout=seconds)
@@ -431,7 +431,7 @@ async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
 
 
 def _claim(url: BleUrl, address: str) -> socket.socket | None:
-    """Claim the device for this program; raise Busy. None on systems other than Linux."""
+    """Claim the device for this program. Raises Busy if another program has it. Returns None if not on Linux."""
     # The system shares a connection between programs without an error. An abstract socket is a lock that disappears
     # with its process, however that ends.
     if sys.platform != "linux":
@@ -442,7 +442,7 @@ def _claim(url: BleUrl, address: str) -> socket.socket | None:
     except OSError as error:
         claim.close()
         if error.errno == errno.EADDRINUSE:
-            raise Busy(f"{url}: {address} is in use by another program (a second gateway?). Stop that first.") from None
+            raise Busy(f"{url}: {address} is in use by another program (a second gateway?). Stop it first.") from None
         raise
     return claim
 

@@ -122,7 +122,7 @@ async def _managed_objects() -> dict[str, Any]:
 
 
 async def _call(path: str, interface: str, member: str) -> list[Any]:
-    """Call BlueZ; raise whatever D-Bus raises."""
+    """Call BlueZ. Raises whatever D-Bus raises."""
     connection = MessageBus(bus_type=BusType.SYSTEM)
     try:
         await connection.connect()

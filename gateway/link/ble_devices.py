@@ -49,7 +49,7 @@ class BleDevice(Device):
 
 
 async def _discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
-    """Return the devices that advertise within this time to any adapter, by address; raise whatever bleak raises."""
+    """Return the devices that advertise within this time to any adapter, by address. Raises whatever bleak raises."""
     # With several adapters bleak chooses any of them, and a car may be in the range of one only.
     options: list[BlueZScannerArgs] = [{"adapter": name} for name in await ble_adapters.list_connections()]
     scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
@@ -57,7 +57,7 @@ async def _discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementD
 
 
 async def list_devices(seconds: float, uarts: Sequence[str]) -> list[BleDevice]:
-    """Return the devices that advertise within this time, first those with one of these services; raise CannotList."""
+    """Return the devices that advertise within this time: first those with one of these services. Or CannotList."""
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await _discover(seconds)

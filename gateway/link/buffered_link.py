@@ -20,10 +20,10 @@ class BufferedLink(Link):
         self._came = asyncio.Event()
         """Set if there are bytes, or if the link is lost."""
         self._lost: str | None = None
-        """Why the link is lost; None if it is not."""
+        """Why the link is lost, or None if it is not."""
 
     async def read(self) -> bytes:
-        """Return the next bytes as they arrived; raise LinkLost."""
+        """Wait for bytes and return them as they arrived. Raises LinkLost if the link ends."""
         while not self._data:
             if self._lost is not None:
                 raise LinkLost(self._lost)

@@ -29,7 +29,7 @@ class SerialPort:
 
 
 def serial_ports() -> list[SerialPort]:
-    """Return the serial ports of this computer by name; raise CannotOpen if the system does not list them."""
+    """Return the serial ports of this computer by name. Raises CannotOpen if the system does not list them."""
     return described(list_ports(), by_id(BY_ID))
 
 

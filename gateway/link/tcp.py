@@ -43,7 +43,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._made_at = 0.0
 
     async def read(self) -> bytes:
-        """Return the next bytes as they arrived; raise LinkLost."""
+        """Wait for bytes and return them as they arrived. Raises LinkLost if the link ends."""
         data = await super().read()
         if self._paused and self._transport is not None and not self._transport.is_closing():
             self._paused = False
@@ -51,7 +51,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         return data
 
     async def write(self, data: bytes) -> None:
-        """Send these bytes in a segment of their own; raise LinkLost."""
+        """Send these bytes in a segment of their own. Raises LinkLost if the connection is gone or stuck."""
         transport = self._transport
         if transport is not None and self._lost is None and transport.is_closing():
             await self._ended.wait()  # connection_lost sets the reason
@@ -137,7 +137,7 @@ class TcpKind(LinkKind[TcpUrl]):
     """TCP."""
 
     async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
-        """Connect; raise CannotOpen."""
+        """Connect. Raises CannotOpen if nobody answers."""
         try:
             async with asyncio.timeout(timeout_s):
                 return await connect_first(url, await _look_up(url))
@@ -159,7 +159,7 @@ KIND: Final = TcpKind()
 
 
 async def _look_up(url: TcpUrl) -> _Addresses:
-    """Return the addresses of the host; raise the errors of getaddrinfo."""
+    """Return the addresses of the host. Raises the errors of getaddrinfo."""
     # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. Run it in a daemon thread,
     # as the process would wait for the loop's own threads. All attempts share one lookup.
     found = _lookups.get(url)
@@ -181,7 +181,7 @@ def _resolve(url: TcpUrl, found: "Future[_Addresses]") -> None:
 
 
 async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:
-    """Connect to the first (family, socket address) that accepts; raise the first OSError if none does."""
+    """Connect to the first (family, socket address) that accepts. If none does, raise the first OSError."""
     # Not `create_connection` with a name: it hides the error numbers of several addresses in one text.
     loop = asyncio.get_running_loop()
     first: OSError | None = None

@@ -39,12 +39,12 @@ class UsbSerialPort:
 
 
 def list_usb_ports() -> list[UsbSerialPort]:
-    """Return the serial ports of this computer; raise CannotOpen. Slow on some systems."""
+    """Return the USB serial ports of this computer. Slow on some systems. Raises CannotOpen if they are not listed."""
     return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in list_ports()]
 
 
 def list_ports() -> "list[ListPortInfo]":
-    """Return the serial ports of this computer as pyserial describes them; raise CannotOpen."""
+    """Return the serial ports of this computer as pyserial describes them, or raise CannotOpen."""
     from serial.tools import list_ports as system
 
     failure: Exception | None = None
@@ -60,7 +60,7 @@ def list_ports() -> "list[ListPortInfo]":
 
 
 def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
-    """Return the only matching port; raise CannotOpen, whose message lists the ports."""
+    """Return the only matching port. If there are none or several, the message of CannotOpen lists the ports."""
     available = sorted(ports, key=lambda port: port.device)
     fit = [port for port in available if url.fits(port.vid, port.pid, port.serial)]
     if len(fit) == 1:

@@ -50,7 +50,7 @@ class BadOption(ValueError):
 
 
 def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
-    """Return the traits of a car with these options, None if they are those of its platform; raise BadOption."""
+    """Return the traits of a car, or None if its platform has the same ones. Raises BadOption for a wrong option."""
     if platform in UGV_BUILDS:
         for option in options:
             if option not in UGV_OPTIONS:

@@ -52,7 +52,7 @@ class SimEndpoint(Protocol):
         """The URL that a gateway opens."""
 
     async def up(self) -> None:
-        """Open the link for a host; raise EndpointError."""
+        """Open the link for a host. Raises EndpointError if the port or path is taken."""
 
     async def down(self) -> None:
         """Close the link, as an unplugged cable or a lost network does; `up` opens it again."""

@@ -45,7 +45,7 @@ class Fault:
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
-    """Duration in seconds. 0 ends the fault now. None: until the same kind comes with 0 (a lost link: link_drop).
+    """Duration in seconds. 0 ends the fault now. None means until the same kind comes with 0 (a lost link: link_drop).
 
     Of `empty`: the time until the battery is.
     """
@@ -61,7 +61,7 @@ class Fault:
     """Bytes/s of a firehose. Bytes that the host does not read in time are lost."""
     flood: Flood = Flood.NOISE
     path: str | None = None
-    """New path of a renamed pseudo terminal. None: the path stays and leads to another device."""
+    """New path of a renamed pseudo terminal. None means that the path stays and leads to another device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Scheduled:
 
 
 def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[str]:
-    """Return the names of the cars that this hits; raise BadSpec if a car does not exist or cannot have it."""
+    """Return the names of the cars that this affects. Raises BadSpec for an unknown car, or one that cannot have it."""
     names = [car.name for car in cars]
     if act.car is not None and act.car not in names:
         raise BadSpec(f"car {act.car!r} is not simulated here: use {', '.join(names)}")
@@ -131,7 +131,7 @@ _RANGES: Final = {
 
 
 def fault_of(fields: object) -> Fault:
-    """Return the fault in a JSON object of the control channel; raise BadSpec."""
+    """Return the fault in a JSON object from the control channel. Raises BadSpec if the object is wrong."""
     if not isinstance(fields, dict):
         raise BadSpec('write one JSON object a line, for example {"car": "red", "fault": "link_drop", "for_s": 2}')
     try:
@@ -170,7 +170,7 @@ def fault_of(fields: object) -> Fault:
 
 
 def press_of(fields: Mapping[str, object]) -> Press:
-    """Return the press in a JSON object of the control channel; raise BadSpec."""
+    """Return the press in a JSON object from the control channel. Raises BadSpec if the object is wrong."""
     _check_words(fields, {"ir", "car"}, set(), "ir")
     return Press(_button(fields.get("ir")), _car(fields))
 
@@ -198,7 +198,7 @@ def _choice(what: str, value: object, allowed: list[str]) -> str:
 
 
 def number(what: str, value: object, low: float, high: float) -> float:
-    """Return a number of the control channel; raise BadSpec if it is out of range."""
+    """Return a number from the control channel. Raises BadSpec if it is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise BadSpec(f"{what} {value!r} is not allowed: a number from {low:.12g} to {high:.12g}")
     return float(value)
@@ -211,7 +211,7 @@ _FIELD: Final = re.compile(r"(?P<word>[a-z_]+)=(?P<value>.+)")
 
 
 def parse_fault(text: str) -> Scheduled:
-    """Parse [CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...]; raise BadSpec. The amount is `for_s`, of garbage `bytes`."""
+    """Parse [CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...], or raise BadSpec. AMOUNT is `for_s` (garbage: `bytes`)."""
     match = _SCHEDULED.fullmatch(text)
     if match is None:
         raise BadSpec(
@@ -235,7 +235,7 @@ def parse_fault(text: str) -> Scheduled:
 
 
 def parse_press(text: str) -> Scheduled:
-    """Parse [CAR:]BUTTON@SECONDS; raise BadSpec."""
+    """Parse [CAR:]BUTTON@SECONDS. Raises BadSpec if a part is not allowed."""
     match = _SCHEDULED.fullmatch(text)
     if match is None or match["amount"] or match["more"]:
         raise BadSpec(f"ir {text!r} is not allowed: write [CAR:]BUTTON@SECONDS, for example red:forward@5")

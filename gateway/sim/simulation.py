@@ -37,10 +37,10 @@ class Machine(Protocol):
 
     @property
     def truth(self) -> Truth | None:
-        """The true state; None if unknown."""
+        """The true state, or None if unknown."""
 
     def pose(self, now: float) -> Pose | None:
-        """Return the pose; None if unknown."""
+        """Return the pose, or None if unknown."""
 
     def feed(self, data: bytes, now: float) -> None:
         """Accept bytes from the host."""
@@ -116,7 +116,7 @@ class SimCar:
         return self.firmware.pose(self._loop.time())
 
     async def start(self) -> None:
-        """Open the link and start the program; raise EndpointError."""
+        """Open the link and start the program. Raises EndpointError if the link cannot open."""
         await self._link.up()
         self._known_as = self.url
         if isinstance(self.firmware, CaptureCar) and isinstance(self.spec.link, PtyPath):
@@ -218,7 +218,7 @@ class SimCar:
         return obeyed
 
     async def inflict(self, fault: Fault) -> None:
-        """Carry out a fault now; raise EndpointError if a link cannot return."""
+        """Carry out a fault now. Raises EndpointError if a link cannot return."""
         self._pump()
         now = self._loop.time()
         until = inf if fault.for_s is None else now + fault.for_s

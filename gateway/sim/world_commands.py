@@ -20,7 +20,7 @@ _THING: Final = {**_PLACE, "speed_m_s": (0.0, FASTEST_M_S)}
 
 
 def change_of(fields: Mapping[str, object], world: World) -> Change:
-    """Return the change in a JSON object of the control channel; raise BadSpec."""
+    """Return the change in a JSON object from the control channel. Raises BadSpec if the object is wrong."""
     if "lamp" in fields:
         return _lamp_change(fields, _named("lamp", fields["lamp"], world.lamps))
     return _thing_change(fields, _named("thing", fields["thing"], world.things))

@@ -35,7 +35,7 @@ class WorldSpec:
 
 
 def read_world(text: str, source: str, cars: Sequence[str] | None = None) -> WorldSpec:
-    """Return the world in a text; raise BadFile with every fault (see `check_world`)."""
+    """Return the world in a text. Raises BadFile with every fault, if any (see `check_world`)."""
     entry = check_world(text, source, cars)
     return WorldSpec(
         walls_of(entry),

@@ -78,7 +78,7 @@ class CertificateKeeper(threading.Thread):
         return max(SHORTEST_CHECK_INTERVAL, min(CHECK_INTERVAL, left)).total_seconds()
 
     def _renew(self, now: datetime) -> str:
-        """Store the next certificate. Return why there is none; empty if it is stored."""
+        """Store the next certificate. Return why there is none, or an empty text if it is stored."""
         return renew_file(self._credentials, self._identity, self._identity, now, lambda _, request: self._ask(request))
 
     def _warn(self, found: CertificateDates, now: datetime, why: str) -> None:
@@ -94,7 +94,7 @@ class CertificateKeeper(threading.Thread):
 def renew_file(
     credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[str, bytes], bytes]
 ) -> str:
-    """Store the next certificate of an identity. Return why there is none; empty if it is stored.
+    """Store the next certificate of an identity. Return why there is none, or an empty text if it is stored.
 
     identity: empty: as the certificate names it. file: of the certificate. ask: asks the hub for an identity.
     """

@@ -57,7 +57,7 @@ class Credentials:
 
     @property
     def me(self) -> str:
-        """Return the identity of whoever uses this computer; empty if there is none."""
+        """Return the identity of whoever uses this computer, or an empty text if there is none."""
         try:
             return (self.directory / ME_FILE).read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError):
@@ -93,7 +93,7 @@ class Credentials:
         raise NoCredentials(f"{words}.")
 
     def dates(self, identity: str) -> CertificateDates | None:
-        """Return when the certificate of an identity begins and ends; None if there is none."""
+        """Return when the certificate of an identity begins and ends, or None if there is none."""
         try:
             return CertificateDates.of((self.directory / f"{identity}.pem").read_bytes())
         except OSError:

@@ -126,7 +126,7 @@ class Bus:
         return self
 
     def _ask_hub(self, request: bytes) -> bytes:
-        """Return the hub's answer to a request for the next certificate; empty if there is none, or it refuses."""
+        """Return the hub's answer to a request for the next certificate. Empty if there is none, or it refuses."""
         key = renewal_key(self.identity)
         for answer in self.query(key, payload=request, timeout_s=RENEWAL_QUERY_TIMEOUT_S):
             if isinstance(answer, Sample):

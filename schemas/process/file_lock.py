@@ -26,7 +26,7 @@ class FileLock:
         return self._descriptor is not None
 
     def try_take(self) -> bool:
-        """Take the lock if it is free, and return True if this object holds it now; raise OSError."""
+        """Take the lock if it is free. Return True if this object holds it now. Raises OSError if locking fails."""
         if self._descriptor is not None:
             return True
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ class FileLock:
 
 
 def _lock(descriptor: int) -> bool:
-    """Lock an open file until it is closed. Return False if another has locked it; raise OSError."""
+    """Lock an open file until it is closed. Return False if another process has locked it. Raises OSError otherwise."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)

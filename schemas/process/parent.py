@@ -9,7 +9,7 @@ def parent_option() -> tuple[str, str]:
 
 
 def watched_pid(starter: int | None) -> int | None:
-    """Return the process id that `os.getppid` reports while the starter runs. None: nothing is to be watched.
+    """Return the process id that `os.getppid` reports while the starter runs, or None if nothing is to be watched.
 
     The starter passes its own id: it may end before the new process could ask for it. On Windows `os.getppid` never
     changes, and reports the launcher of the virtual environment.

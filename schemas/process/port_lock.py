@@ -16,7 +16,7 @@ _MAX_COMMAND_LENGTH: Final = 80
 
 
 def find_holder(file_stat: os.stat_result) -> str | None:
-    """Return which process has locked a file or device, in words; None if none has, or if that is unknown."""
+    """Return which process has locked a file or device, in words, or None if none has, or if that is unknown."""
     try:
         locks = LOCKS.read_text(encoding="ascii", errors="replace")
     except OSError:

@@ -40,7 +40,7 @@ ClockPair = tuple[Callable[[], float], Callable[[], float]]
 
 
 def clock_pair() -> ClockPair | None:
-    """Return the clocks of this system; None if it has no such pair."""
+    """Return the clocks of this system, or None if it has no such pair."""
     if sys.platform == "win32":
         kernel = ctypes.windll.kernel32
         kernel.GetTickCount64.restype = ctypes.c_uint64

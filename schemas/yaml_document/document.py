@@ -96,7 +96,7 @@ def _without_titles(part: Any) -> Any:
 
 
 def name_special_file(path: Path) -> str:
-    """Name the type of a path that is no regular file (`directory`, `FIFO`, ...); empty if it is one. Raises OSError.
+    """Name the type of a path that is not a regular file (`directory`, `FIFO`, ...). Empty if it is one.
 
     Call it before opening: opening a FIFO blocks, and opening a serial port resets the car on it.
     """
@@ -116,7 +116,7 @@ def _similar_file(path: Path) -> str:
 
 
 def read_text(path: Path, source: str | None = None) -> str:
-    """Read the text of a file; raises BadFile if it cannot be read, is too large, or is not UTF-8."""
+    """Read the text of a file. Raises BadFile if it cannot be read, is too large, or is not UTF-8."""
     source = str(path) if source is None else source
     try:
         kind = name_special_file(path)
@@ -191,7 +191,7 @@ class Document:
     def validate_partial(self, model: type[_Model], missing: Mapping[str, object]) -> _Model | None:
         """Return the document as this model without its faulty values, so that other faults can be found.
 
-        Call it after `validate`. `missing`: values for missing required fields, by name. None: too little remains.
+        Call it after `validate`. `missing` has values for missing required fields. Returns None if too little remains.
         """
         dropped, added = set(self._faulty), dict[Where, object]()
         for _ in range(MAX_YAML_DEPTH):
@@ -278,7 +278,7 @@ class Document:
         return Problem(mark.line + 1, mark.column + 1, format_place(where, self.tree), words)
 
     def _construct(self, where: Where, key: yaml.Mark | None, node: yaml.Node) -> Any:
-        """Return plain data with all aliases expanded; raises BadFile if it has too many values or levels."""
+        """Return plain data with all aliases expanded. Raises BadFile if it has too many values or levels."""
         self._places[where] = (key, node)
         self._values += 1
         if self._values > MAX_YAML_VALUES or len(where) > MAX_YAML_DEPTH:

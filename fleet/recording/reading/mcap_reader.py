@@ -52,7 +52,7 @@ Extra = Attachment | Metadata
 
 
 class McapReader:
-    """Reader of one file; raises NotMcap. `damage` lists what `check` or `messages` have found so far."""
+    """Reader of one MCAP file, or raises NotMcap. `damage` lists what `check` or `messages` have found so far."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,7 +80,7 @@ class McapReader:
 
     @property
     def words(self) -> str:
-        """Return the damage on one line; empty if there is none."""
+        """Return the damage on one line, or an empty text if there is none."""
         if not self.damage:
             return ""
         kind = "is damaged"
@@ -184,7 +184,7 @@ class McapReader:
             yield ChunkPart(at, opcode, record[HEAD.size :])
 
     def index(self) -> Index | None:
-        """Return the index if it is intact and lists every chunk, else None; raises OSError."""
+        """Return the index if it is intact and lists every chunk, else None. Raises OSError if reading fails."""
         self._begin()
         with self.path.open("rb") as file:
             _, index = self._index(file)
@@ -199,7 +199,7 @@ class McapReader:
         self.damage.append(Damage(0, f"it cannot be read: {error.strerror}"))
 
     def _index(self, file: IO[bytes]) -> tuple[Footer | None, Index | None]:
-        """Return the footer and index of a file; None if they are missing or fail the CRC."""
+        """Return the footer and index of a file, or None if they are missing or fail the CRC."""
         size = file.seek(0, os.SEEK_END)
         at = size - _FOOTER_SIZE - len(MAGIC)
         tail = read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))

@@ -90,7 +90,7 @@ class RecordScanner:
         self._report(at, "it stops there")
 
     def chunk_from(self, start: int) -> int | None:
-        """Return the offset of the first intact chunk at or after `start`; None if not found."""
+        """Return the offset of the first intact chunk at or after `start`, or None if not found."""
         if self._next_chunk is not None:
             searched, found = self._next_chunk
             if searched <= start and (found is None or found >= start):

@@ -23,7 +23,7 @@ class MessageDecoder:
         self._classes: dict[tuple[str, bytes], type[Message] | None] = {}
 
     def class_of(self, info: ChannelInfo) -> type[Message] | None:
-        """Return the class of the messages of a channel; None if it is not protobuf, or its schema is invalid."""
+        """Return the class of the messages of a channel, or None if it is not protobuf, or its schema is invalid."""
         schema = info.schema
         if schema is None or schema.encoding != "protobuf" or info.channel.message_encoding != "protobuf":
             return None
@@ -33,7 +33,7 @@ class MessageDecoder:
         return self._classes[kind]
 
     def message(self, info: ChannelInfo, payload: bytes) -> Message | None:
-        """Return the decoded payload; None if it does not match its schema."""
+        """Return the decoded payload, or None if it does not match its schema."""
         message_class = self.class_of(info)
         if message_class is None:
             return None
@@ -90,7 +90,7 @@ def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = fro
 
 
 def message_of(info: ChannelInfo) -> str:
-    """Return the full protobuf name of the messages of a channel; empty if the file has no schema for it."""
+    """Return the full protobuf name of the messages of a channel, or an empty text if the file has no schema for it."""
     return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""
 
 

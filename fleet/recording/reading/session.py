@@ -68,7 +68,7 @@ class Recorded:
     key: str
     payload: bytes
     message: str
-    """Full protobuf name; empty if the file has no schema for it."""
+    """Full protobuf name, or an empty text if the file has no schema for it."""
     encoding: str
     """MCAP message encoding: `protobuf`, `json`, or the encoding of the publisher."""
     published_ns: int
@@ -160,12 +160,12 @@ class Session:
 
     @property
     def undescribed(self) -> str:
-        """Return what is wrong with session.json of a directory, in words; empty if it can be read."""
+        """Return what is wrong with session.json of a directory, in words, or an empty text if it can be read."""
         unread = self.description is None and self.path.is_dir()
         return "is missing or unreadable: it names recorder and marks" if unread else ""
 
     def lacking(self, messages: int) -> str:
-        """Return which messages session.json counts beyond these, in words; empty if none or unknown."""
+        """Return which messages session.json counts beyond these, in words, or an empty text if none or unknown."""
         info = self.description
         gone = session_dir.gone_messages(info) if info is not None else 0
         total = info.messages - gone if info is not None and info.closed and gone is not None else 0
@@ -173,7 +173,7 @@ class Session:
 
     @property
     def damage_words(self) -> str:
-        """Return the damage on one line; empty if there is none."""
+        """Return the damage on one line, or an empty text if there is none."""
         return "; ".join(f"{path} {words}" for path, words in sorted(self.damage.items()))
 
     def check(self) -> None:
@@ -376,7 +376,7 @@ class Session:
             yield from self._read_segment(segment, selection)
 
     def expected(self) -> dict[Path, int | None]:
-        """Return the expected messages of each segment, from its index or index.json; None if unknown."""
+        """Return the expected messages of each segment, from its index or index.json, or None if unknown."""
         counts = ((each["file"], each.get("messages")) for each in session_dir.indexed_segments(self.path))
         indexed = {name: count for name, count in counts if isinstance(count, int)}
         found: dict[Path, int | None] = {}
@@ -387,7 +387,7 @@ class Session:
         return found | {path: indexed.get(path.name) for path in gone}
 
     def indexes(self) -> dict[Path, Index | None]:
-        """Return the index of each segment; None if it is damaged or cannot be read."""
+        """Return the index of each segment, or None if it is damaged or cannot be read."""
         found: dict[Path, Index | None] = {}
         for segment in self.segments:
             try:

@@ -210,7 +210,7 @@ def is_stray(info: ChannelInfo) -> bool:
 
 
 def own_type(key: str) -> str:
-    """Return the full name of the messages of a key; empty if the key is not ours."""
+    """Return the full name of the messages of a key, or an empty text if the key is not ours."""
     topic = topics.of_key(key)
     if topic is not None:
         return topic.message
@@ -220,7 +220,7 @@ def own_type(key: str) -> str:
 
 
 def export(rows: Iterable[Row], out: Path, sink: type[FileSink]) -> Exported:
-    """Write the tables of messages into an existing directory; raises OSError, FormatMissing.
+    """Write the tables of messages into an existing directory. Raises OSError if that fails, or FormatMissing.
 
     After an error none of its files are left.
     """
@@ -228,7 +228,7 @@ def export(rows: Iterable[Row], out: Path, sink: type[FileSink]) -> Exported:
 
 
 def arrow_tables(rows: Iterable[Row]) -> tuple[dict[str, Any], Exported]:
-    """Return the pyarrow tables of messages by name; raises FormatMissing."""
+    """Return the pyarrow tables of messages by name. Raises FormatMissing if pyarrow is not installed."""
     sinks: dict[str, ArrowSink] = {}
     exported = _export(rows, lambda name, columns: sinks.setdefault(name, ArrowSink(columns)))
     return {name: sink.table() for name, sink in sinks.items()}, exported

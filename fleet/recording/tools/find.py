@@ -158,7 +158,7 @@ def _messages(
 def _why_left_out(
     info: ChannelInfo, decoder: MessageDecoder, message: Any, topic: str, names: Collection[str]
 ) -> LeftOutCause | None:
-    """Return why a message has no value of these names; None if it has one, or could have."""
+    """Return why a message has no value of these names, or None if it has one, or could have."""
     if message is None:
         return why_not_decoded(decoder, info)
     if message.DESCRIPTOR.full_name != TOPICS[topic].message:

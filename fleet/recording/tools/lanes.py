@@ -179,7 +179,7 @@ class Lanes:
 
 
 def _kept_by(safety: Any) -> str:
-    """Return what keeps a car from moving: an e-stop, the pause of the fleet, or a hold. Empty: nothing."""
+    """Return what keeps a car from moving: an e-stop, the pause of the fleet, or a hold. Empty if nothing does."""
     if safety.estops:
         return f"e-stop by {keys.person_of(safety.estops[0].by)}{_because(safety.estops[0].why)}"
     if (pause := binding_pause(safety.pauses)) is not None:

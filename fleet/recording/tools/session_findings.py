@@ -37,7 +37,7 @@ class SessionCheckup:
     broken: Counter[str] = field(default_factory=Counter)
     """Lost links."""
     car: str = ""
-    """The only car to look at. Empty: all."""
+    """The only car to look at. Empty for all cars."""
     cars: set[str] = field(default_factory=set)
     """The cars of the session."""
     _decoder: MessageDecoder = field(default_factory=MessageDecoder)

@@ -33,7 +33,7 @@ class UnshownStop:
     at_ns: int
     code: str
     asked: str
-    """Who asked for it, such as `stop by mia`. Empty: the gateway itself."""
+    """Who asked for it, such as `stop by mia`. Empty if it was the gateway itself."""
     words: str
     """The words of the gateway."""
     cause: str

@@ -78,7 +78,7 @@ class SessionSummary:
 
 
 def overviews(root: Path) -> Iterator[SessionSummary]:
-    """Yield every session below a directory, oldest first; raises OSError if it cannot be listed."""
+    """Yield every session below a directory, oldest first. Raises OSError if the directory cannot be listed."""
     yield from map(overview, filter(session_dir.is_session, sorted(root.iterdir())))
 
 
@@ -186,7 +186,7 @@ def growing(session: Session) -> Callable[[], bool]:
 
 
 def total(session: Session) -> int | None:
-    """Return the number of messages from the indexes; None if one is missing."""
+    """Return the number of messages from the indexes, or None if one is missing."""
     count = 0
     for index in session.indexes().values():
         if index is None or index.statistics is None:

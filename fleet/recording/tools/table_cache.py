@@ -71,7 +71,7 @@ class CachedTables:
     session: Path
     directory: Path
     words: str = ""
-    """What of the session could not be read; empty if all was."""
+    """What of the session could not be read, or an empty text if all was."""
 
     names: tuple[str, ...] = ()
     """The files in the directory."""
@@ -192,7 +192,7 @@ def _made(session: Path, place: Path, stamp: str) -> CachedTables:
 
 
 def _words(session: Session) -> str:
-    """Return what is not whole of a session, as `fleet find` and `fleet sessions` say it; empty if it is whole."""
+    """Return what is not whole in a session, as `fleet find` and `fleet sessions` print it. Empty if it is whole."""
     return session.damage_words or of_session(session).words
 
 
@@ -269,7 +269,7 @@ class _State:
     """Sizes and times of the files of a session."""
 
     names: tuple[str, ...]
-    """All names in the session; empty if it is a file."""
+    """All names in the session. Empty if it is a file."""
     segments: tuple[str, ...]
     """Each segment with its size and time."""
     description: tuple[str, ...]

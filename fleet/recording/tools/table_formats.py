@@ -159,7 +159,7 @@ _TO_TEXT: Final[dict[ColumnKind, Callable[[Values], Values]]] = {
 
 
 def import_pyarrow() -> Any:
-    """Return pyarrow; raises FormatMissing."""
+    """Return pyarrow. Raises FormatMissing if it is not installed."""
     try:
         import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
     except ImportError:

@@ -141,7 +141,7 @@ class RequestColumns:
 
     @classmethod
     def of(cls, descriptor: Any) -> Self | None:
-        """Return the columns for messages of this type; None if it is no event of a command."""
+        """Return the columns for messages of this type, or None if it is no event of a command."""
         return cls(descriptor) if descriptor.full_name == TOPICS["event/command"].message else None
 
     def fill(self, events: Sequence[Any]) -> list[Values]:
@@ -187,7 +187,7 @@ def column_name(name: str, unit: str, index: int | None = None) -> str:
 
 
 def car_of(key: str) -> str:
-    """Return the car or service of a key; empty if the key belongs to no fleet."""
+    """Return the car or service of a key, or an empty text if the key belongs to no fleet."""
     parsed = keys.parse(key)
     return parsed.car if parsed is not None else ""
 

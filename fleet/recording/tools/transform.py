@@ -31,7 +31,7 @@ class Exists(Exception):
 
 @contextmanager
 def atomic_directory(out: Path) -> Iterator[Path]:
-    """Yield a temporary directory, and rename it to `out` if no error occurs; raises Exists, OSError."""
+    """Yield a temporary directory, and rename it to `out` if no error occurs. Raises Exists if there is an `out`."""
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise Exists(f"{out} is there already: name a new directory")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int,
 
 
 def _missing(session: Session, count: int, words: str) -> int | None:
-    """Return the number of messages that could not be read; None if unknown."""
+    """Return the number of messages that could not be read, or None if unknown."""
     description = session.description
     if not words:
         return 0
@@ -85,7 +85,7 @@ def _missing(session: Session, count: int, words: str) -> int | None:
 
 
 def _sum(counts: Iterable[object]) -> int | None:
-    """Return the sum; None if one count is unknown."""
+    """Return the sum, or None if one count is unknown."""
     total = 0
     for each in counts:
         if not isinstance(each, int):
@@ -261,12 +261,12 @@ def _has(selection: Selection, begin: object, end: object) -> bool:
 
 
 def origin_of(session: Session) -> Mapping[str, Any]:
-    """Return the origin of a session that was made from another; empty if it was recorded."""
+    """Return the origin of a session that was made from another. Empty if it was recorded."""
     return session.description.origin if session.description is not None else {}
 
 
 def lost_words(session: Session) -> str:
-    """Return the losses of the session from which this one was made; empty if there are none."""
+    """Return the losses of the session from which this one was made, or an empty text if there are none."""
     origin = origin_of(session)
     if not origin.get("lost") or origin.get("missing") == 0:
         return ""
@@ -276,7 +276,7 @@ def lost_words(session: Session) -> str:
 
 
 def origin_words(origin: object) -> str:
-    """Return the origin of a session on one line; empty if it was recorded."""
+    """Return the origin of a session on one line, or an empty text if it was recorded."""
     if not isinstance(origin, dict) or not origin:
         return ""
     parts = [f"{name} {json.dumps(value)}" for name, value in origin.items() if value and name not in ("by", "of")]

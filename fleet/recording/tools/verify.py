@@ -48,7 +48,7 @@ class SessionVerdict:
     """Damage by file."""
     closed: bool = True
     ended: str = ""
-    """Why the recorder did not close the session; empty if it did."""
+    """Why the recorder did not close the session, or an empty text if it did."""
     lost: str = ""
     """Losses of the session from which this one was made."""
     gone: list[dict[str, Any]] = field(default_factory=list)

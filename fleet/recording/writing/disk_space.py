@@ -23,7 +23,7 @@ MIN_CLOSE_BYTES: Final = 200_000
 
 
 def free_bytes(path: Path) -> int:
-    """Return the free space on the disk where `path` is or would be created; raises OSError."""
+    """Return the free space on the disk where `path` is or would be. Raises OSError if the system does not tell it."""
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
 
 

@@ -59,7 +59,7 @@ class PinWatch:
         self._rules = rules
         self._conditions = ConditionPins(rules)
         self._keys: dict[str, tuple[str, str] | None] = {}
-        """Car and topic of each key; None if it is of no use here."""
+        """Car and topic of each key, or None if it is of no use here."""
         self._cars: set[str] = set()
         self._stopped: dict[str, set[str]] = {}
         """The cars that each stop has reached, by its id."""

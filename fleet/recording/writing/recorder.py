@@ -114,7 +114,7 @@ class Recorder:
         self._options = options or Options()
         self._pin_rules = pins
         self._read_people = people
-        """Returns the people of the fleet file, who may start and stop. None: those that the gateways know."""
+        """Returns the people in the fleet file, who may start and stop. None means those whom the gateways know."""
         self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes
@@ -163,11 +163,11 @@ class Recorder:
 
     @property
     def full(self) -> str:
-        """Return why writing pauses; empty if it does not."""
+        """Return why writing pauses, or an empty text if it does not."""
         return self._session.full
 
     def close(self) -> RecordingOutcome:
-        """Write all received messages, and close the session; raises RecordingFailed."""
+        """Write all received messages, and close the session. Raises RecordingFailed if that fails."""
         if not self.ended.is_set():
             self._await_messages_in_transit()
         self._backfill.close()
@@ -346,7 +346,7 @@ class Recorder:
         self._publish()
 
     def _begin_session(self) -> None:
-        """Begin the next session; raises OSError if it cannot be created."""
+        """Begin the next session. Raises OSError if it cannot be created."""
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
         if not self._session.full:
             self._notify(f"recording {keys.describe_fleet(self._fleet)} to {self._session.path}")

@@ -18,7 +18,7 @@ class ResumePoint:
     """End of an interrupted session, from which a new one continues, and the messages that it already holds."""
 
     name: str
-    """Name of the interrupted session; empty if there is none."""
+    """Name of the interrupted session, or an empty text if there is none."""
     since_ns: int
     """Publish time from which the new session accepts backfilled messages."""
     known: frozenset[tuple[str, int, int]] = frozenset()

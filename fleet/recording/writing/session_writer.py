@@ -91,7 +91,7 @@ class SessionWriter:
         self.recovered: dict[str, int] = {}
         """Messages by key that a backfill restored."""
         self.full = ""
-        """Why writing pauses; empty if it does not."""
+        """Why writing pauses. Empty if it does not."""
         self.cost = ""
         """Losses at the end of the session because the disk was full."""
         self.warning = ""
@@ -211,7 +211,7 @@ class SessionWriter:
 
     @property
     def free_bytes(self) -> int:
-        """Return the free space on the disk in bytes; raises OSError."""
+        """Return the free space on the disk in bytes. Raises OSError if the system does not tell it."""
         return shutil.disk_usage(self.path).free if self._made else free_bytes(self._root)
 
     @property
@@ -259,7 +259,7 @@ class SessionWriter:
             self._check_disk()
 
     def mark(self, text: str, by: str, now_ns: int) -> None:
-        """Add a mark and exempt the session from the quota; raises OSError."""
+        """Add a mark and exempt the session from the quota. Raises OSError if the mark cannot be written."""
         marks = [*self.description.marks, {"time": format_utc(_utc(now_ns)), "text": text, "by": by}]
         self.description.marks, self.description.kept = marks, True
         if self._made:

@@ -175,7 +175,7 @@ def presence(recorded: Iterable[Recorded], end_ns: int) -> list[PresenceToken]:
 
 
 def decode_message(item: Recorded) -> Any:
-    """Return the decoded message of a known topic; None if the topic is unknown or the payload invalid."""
+    """Return the decoded message of a known topic, or None if the topic is unknown or the payload invalid."""
     key = keys.parse(item.key)
     if key is None:
         return None
@@ -190,7 +190,7 @@ def decode_message(item: Recorded) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class DecisionDifference:
-    """Time span with different decisions in the recording and now; None: no decision."""
+    """Time span in which the recorded decision differs from the new one. None means no decision."""
 
     subject: str
     from_ns: int

@@ -46,7 +46,7 @@ class Tx:
 
 @dataclass(frozen=True, slots=True)
 class KnownMode:
-    """Known mode of the car from this time on; None: unknown."""
+    """Known mode of the car from this time on, or None if it is unknown."""
 
     at_ns: int
     mode: Mode | None

@@ -56,7 +56,7 @@ def keys_for(fleet: str, plans: Iterable[Plan]) -> list[str]:
 
 
 def plans_of(run: CoordinatorRun) -> list[Plan]:
-    """Return the plans of a coordinator in order; raises BadPlan if this version cannot read one."""
+    """Return the plans of a coordinator in order. Raises BadPlan if this version cannot read one of them."""
     return [parse(text, f"the recorded plan of {run.fleet}") for _, text in run.plans]
 
 

@@ -66,7 +66,7 @@ class Player:
         self._hub_keeper = HubKeeper(self.bus.endpoint, _HUB_RESTART_DELAY_S)
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
-        """Declare the tokens of these cars, and answer queries; raises NameTaken."""
+        """Declare the tokens of these cars, and answer queries. Raises NameTaken if there is such a fleet already."""
         another = "name this one otherwise with --as"
         if playing := self.bus.tokens(keys.replay_token(self.name)):
             raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {another}")
@@ -228,7 +228,7 @@ def _subject(topic: Topic, payload: bytes) -> str:
 
 
 def _identity(verb: str, query: zenoh.Query, encoding: str) -> str:
-    """Return the id that the sender gave a command; empty if unreadable."""
+    """Return the id that the sender gave a command, or an empty text if unreadable."""
     if verb not in COMMANDS or query.payload is None:
         return ""
     try:

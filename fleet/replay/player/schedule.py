@@ -12,7 +12,7 @@ class Schedule:
 
     rate: float = 1.0
     longest_gap_ns: int | None = None
-    """Maximum pause; longer ones are shortened to it. None: no limit."""
+    """Maximum pause, to which longer ones are shortened. None means no limit."""
     played_ns: int = 0
     """Length of the recording played so far, with shortened pauses."""
     shortened: int = 0

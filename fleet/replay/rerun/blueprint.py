@@ -39,9 +39,9 @@ _Overrides = dict[Any, list[Any]]
 
 
 def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.Blueprint:
-    """Return the layout for the contents of a drawing. `tab` names the car whose tab is in front; empty: the fleet's.
+    """Return the layout for the contents of a drawing. `tab` is the car whose tab is in front (empty: the fleet's).
 
-    `last_s` is the time span in view before the cursor; None: the whole time.
+    `last_s` is the time span in view before the cursor. None means the whole time.
     """
     session = drawing.contents()
     builder = _RerunLayout(drawing, _axis(drawing.span_ns, last_s))
@@ -149,7 +149,7 @@ class _RerunLayout:
         return self._tracks(name, overrides) if overrides else None
 
     def _panel(self, car: str, panel: Panel) -> rrb.View | None:
-        """Return the view of a panel of a car (empty: of a service); None without data."""
+        """Return the view of a car's panel, or None without data. An empty `car` means a service."""
         if panel.texts:
             texts = [self._entity(car, topic) for topic in panel.texts if self._has(car, topic)]
             return _text(panel.name, texts) if texts else None

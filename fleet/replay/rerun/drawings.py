@@ -48,7 +48,7 @@ _MAX_LEDS: Final = 256
 
 
 class Drawing:
-    """Derived chunks and contents of a session. `limit` is the maximum of points per path; None: no limit.
+    """Derived chunks and contents of a session. `limit` is the maximum of points per path. None means no limit.
 
     `car_colors`: those of the fleet file, by car.
     """
@@ -158,7 +158,7 @@ class Drawing:
             yield rrc.Chunk.from_columns(panels.entity(key), indexes=indexes, columns=columns)
 
     def ground(self, topic: str) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Return the lowest and highest x and y of the paths of a topic in meters; None if it has none.
+        """Return the lowest and highest x and y of the paths of a topic in meters, or None if it has none.
 
         Those of the truth include the walls: a measured pose counts from an origin of its own.
         """
@@ -297,7 +297,7 @@ def _with_ends(times: _Times, marks: list[str]) -> tuple[_Times, list[str | None
 
 
 def _led_color(event: dict[str, Any]) -> str:
-    """Return the color of an LED command in the format of `sim/truth`; empty if unknown."""
+    """Return the color of an LED command in the format of `sim/truth`, or an empty text if unknown."""
     try:
         requested: Any = messages.parse(LED_MESSAGE, event["request"], event["request_encoding"])
     except messages.BadPayload:

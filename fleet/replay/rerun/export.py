@@ -48,7 +48,7 @@ class Part:
     """Part of a session to show: cars (the fleet's services are always included) and a time span."""
 
     cars: tuple[str, ...] = ()
-    """Empty: all cars."""
+    """Empty means all cars."""
     start_ns: int | None = None
     end_ns: int | None = None
     """Times of the recorder's clock, ns since the epoch; `end_ns` is excluded."""

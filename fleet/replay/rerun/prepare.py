@@ -69,7 +69,7 @@ def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole
 def copied(
     session: Session, selection: Selection, wanted: Wanted, scratch: Path, refused: Collection[str] = ()
 ) -> Prepared:
-    """Copy the messages into files that Rerun reads whole; raises OSError.
+    """Copy the messages into files that Rerun reads whole. Raises OSError if they cannot be written.
 
     wanted: whether to copy a key. scratch: an existing directory. refused: names of schemas that Rerun refuses.
     """

@@ -91,7 +91,7 @@ class Viewer:
             return None
 
     def wait_until_it_listens(self, port: int) -> None:
-        """Wait until it accepts data at this port; raises NoViewer if it does not."""
+        """Wait until the viewer accepts data at this port. Raises NoViewer if it does not."""
         deadline = time.monotonic() + VIEWER_START_TIMEOUT_S
         while True:
             with socket.socket() as probe:

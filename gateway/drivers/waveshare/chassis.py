@@ -48,7 +48,7 @@ _NOT_OBSERVED: Final = ("all of it: read in the firmwares' source, tried on no c
 
 
 def profile_of(name: str) -> PlainProfile:
-    """Return what cars of a platform can do; raise ValueError."""
+    """Return what cars of a platform can do. Raises ValueError for a wrong name."""
     kind, plus, options = name.partition("+")
     if plus:
         raise ValueError(f'Unknown option "+{options[:40]}" of {kind}. It has none.')

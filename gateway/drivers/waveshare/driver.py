@@ -254,7 +254,7 @@ class WaveshareDriver(PlainDriver):
 
     @property
     def _here(self) -> Chassis | None:
-        """The chassis with the firmware that the car has shown; None if this platform has none with it."""
+        """The chassis with the firmware that the car has shown, or None if this platform has none with it."""
         return None if self._firmware is None else self._chassis.get(self._firmware)
 
     @property
@@ -507,7 +507,7 @@ class WaveshareDriver(PlainDriver):
     # ------------------------------------------------------------------ frames out
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state; None if it can."""
+        """Return why this car cannot do it in any state, or None if it can."""
         if isinstance(what, Drive) and self._firmware is not None and self._here is None:
             name = self._model.profile.name
             return f"{self.desk.car} runs {self._firmware}, which {name} cars do not. Correct `platform:`."

@@ -26,7 +26,7 @@ _DECODER: Final = json.JSONDecoder()
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """One report. None: it has no such field. `at` is the time of the last byte."""
+    """One report. A field is None if the report does not have it. `at` is the time of the last byte."""
 
     raw: bytes
     at: float

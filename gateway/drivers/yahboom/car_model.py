@@ -108,7 +108,7 @@ class CarModel:
 
     @property
     def silence_limit_s(self) -> float | None:
-        """Return the longest normal silence now; None if silence says nothing."""
+        """Return the longest normal silence now, or None if silence says nothing."""
         return self.mode.silence_limit(fan=bool(self.believed.fan))
 
     @property
@@ -178,7 +178,7 @@ class CarModel:
 
     @property
     def silent_program(self) -> str:
-        """Return what to do about a car that never sent a reading; empty if it has sent one."""
+        """Return what to do about a car that never sent a reading, or an empty text if it has sent one."""
         if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
             return ""
         if self.profile.kind is not Platform.UNKNOWN:
@@ -205,16 +205,16 @@ class CarModel:
 
     @property
     def basis(self) -> Basis | None:
-        """Return the basis of the claim that the motors are off; None if they are not."""
+        """Return the basis of the claim that the motors are off, or None if they are not."""
         return self.trust.basis if self.motors is Motors.OFF else None
 
     @property
     def motion(self) -> Motion | None:
-        """Return the last motion sent; None if the state is unknown or the car drives by itself."""
+        """Return the last motion sent, or None if the state is unknown or the car drives by itself."""
         return self.believed.motion if self.known and self.manual else None
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words how the distance has changed since a drive began; empty if no reading shows that."""
+        """Return in words how the distance has changed since a drive began. Empty if no reading shows that."""
         return "" if self.range_at < since + FLIGHT_S else describe_way(range_cm, self.range_cm)
 
     @property

@@ -126,7 +126,7 @@ class YahboomDriver(Executor):
     # ------------------------------------------------------------------ commands
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state; None if it can."""
+        """Return why this car cannot do it in any state, or None if it can."""
         car, profile, believed = self.desk.car, self.model.profile, self.model.believed
         match what:
             case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
@@ -155,7 +155,7 @@ class YahboomDriver(Executor):
                 return None
 
     def _too_fast(self, step: SpeedStep) -> str | None:
-        """Return why the car must not become as fast as after this step; None if it may."""
+        """Return why the car must not become as fast as after this step, or None if it may."""
         speed, before = self.model.profile.speed, self.model.believed.speed
         after = speed.step(before, step)
         share, maximum = speed.fraction(after), self.desk.speed_max

@@ -332,7 +332,7 @@ class Executor(Driver):
 
     @property
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car; empty if the car is stopped."""
+        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
         return self.stops.not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
@@ -362,7 +362,7 @@ class Executor(Driver):
 
     @property
     def doubt_of_drive(self) -> str:
-        """Return why the car may have ignored a drive; empty if there is no reason to think so."""
+        """Return why the car may have ignored a drive, or an empty text if there is no reason to think so."""
         model = self.model
         if model.is_deaf and model.missed_stop:
             return "it has not reacted to the last stop"

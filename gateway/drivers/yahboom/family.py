@@ -15,7 +15,7 @@ PLATFORMS: Final = tuple(map(str, Platform))
 
 
 def profile_of(name: str) -> Profile:
-    """Return what cars of a platform can do; raise ValueError."""
+    """Return what cars of a platform can do. Raises ValueError for a wrong name."""
     return parse_platform(name)
 
 
@@ -25,7 +25,7 @@ def profiles() -> tuple[Profile, ...]:
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], YahboomDriver]":
-    """Return the driver of a car. It finds out the platform of an `auto` one; raise ValueError."""
+    """Return the driver of a car. With `auto` it finds out the platform. Raises ValueError for a wrong platform."""
     # A program that only asks for a profile needs no driver.
     from gateway.drivers.yahboom.driver import yahboom
     from gateway.drivers.yahboom.estimate.learned import Learned

@@ -35,7 +35,7 @@ class StopExecutor:
         self.renewal = StopRenewal(model)
         self.shutting_down = False
         self.not_stopped = ""
-        """Why the gateway ends without a stop of the car; empty if the car is stopped."""
+        """Why the gateway ends without a stop of the car. Empty if the car is stopped."""
         self._log = log
         self._shutdown_until = float("inf")
 
@@ -196,7 +196,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
-        """Return why the stop ends without evidence; None if the car may still show it."""
+        """Return why the stop ends without evidence, or None if the car may still show it."""
         if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)

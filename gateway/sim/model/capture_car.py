@@ -19,7 +19,7 @@ class CaptureCar:
         self._loop = loop
         self._index = 0
         self._start = now
-        """Start time of the round. None: waits for a host."""
+        """Start time of the round, or None if the capture waits for a host."""
         self.rounds = 0
         """Number of complete rounds."""
         self.sent_bytes = 0

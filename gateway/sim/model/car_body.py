@@ -50,7 +50,7 @@ class CarBody:
 
     @property
     def name(self) -> str:
-        """The name of the car; empty if the world needs none."""
+        """The name of the car, or an empty text if the world needs none."""
         return self._name
 
     @property

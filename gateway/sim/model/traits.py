@@ -45,7 +45,7 @@ class CarTraits:
     gray_max: int = 1023
     """Maximum of the grayscale reading."""
     more: str = ""
-    """Fields that the program prints at the end of the mode-0 report, such as `TP31.5`; empty if there are none."""
+    """Fields that the program prints at the end of the mode-0 report, such as `TP31.5`. Empty if there are none."""
     constants: bool = False
     """True if the mode-0 report has constants in place of line, obstacle, light and grayscale."""
 

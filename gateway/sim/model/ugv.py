@@ -113,9 +113,9 @@ class UgvCar:
         self.scheduler: EventScheduler | None = None
         self.alive: Final = True
         self.runaway_since: float | None = None
-        """Since when the motors are on while the dead-man is not armed; None if they are not."""
+        """Since when the motors are on while the dead-man is not armed, or None if they are not."""
         self.wrong_since: float | None = None
-        """Since when it drives by a line of its host while it was told another chassis; None if it does not."""
+        """Since when it drives by a line of its host while it was told another chassis, or None if it does not."""
         self._reset(now, text=False)
         self._boot_until = self._uart_from = now  # it has run for a while
         self._mission: list[tuple[float, str]] = []

@@ -369,7 +369,7 @@ class World:
         self.things = tuple(each.faster(speed_m_s, at_s) if each.name == name else each for each in self.things)
 
     def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
-        """Move a thing to a place, where it stays (None: unchanged). The place of a carried thing is on its car."""
+        """Move a thing to a place, where it stays. None keeps a coordinate. A carried thing's place is on its car."""
 
         def put(thing: MovingObject) -> MovingObject:
             pose = thing.pose(now - self._began)

@@ -39,12 +39,12 @@ class ModeEstimator:
     learned: Learned = field(default_factory=Learned)
     asked: Mode | None = None
     inferred: Mode | None = None
-    """The only mode that fits the last readings or the silence; None if several or none fit."""
+    """The only mode that fits the last readings or the silence, or None if several or none fit."""
     verdict: Verdict = Verdict.ASSUMED
     evidence: str = "no reading yet"
     evidence_at: float | None = None
     since: float | None = None
-    """Since when the mode is commanded and the verdict is what it is; None if no mode was commanded on this link."""
+    """Since when the mode is commanded and the verdict is what it is, or None if no mode was commanded on this link."""
     candidates: tuple[Mode, ...] = ()
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
@@ -208,7 +208,7 @@ class ModeEstimator:
         return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
-        """Return the longest silence of the commanded mode, s; None if silence shows nothing, or no mode was commanded.
+        """Return the longest silence of the commanded mode, s. None if silence shows nothing, or no mode was commanded.
 
         In a mode other than 0, silence shows something only on a car that has reported in that mode before.
         """

@@ -103,7 +103,7 @@ Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
 
 
 def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
-    """Return the bytes of a frame; raise EncodeError for a value that the table does not allow."""
+    """Return the bytes of a frame. Raises EncodeError for a value that the table does not allow."""
     match frame:
         case General():
             return _general(frame, dialect)

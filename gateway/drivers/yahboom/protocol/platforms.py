@@ -186,7 +186,7 @@ class Profile:
 
     @property
     def dead_man_s(self) -> None:
-        """None: no such car stops by itself (docs/reference/protocol.md#stops)."""
+        """Always None, because no such car stops by itself (docs/reference/protocol.md#stops)."""
         return None
 
     @property
@@ -245,7 +245,7 @@ class Profile:
         return self.kind in {Platform.ARDUINO, Platform.UNKNOWN}
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes of a frame as this car spells it; raise EncodeError."""
+        """Return the bytes of a frame as this car spells it. Raises EncodeError for a value that is not allowed."""
         return encode(frame, self.dialect)
 
     def parse_sent(self, data: bytes) -> Frame | None:
@@ -399,7 +399,7 @@ class Profile:
 
 
 def parse_platform(text: str) -> Profile:
-    """Return the profile of a platform such as `arduino` or `stm32+arm+head=BALA` in any case; raise ValueError."""
+    """Return the profile of a platform such as `arduino` or `stm32+arm+head=BALA` in any case, or raise ValueError."""
     return _profile(*parse_name(text))
 
 

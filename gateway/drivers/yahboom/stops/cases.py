@@ -57,7 +57,7 @@ class StopCase:
     stop: str
     """Which stop it is, for the docs."""
     shown_by: str
-    """What shows it; empty if the car cannot show it."""
+    """What shows it, or an empty text if the car cannot show it."""
     otherwise: str
     """What happens if it is not shown."""
     words: str = ""
@@ -76,7 +76,7 @@ class StopCase:
     """True if the first renewals are `MODE00`, which clears half a named frame."""
 
     def ends(self, facts: StopFacts) -> "StopCase | None":
-        """Return as which case a stop that began as this one ends without evidence; None if it goes on."""
+        """Return as which case a stop that began as this one ends without evidence, or None if it goes on."""
         return self.rule(self, facts)
 
     def why(self, car: str) -> str:

@@ -136,11 +136,11 @@ class StopEvidence:
     profile: Profile
     learned: Learned = field(default_factory=Learned)
     reacted_at: float | None = None
-    """When the car last reacted to a frame; None if never on this link, or not to the last stop."""
+    """When the car last reacted to a frame, or None if never on this link, or not to the last stop."""
     words: str = ""
     """The evidence for `SHOWN`."""
     settles_at: float | None = None
-    """When the pauses count, unless a reading comes before; None if they do not suffice."""
+    """When the pauses count, unless a reading comes before, or None if they do not suffice."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
     found_out: bool = False
@@ -181,7 +181,7 @@ class StopEvidence:
     _opened_at: float = _NEVER
     """When the last mode was opened."""
     _closed_at: float | None = None
-    """When the first `MODE00` since then was written; None if none was."""
+    """When the first `MODE00` since then was written, or None if none was."""
     _plain: bool = False
     """True if no other frame was written before that `MODE00`."""
 
