@@ -1,4 +1,4 @@
-"""The `fleet` command as a script and as `python -m fleet`: a Ctrl-C while it starts or ends is no traceback."""
+"""The `fleet` command as a script and as `python -m fleet`: a Ctrl-C while it starts or ends prints no traceback."""
 
 from schemas.process import startup
 

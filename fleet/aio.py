@@ -246,7 +246,7 @@ class Watch:
         )
         self._dropped = 0
         self.unreadable = 0
-        """Number of samples that are no message of ours."""
+        """Number of samples that are not messages of ours."""
 
     @property
     def dropped(self) -> int:

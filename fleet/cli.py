@@ -282,7 +282,7 @@ def _one_line(error: click.ClickException) -> str:
     extra = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", words)
     if extra is None or not isinstance(error, click.UsageError):
         return words
-    return f'{_command_path(error)} takes no "{extra[1]}".'
+    return f'{_command_path(error)} does not accept "{extra[1]}".'
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The `gateway` command as a script and as `python -m gateway`: a Ctrl-C while it starts or ends is no traceback."""
+"""The `gateway` command as a script and as `python -m gateway`. Ctrl-C while it starts or ends prints no traceback."""
 
 from schemas.process import startup
 

@@ -17,7 +17,7 @@ MAX_LINE_BYTES: Final = 8 * 1024 * 1024
 
 
 class BadCapture(ValueError):
-    """A file that is no capture. The message names the file, the line and the fault."""
+    """A file that is not a capture. The message names the file, the line and the fault."""
 
 
 @dataclass(frozen=True, slots=True)

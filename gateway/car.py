@@ -243,7 +243,7 @@ class CarGateway:
             self._driver.link_down("its gateway failed", self._loop.time())
 
     async def _check_rival(self) -> None:
-        """Check once more for another gateway. Of two that started together the one with the higher id ends."""
+        """Check again for another gateway. If two started together, the gateway with the higher id ends."""
         await asyncio.sleep(RIVAL_CHECK_DELAY_S)
         await self._has_rival()
         await self._writer.finished.wait()

@@ -36,7 +36,7 @@ class _OfLink:
 
 
 class SafetyStateFile:
-    """The state file of one car at one link. `link`: the text of `schemas.links.car_link`."""
+    """The state file of one car at one link. `link` is the text of `schemas.links.car_link`."""
 
     def __init__(self, directory: Path, fleet: str, car: str, link: str) -> None:
         self.path = directory / f"{fleet}.{car}.json"

@@ -86,7 +86,7 @@ def parse(identity: str) -> tuple[IdentityRole, str] | None:
 
 
 def role_of(identity: str) -> IdentityRole | None:
-    """Return the role of an identity, or None if it is none."""
+    """Return the role of an identity, or None if it is not one."""
     known = parse(identity)
     return None if known is None else known[0]
 

@@ -37,7 +37,7 @@ PortKey = tuple[str, str, frozenset[tuple[str, str]]]
 
 
 class BadLink(ValueError):
-    """Text that is no link. The message is the reason."""
+    """Text that is not a link. The message is the reason."""
 
 
 class Look(Protocol):
@@ -161,7 +161,7 @@ class SerialUrl(_SerialLine):
 class UsbUrl(_SerialLine):
     """A serial port by the ids of its USB device, wherever it is plugged in. At least one id is set.
 
-    vid, pid: 0 to 0xFFFF. serial: the whole serial number of the device.
+    vid, pid: 0 to 0xFFFF. `serial` is the whole serial number of the device.
     """
 
     vid: int | None = None
@@ -255,7 +255,7 @@ class TcpUrl(LinkUrl):
 class BleUrl(LinkUrl):
     """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name.
 
-    adapter: the computer's adapter, such as hci1; `auto` for any with room; None for the first one.
+    `adapter` is the computer's adapter, such as hci1; `auto` for any with room; None for the first one.
     """
 
     address: str | None = None
@@ -344,7 +344,7 @@ def _host(host: str) -> str:
 def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
     fields = parse_qs(query.replace("+", "%2B"), keep_blank_values=True)  # a + is a +, not a blank
     if unknown := sorted(fields.keys() - {"baud", *_USB_FIELDS}):
-        raise BadLink(f"{', '.join(unknown)} is no option of a serial link")
+        raise BadLink(f"{', '.join(unknown)} is not an option of a serial link")
     if twice := sorted(name for name, values in fields.items() if len(values) > 1):
         raise BadLink(f"{', '.join(twice)} is given twice")
     options = {name: values[0] for name, values in fields.items()}
@@ -385,7 +385,7 @@ def _usb_id(name: str, options: dict[str, str]) -> int | None:
 def _ble(rest: str) -> BleUrl:
     rest, option, adapter = _split_adapter(rest)
     if option and _ADAPTER.fullmatch(adapter) is None:
-        raise BadLink(f"adapter={adapter[:20]} is no adapter. Write adapter=hci1, or adapter=auto")
+        raise BadLink(f"adapter={adapter[:20]} is not an adapter. Write adapter=hci1, or adapter=auto")
     chosen = adapter if option else None
     if rest.startswith("name="):
         name = unquote(rest[5:])

@@ -52,7 +52,7 @@ def with_offset(at_ns: int) -> str:
 def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
     """Return when a local time of day (`14:05`, `14:05:12`) begins on each day from `start_ns` to `end_ns`.
 
-    Only those that are not over at `start_ns` and begin by `end_ns`. None if the text is no time of day.
+    Only those that are not over at `start_ns` and begin by `end_ns`. None if the text is not a time of day.
     """
     found = _CLOCK.fullmatch(text)
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3] or 0) > 59:

@@ -159,7 +159,7 @@ _ROLES: Final = {"": PersonRole.DRIVER, "lead": PersonRole.LEAD, "other": Person
 def _parse(entry: str) -> tuple[str, PersonRole]:
     name, _, role = entry.partition(":")
     if not is_name(name) or role not in _ROLES:
-        raise ValueError(f"{entry!r} is no person: write NAME, NAME:lead or NAME:other ({NAME_RULE})")
+        raise ValueError(f"{entry!r} is not a person: write NAME, NAME:lead or NAME:other ({NAME_RULE})")
     return name, _ROLES[role]
 
 
@@ -309,7 +309,7 @@ _REASONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Denial:
-    """Why a right is denied. `mark`: the e-stop, pause, hold, loan or lease that it rests on."""
+    """Why a right is denied. `mark` is the e-stop, pause, hold, loan or lease that it rests on."""
 
     bar: Bar
     mark: Mark | None = None

@@ -321,7 +321,7 @@ SERVICE_TOPICS: Final = (
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
 
 FROM_OUTSIDE: Final = frozenset({"sensor/pose"})
-"""Readings that a program outside of the car may publish, of any car and in any mode. They are no sign of life."""
+"""Readings that a program outside of the car may publish, of any car and in any mode. They are not a sign of life."""
 RESULT: Final = "fleet.v1.Result"
 _FAMILIES: Final = tuple(dict.fromkeys(topic.family for topic in CAR_TOPICS))
 _MIN_WORD_LENGTH: Final = 4

@@ -306,7 +306,7 @@ class Blocking(StrEnum):
 
 
 class FrameVerdict(StrEnum):
-    """The kind of a received frame. Bytes that are no frame have a `Cause` instead."""
+    """The kind of a received frame. Bytes that are not a frame have a `Cause` instead."""
 
     SENSORS = "sensors"
     ARM = "arm"

@@ -107,7 +107,7 @@ def _sensor(device_class: str, unit: str) -> dict[str, Any]:
 
 
 def _words(*words: str) -> dict[str, Any]:
-    # Home Assistant rejects a value that is no option, and null is none.
+    # Home Assistant rejects a value that is not an option, and null is not an option.
     return {
         "platform": "sensor",
         "device_class": "enum",

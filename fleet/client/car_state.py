@@ -104,7 +104,7 @@ class CarState:
     # ------------------------------------------------------------------ what comes in
 
     def take(self, topic: str, message: Any, at: float) -> bool:
-        """Take in a message of a topic such as `state/link`. at: the time from which its age counts.
+        """Take in a message of a topic such as `state/link`. `at` is the time from which its age counts.
 
         Return False if it does not count: it is older than what is known, or of a gateway that has ended.
         """
@@ -131,7 +131,7 @@ class CarState:
         self.present = present
 
     def on_gateway_end(self, running: str = "") -> None:
-        """Note that its gateway has ended. running: the boot_id of the next one, if it is known."""
+        """Note that its gateway has ended. `running` is the boot_id of the next one, if it is known."""
         self.present = False
         if running:
             self._starts.take(running)
@@ -195,7 +195,7 @@ class CarState:
     # ------------------------------------------------------------------ what follows from it
 
     def claims(self, now: float) -> CarClaims:
-        """Return what is claimed of motors, mode and link. Of a gateway that is gone they are past."""
+        """Return what is claimed of motors, mode and link. If the gateway is gone, the claims are past."""
         states = {topic: seen.message for topic, seen in self.newest_by_topic.items()}
         return claims_of(states, {topic: self.age_s(topic, now) for topic in states}, present=self.present)
 

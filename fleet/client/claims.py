@@ -154,7 +154,7 @@ class CarClaims:
 def claims_of(
     states: Mapping[str, Any], ages_s: Mapping[str, float] | None = None, *, present: bool = True
 ) -> CarClaims:
-    """Return the claims about a car. states: the newest messages by topic, with their ages."""
+    """Return the claims about a car. `states` are the newest messages by topic, with their ages."""
     ages = ages_s or {}
     safety, mode, link = ((states.get(topic), ages.get(topic, 0.0)) for topic in _STATES)
     return CarClaims(

@@ -101,8 +101,8 @@ class Fleet:
     """One operator on the bus. Use it with `with`. Its methods may be called from several threads.
 
     endpoint: `tcp/HOST:PORT` of the bus. The default is FLEET_ENDPOINT, else loopback port 7447.
-    name: the fleet's name. person: who drives, such as `group_a` (default: FLEET_AS, else the user's login).
-    sender: the name shown to others, person@host-pid by default.
+    `name` is the fleet's name. `person` is who drives, such as `group_a` (default: FLEET_AS, else the user's login).
+    `sender` is the name shown to others, person@host-pid by default.
     kind: `script`, `person` (outranks scripts) or `coordinator`.
     identity: whose certificate it uses, such as `service.coordinator` (default: the user's). On a hub with certificates
     the owner of the certificate drives, and another `person` or `sender` raises keys.BadKey.
@@ -230,13 +230,13 @@ class Fleet:
             try:
                 found.append(reading_of(answer))
             except (messages.BadPayload, KeyError) as error:
-                log.warning("%s: an answer that is no message of this fleet: %s", answer.key, error)
+                log.warning("%s: an answer that is not a message of this fleet: %s", answer.key, error)
         return sorted(found, key=lambda reading: reading.key)
 
     def watch(self, expression: str, *, when: str | None = None) -> Watch:
         """Subscribe to readings: `for reading in fleet.watch("*/sensor/range")`.
 
-        when: a condition on the fields of one message, such as `range_m < 0.3`. Raises conditions.BadExpression.
+        `when` is a condition on the fields of one message, such as `range_m < 0.3`. Raises conditions.BadExpression.
         Use it with `with` if the fleet stays open longer. Otherwise it receives readings until the fleet is closed.
         """
         written = check_key(self.expression(expression))

@@ -208,7 +208,7 @@ class CarCommands(ABC, Generic[R]):
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
         """Move a servo: `front` and `horizontal` left, right or reset; `vertical` up, down or reset.
 
-        deg: the angle (0..180) of `front`, instead of an action.
+        `deg` is the angle (0..180) of `front`, instead of an action.
         """
         return self.do(servo_request(servo, action, deg))
 

@@ -54,7 +54,7 @@ def check_key(written: str) -> str:
 def check_car(name: str) -> str:
     """Return the name of one car. Raises BadKey."""
     if name.startswith("@"):
-        raise keys.BadKey(f"{name} is a group, and this takes one car. `fleet.cars()` are the names of all cars.")
+        raise keys.BadKey(f"{name} is a group, and this accepts one car. `fleet.cars()` are the names of all cars.")
     return keys.check_name(name)
 
 

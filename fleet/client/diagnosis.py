@@ -48,7 +48,7 @@ _OUT_OF_RANGE: Final = {
 """The likely cause by field, if its values are always out of range."""
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
-"""Counts in `rejects` of a link that are no rejected frames."""
+"""Counts in `rejects` of a link that are not rejected frames."""
 FAILED_PHASES: Final = (Phase.REJECTED, Phase.FAILED, Phase.EXPIRED)
 """Phases of a command that was not carried out."""
 _CARRIED_OUT: Final = (Phase.SENT, Phase.EFFECT_SEEN, Phase.COMPLETE)
@@ -164,7 +164,7 @@ def _contradicted(e: CarEvidence) -> str:
 
 def _doubted(e: CarEvidence) -> str:
     if e.state.health.doubted:
-        words = "It has shown its stops before, and did not show the last one. Plans leave it alone."
+        words = "It has shown its stops before, but did not show the last one. Plans leave it alone."
         return f"{words} {describe_end_of_doubt(e.state.car)}"
     if e.state.safety.trust == CarTrust.UNPROVEN:
         return "Its reports do not show its last stop yet. Look at the car: it may be moving."
@@ -185,8 +185,8 @@ def _baud(e: CarEvidence) -> str:
     if link.rx_frames > sum(e.rejected.values()):  # a reading came
         return ""
     if link.rejects.get("wrong_baud", 0):
-        return "Bytes arrive, and never a frame. They look like a wrong baud rate: the log has both rates."
-    return "Bytes arrive, and never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
+        return "Bytes arrive, but never a frame. They look like a wrong baud rate: the log has both rates."
+    return "Bytes arrive, but never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
 
 
 def _silent_fan(e: CarEvidence) -> str:
@@ -217,7 +217,7 @@ def _damaged(e: CarEvidence) -> str:
     if _baud(e) or count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
-    return f"{count} of {link.rx_frames} frames were no reading, most of them {worst}: a bad wire or radio."
+    return f"{count} of {link.rx_frames} frames were not readings, most of them {worst}: a bad wire or radio."
 
 
 def _estopped(e: CarEvidence) -> str:
@@ -352,7 +352,7 @@ CHECKS: Final = (
 
 
 def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
-    """Return what is odd, the likeliest cause first. Empty if nothing is. options: what proposed commands need."""
+    """Return what is odd, the likeliest cause first. Empty if nothing is. `options` is what proposed commands need."""
     found = [
         DoctorFinding(
             check.code,

@@ -6,7 +6,7 @@ way it can only have become older, so of several messages the one with the newes
 enough: it may be the last one before a pause of a network or a process.
 
 A gateway that hangs publishes nothing, so nothing is said of its clock. A replay publishes old stamps at the usual
-rate, and is no gateway: whoever asks leaves it out. Pure.
+rate, and is not a gateway: whoever asks leaves it out. Pure.
 """
 
 from collections import deque
@@ -29,7 +29,7 @@ class GatewayClock:
         """Stamp (ns), and how far it was ahead of our clock when it came (s)."""
 
     def take(self, boot_id: str, stamp_ns: int, now_ns: int) -> None:
-        """Take in a state. now_ns: our wall clock when it came."""
+        """Take in a state. `now_ns` is our wall clock when it came."""
         if boot_id != self._boot_id:  # another process, perhaps elsewhere
             self._boot_id = boot_id
             self._leads.clear()

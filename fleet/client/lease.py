@@ -69,7 +69,7 @@ class LeaseMonitor:
 
 
 def _other(sender: str, ours: str) -> str:
-    """Return the name of another sender, also if the same person has it."""
+    """Return the name of another sender, even if it is the same person's."""
     name = keys.name_of(sender)
     return f"another program of {name}" if name == keys.name_of(ours) else name
 

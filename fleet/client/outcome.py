@@ -60,9 +60,9 @@ class Outcome:
     took_s: float = 0.0
     """Time from the request until the outcome was known."""
     basis: str = ""
-    """Of a stop: `shown` if the car's readings show that it stands, `sent` if they cannot.
+    """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot.
 
-    Of a drive: `shown` if a reading shows that the car moved, `sent` if none does.
+    For a drive: `shown` if a reading shows that the car moved, `sent` if none does.
     """
     effect: str = ""
     """The effect of the command in words: `LED color sent`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""

@@ -52,7 +52,7 @@ class Reading:
 
     @classmethod
     def of(cls, key: str, value: Any, time_ns: int) -> Self:
-        """Return the reading of a message. time_ns: its time if it has no stamp, ns since the epoch."""
+        """Return the reading of a message. `time_ns` is its time if it has no stamp, ns since the epoch."""
         stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
         if stamp is not None and stamp.seconds:
             time_ns = messages.stamp_ns(stamp)
@@ -123,7 +123,7 @@ ReadingFilter: TypeAlias = Callable[[Reading], bool | None]
 
 
 def reading_of(sample: Sample) -> Reading:
-    """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is no message of this schema."""
+    """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is not a message of this schema."""
     return Reading.of(sample.key, sample.message(), sample.time_ns)
 
 
@@ -138,7 +138,7 @@ class Watch:
         self.dropped = 0
         """Number of samples dropped from the full queue."""
         self.unreadable = 0
-        """Number of samples that are no message of this schema."""
+        """Number of samples that are not messages of this schema."""
 
     def begin(self, subscribe: Callable[[Callable[[Sample], None]], Callable[[], object]]) -> Self:
         """Subscribe. `subscribe` returns the function that ends the subscription."""

@@ -1,7 +1,7 @@
 """Tells whether a hub with certificates refuses us, which looks as if no car were connected.
 
 The rules of a hub are silent. Whoever was revoked is still linked, and hears and reaches nothing. So we look for
-something that only we can have said: the token of our own client, asked for over a second session. It is no command,
+something that only we can have said: the token of our own client, asked for over a second session. It is not a command,
 and every identity that a rule knows may have and see one.
 """
 
@@ -21,7 +21,7 @@ _TOKEN_POLL_S: Final = 0.1
 
 
 def why_refused(client: Fleet) -> str:
-    """Return why the hub lets this client do nothing. Empty if it does, or if there is no hub with certificates."""
+    """Return why the hub refuses everything to this client. Empty if it does not, or has no certificates."""
     identity = client.bus.identity
     if not identity:
         return ""
@@ -35,7 +35,7 @@ def why_refused(client: Fleet) -> str:
                 return (
                     f"The hub refuses this certificate of {identity}: it was revoked. "
                     "`fleet hub invite` on the hub's computer and `fleet join` here make another one. "
-                    "Cars may be there: who must stop one asks somebody else, or goes to it."
+                    "Cars may be there: to stop one, ask somebody else, or go to it."
                 )
             time.sleep(_TOKEN_POLL_S)
     return ""

@@ -45,7 +45,7 @@ def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
 
 
 def colors_of(status: Any) -> dict[str, Rgb]:
-    """Return the colors of the cars in a fleet.v1.Supervision. Skip what is no color."""
+    """Return the colors of the cars in a fleet.v1.Supervision. Skip what is not a color."""
     colors: dict[str, Rgb] = {}
     for car, color in status.colors.items():
         with suppress(ValueError):  # anybody may answer
@@ -54,6 +54,6 @@ def colors_of(status: Any) -> dict[str, Rgb]:
 
 
 def groups_of(status: Any) -> dict[str, Sequence[str]]:
-    """Return the cars of each group in a fleet.v1.Supervision, by name. Skip what is no name."""
+    """Return the cars of each group in a fleet.v1.Supervision, by name. Skip what is not a name."""
     named = sorted(name for name in status.groups if keys.is_name(name))
     return {name: [*filter(keys.is_name, status.groups[name].split(","))] for name in islice(named, MAX_GROUPS)}

@@ -14,7 +14,7 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class NotInTime(TimeoutError):
-    """The condition did not hold in time. last: the newest reading, if there was one."""
+    """The condition did not hold in time. `last` is the newest reading, if there was one."""
 
     def __init__(self, words: str, last: Reading | None) -> None:
         super().__init__(words)
@@ -35,7 +35,7 @@ class _LastMatch:
 
 
 class ConditionWait:
-    """A wait for one condition. for_s: minimum time for which it must hold, by the readings' stamps."""
+    """A wait for one condition. `for_s` is the minimum time for which it must hold, by the readings' stamps."""
 
     def __init__(self, condition: KeyCondition, for_s: float = 0.0) -> None:
         self._condition = condition

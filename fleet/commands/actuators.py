@@ -52,7 +52,7 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Comman
             raise click.BadParameter(f"{action!r} is not allowed for {words}")
         return servo_request(servo, action)
     if servo is not Servo.FRONT:
-        raise click.BadParameter(f"{action!r} is not allowed: servo {servo} takes no degrees, only front does")
+        raise click.BadParameter(f"{action!r} is not allowed: servo {servo} does not accept degrees, only front does")
     try:
         return servo_request(servo, deg=int(action))
     except ValueError as error:

@@ -76,7 +76,7 @@ def listen_or_fail(port: int | None, other: str) -> socket.socket:
         return listen(port)
     except OSError as error:
         command = other.format(other=port + 1 if port < 65535 else port - 1)
-        raise click.ClickException(f"{_port_in_use(port, error)} `{command}` takes another one.") from None
+        raise click.ClickException(f"{_port_in_use(port, error)} `{command}` uses another port.") from None
 
 
 async def _send_heartbeats(parent: int, address: str) -> None:
@@ -290,7 +290,7 @@ def _open_lan(port: int, people: PeopleFile, listed: People) -> "Lan":
         listener = network.LimitedListener.on_port(port)
     except OSError as error:
         raise click.ClickException(
-            f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` takes a free one."
+            f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` uses a free one."
         ) from None
     try:
         lan: Lan = network.Lan(listener, people, listed)

@@ -49,7 +49,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
     if name is not None and (session := _session_of(name)) is not None:
         _show_session(session, car or "", as_json=as_json)
     if car is not None:
-        raise click.UsageError(f'"{name}" is no session, and a second name needs one: fleet doctor SESSION CAR')
+        raise click.UsageError(f'"{name}" is not a session, and a second name needs one: fleet doctor SESSION CAR')
     named = (name,) if name is not None else ()
     with open_client(connect, fleet, named) as client:
         found = collect(client)
@@ -75,7 +75,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
 
 
 def _session_of(name: str) -> Path | None:
-    """Return the path of a session of this name. None if it is none."""
+    """Return the path of the session with this name, or None if there is no such session."""
     path = SessionPath().convert(name, None, click.get_current_context())
     return path if is_session(path) else None
 

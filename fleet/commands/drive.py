@@ -121,7 +121,7 @@ def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
     """Open the client. A hub that hangs must not read as a stop that was carried out."""
     try:
         return client_in(connect, fleet)
-    except NoFleet:  # nothing is running, which is no fault
+    except NoFleet:  # nothing is running, which is not a fault
         raise
     except LostHub as error:
         raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
@@ -211,7 +211,7 @@ def _in_force(client: Fleet, car: str) -> list[str]:
 
 
 def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
-    """Return the id with this prefix. The gateway rejects an id that is no e-stop of its car."""
+    """Return the id with this prefix. The gateway rejects an id that is not an e-stop of its car."""
     found = [each for each in in_force if each.startswith(prefix)]
     if len(found) > 1 and prefix not in found:
         raise click.UsageError(f"--id {prefix}: several e-stops of {car} begin so: {', '.join(found)}")

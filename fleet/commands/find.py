@@ -180,7 +180,7 @@ def _link(path: Path, hit: "Hit") -> str:
 
 
 def _open_command(path: Path, hit: "Hit") -> str:
-    """Return a command that a person may paste. A name that no car can have is none of it, whoever recorded it."""
+    """Return a command that a person may paste. It leaves out a name that no car can have, whoever recorded it."""
     place = str(path) if not str(path).startswith("-") else f"./{path}"
     car = f" --car {hit.car}" if keys.is_name(hit.car) else ""
     return f"fleet replay {shlex.quote(place)}{car} --from {with_offset(hit.begin_ns)}"

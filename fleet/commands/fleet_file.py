@@ -245,7 +245,7 @@ def _unanswered(error: click.Abort, instead: str) -> click.Abort | click.ClickEx
     if isinstance(error.__context__, KeyboardInterrupt):
         return error
     click.echo()
-    why = "the input has ended" if sys.stdin.isatty() else "stdin is no terminal, and no answer came from it"
+    why = "the input has ended" if sys.stdin.isatty() else "stdin is not a terminal, and no answer came from it"
     other = f", or {instead}" if instead else ""
     return click.ClickException(f"Nothing is written without an answer: {why}. Type the command at a terminal{other}.")
 

@@ -245,8 +245,8 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         endpoint = local_hub.store_joined(name, joined, at, at_port)
         if joined.rules:
             click.echo(
-                f"This computer is the hub of {joined.identity} now, linked to {name}. `fleet up` starts it. Who uses "
-                f"it is invited on {name}, and joins with --at: on this computer, `fleet join {name} CODE --at "
+                f"This computer is the hub of {joined.identity} now, linked to {name}. `fleet up` starts it. Invite "
+                f"its users on {name}, and let them join with --at: on this computer, `fleet join {name} CODE --at "
                 "127.0.0.1`."
             )
             return
@@ -306,7 +306,7 @@ def _cars_on(endpoint: str) -> list[str]:
 def _own_store(endpoint: str) -> HubStore:
     if not is_secure(endpoint) or not (store := HubStore.of(endpoint)).is_hub:
         raise click.ClickException(
-            f"This computer is no hub ({endpoint}). `fleet hub init` makes it one. These commands are for its computer."
+            f"This computer is not a hub ({endpoint}). `fleet hub init` makes it a hub. Only a hub has these commands."
         )
     return store
 

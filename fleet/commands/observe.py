@@ -118,7 +118,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
         if words := describe_clock(row["car"], row["clock_off_s"]):
             click.echo(f"fleet: {words}", err=True)
         for words in row["platform_contradictions"]:
-            click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
+            click.echo(f"fleet: {row['car']} may not be a {row['platform']} car: {words}", err=True)
         if row["doubted"]:
             say(f"fleet: {row['shows_stops_words']}. {describe_end_of_doubt(row['car'])}", err=True)
 

@@ -84,7 +84,7 @@ def with_client(function: _Function) -> _Function:
 def not_running(fleet: str, connect: str | None) -> click.ClickException:
     """Return the error that no supervisor answers. Gateways may run all the same, and their cars may move."""
     if running := describe_running(resolve_endpoint(connect)):
-        words = f"No `fleet up` of {keys.describe_fleet(fleet)} answers, but {running}. Repeat this in some seconds."
+        words = f"No `fleet up` of {keys.describe_fleet(fleet)} answers, but {running}. Repeat this in a few seconds."
         return click.ClickException(f"{words} `fleet list` shows the cars.")
     return click.ClickException(f"{keys.describe_fleet(fleet).capitalize()} is not running. Start it with `fleet up`.")
 

@@ -338,7 +338,7 @@ def no_cars(client: Fleet) -> click.ClickException:
         return click.ClickException(others)
     words = why_refused(client) or "No car is connected."
     if running := describe_running(client.bus.endpoint):  # on their way back to a hub that was restarted
-        words = f"No car is connected, but {running}. Repeat this in some seconds. Else go to the cars."
+        words = f"No car is connected, but {running}. Repeat this in a few seconds. Otherwise go to the cars."
     return click.ClickException(words)
 
 

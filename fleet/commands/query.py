@@ -115,7 +115,7 @@ def _cell(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it, else as text. Times are UTC. A number that is none (NaN, infinite) is None."""
+    """Return a value as JSON has it, else as text. Times are UTC. NaN and infinite numbers are None."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return None
     if isinstance(value, dict):

@@ -350,5 +350,5 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
     found = _query(RecorderVerb.MARK, connect, fleet, text=text, by=by or default_sender(chosen_person()))
     if why := why_unrecorded(found):
-        raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` says whether it is.")
+        raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` tells whether it is.")
     click.echo(f"marked in {found.session}")

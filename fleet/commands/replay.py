@@ -79,7 +79,7 @@ def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
             f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
         )
     if save.exists() and not save.is_file():
-        raise click.UsageError(f"--save {save}: this is no file: name one that ends in .rrd")
+        raise click.UsageError(f"--save {save}: this is not a file: name a file that ends in .rrd")
     for segment in segments:
         if save.exists() and save.samefile(segment):
             raise click.UsageError(f"--save {save}: this is the recording itself: name another file")

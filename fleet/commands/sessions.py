@@ -124,7 +124,7 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     """
     now_s = time.time()
     try:
-        time_spec.is_within(time_text, 0, 0, now_s)  # refuses a wrong time also where no session is
+        time_spec.is_within(time_text, 0, 0, now_s)  # refuses a wrong time even where there is no session
         ran = [one for one in _summaries(directory) if time_spec.is_within(time_text, one.start_ns, one.end_ns, now_s)]
     except ValueError as error:
         raise click.UsageError(str(error)) from None

@@ -213,7 +213,7 @@ def _value_of(node: Node, lookup: Lookup) -> Value | None:
     if value is None:
         return None
     if not isinstance(value, _VALUES) or KINDS.get(type(value)) is not node.kind:
-        raise TypeError(f"{node.name} should be {node.kind}, and is {value!r}")
+        raise TypeError(f"{node.name} should be {node.kind}, but is {value!r}")
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

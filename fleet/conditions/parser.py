@@ -298,7 +298,7 @@ class _Parser:
         return f"there are {', '.join(listed[:_MAX_NAMES_LISTED])}{more}"
 
     def _check_condition(self, token: _Token, node: Node) -> None:
-        """Fail if a node is a number or a word, which is no condition."""
+        """Fail if a node is a number or a word, which is not a condition."""
         kind = kind_of(node)
         if kind is not ValueKind.TRUTH:
             example = f"{node} < 0.3" if kind is ValueKind.NUMBER else f"{node} == 'low'"

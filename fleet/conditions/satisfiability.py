@@ -39,7 +39,7 @@ def is_contradictory(expression: Expression) -> bool:
 def explain_impossible(expression: Expression, of: str = "") -> str:
     """Return why it can never be true by the words and ranges of schemas/topics.py, or an empty text if it can.
 
-    `of`: the last word of the topic, if the names are the fields of one message.
+    `of` is the last word of the topic, if the names are the fields of one message.
     """
     if is_contradictory(expression):
         return f"{expression} is never true"

@@ -34,7 +34,7 @@ COOLDOWN_S: Final = 15.0
 # the burst three times: each command costs every gateway that is asked.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
-"""Commands of one device that ask gateways, at once and per second. A press is one, also if it changes direction."""
+"""Commands of a device that ask gateways, at once and per second. A press counts once, even if it turns."""
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum commands of one device without an outcome. One command may be for many cars."""
 MAX_BUDGETS: Final = 1024

@@ -27,7 +27,7 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
         log.log(level, "%s: %s", sample.key, error)
         return None
     if not is_finite(message):
-        log.log(level, "%s: a number in it is infinite or none", sample.key)
+        log.log(level, "%s: a number in it is infinite or not a number", sample.key)
         return None
     return key, message
 
@@ -38,7 +38,7 @@ def is_shown(name: str) -> bool:
 
 
 def is_finite(message: Any) -> bool:
-    """Return True if all numbers of a message are finite. Others are no JSON, and no page could read its state."""
+    """Return True if all numbers of a message are finite. Others are not JSON, and no page could read its state."""
     return all(_is_finite(value) for _, value in message.ListFields())
 
 

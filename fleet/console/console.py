@@ -371,7 +371,7 @@ class Console:
     ) -> PageLink:
         """Add a page of a person, or of this computer if `person` is None. Raises TooManyPages and BusError.
 
-        device: the id of the device on the network.
+        `device` is the id of the device on the network.
         """
         self._check_room(person, device)
         whose = person or self.person

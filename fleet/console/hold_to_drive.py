@@ -76,10 +76,10 @@ class PressBook:
     ) -> tuple[HeldPress, list[HeldPress]]:
         """Begin a press. It replaces the page's earlier press. Raises PressRefused.
 
-        Return it with the presses of other pages that it ends: a lead takes cars from persons who are none.
+        Return it with the presses of other pages that it ends: a lead takes cars from persons who are not leads.
         An id counts once: a press that is over, or a late message of it, never begins again.
 
-        person: of the page. leads: the persons who are leads, for all of these cars.
+        person: of the page. `leads` are the persons who are leads, for all of these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -146,7 +146,7 @@ class PressBook:
     def drop_cars_of(self, cars: set[str], person: str, leads: Collection[str] = ()) -> list[HeldPress]:
         """End the presses of these cars that a person may end by anything but a stop.
 
-        Those are the person's own, and for a lead of the cars those of persons who are none.
+        Those are the person's own, and for a lead of the cars those of persons who are not leads.
         """
         return self._end(
             lambda press: bool(cars & set(press.cars)) and (press.person == person or _outranks(person, press, leads))

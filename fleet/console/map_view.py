@@ -69,7 +69,7 @@ class MapView:
             case POSE.name:
                 before = self._places.get(car)
                 if before is not None and before.is_true and not before.is_stale(at):
-                    return  # what a simulator knows is no measurement, and better than any
+                    return  # what a simulator knows is not a measurement, and better than any
                 std = message.xy_std_m if message.HasField("xy_std_m") else None
                 frame = message.frame[:_MAX_MAP_NAME_LENGTH] or "map"
                 self._put(car, Place(message.x_m, message.y_m, message.heading_rad, frame, at, std))

@@ -109,7 +109,7 @@ class Lan:
     # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
 
     def __init__(self, listener: LimitedListener, people: PeopleFile, listed: People = NO_PEOPLE) -> None:
-        """Begin. listed: the people of the fleet until its gateways say who they are."""
+        """Begin. `listed` has the people of the fleet until its gateways say who they are."""
         self.listener = listener
         self.people = people
         self.port: int = listener.getsockname()[1]
@@ -241,7 +241,7 @@ class Lan:
 
     @contextmanager
     def connected(self, scope: Scope, close: Callable[[], object], renew: Callable[[], object]) -> Iterator[None]:
-        """Keep a socket in the list of those that revocation closes. renew: lets the page connect again."""
+        """Keep a socket in the list of sockets that a revocation closes. `renew` lets the page connect again."""
         self._last_socket += 1
         number = self._last_socket
         self._connected[number] = scope[DEVICE], scope["client"][0], close, renew
@@ -356,4 +356,4 @@ def show_code(address: str, code: str, person: PagePerson, write: Callable[[str]
         segno.make(pairing_link(address, code)).terminal(picture, compact=True, border=2)
         write(picture.getvalue())
     write(f"To pair a device as {person.name}, scan, or open {address} and type {code_words(code)}")
-    write("The code is good once, for 2 minutes. For another one, type: fleet console pair NAME")
+    write("The code works once, for 2 minutes. For another code, type: fleet console pair NAME")

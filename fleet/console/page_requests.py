@@ -60,7 +60,7 @@ class PageMessage:
         try:
             value.encode()
         except UnicodeEncodeError:  # half of a pair of surrogates
-            raise BadPageMessage(f"{name} has characters that are none") from None
+            raise BadPageMessage(f"{name} has invalid characters") from None
         return value
 
     def number(self, name: str) -> int:

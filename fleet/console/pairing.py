@@ -52,7 +52,7 @@ CookieState = Literal["unknown", "expired", "valid"]
 
 
 class UnknownPerson(ValueError):
-    """The fleet lists its people, and this is none of them. The text says who they are."""
+    """The fleet lists its people, and this person is not among them. The text lists them."""
 
 
 class ClassFull(Exception):
@@ -142,7 +142,7 @@ class PeopleBook:
     """The leads among them, or None if the fleet lists nobody. Then a code may make anybody a lead."""
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
-        """Add a code for a person. Raises UnknownPerson, and ValueError for what is no name or no rank."""
+        """Add a code for a person. Raises UnknownPerson, and ValueError for what is not a name or no rank."""
         self._check(person)
         open_codes = [each for each in self.codes if each.is_open(now)]
         codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
@@ -178,7 +178,7 @@ class PeopleBook:
         return [each for each in self.devices if each.person.is_guest and each.state(now) == "valid"]
 
     def _check(self, person: PagePerson) -> None:
-        """Raise UnknownPerson, or ValueError for what is no name or no rank."""
+        """Raise UnknownPerson, or ValueError for what is not a name or no rank."""
         keys.check_name(person.name, "a person's name")
         if self.people is not None and person.name not in self.people:
             hint = did_you_mean(person.name, self.people) or f"There are: {', '.join(self.people)}."
@@ -188,7 +188,7 @@ class PeopleBook:
             raise ValueError(f"There is no rank {person.rank!r}.")
         if self._ranked(person) != person:
             leads = f"Leads are: {', '.join(self.leads)}." if self.leads else "It has no lead."
-            raise ValueError(f"`people:` in the fleet file makes {person.name} no lead. {leads}")
+            raise ValueError(f"`people:` in the fleet file does not make {person.name} a lead. {leads}")
 
     def _matching(self, code: str, now: float) -> list[PairingCode]:
         wanted = digest(normal_code(code))
@@ -217,7 +217,7 @@ class PeopleBook:
         return replace(self, codes=codes, devices=(*devices, added)[-MAX_DEVICES:])
 
     def _guest_name(self) -> str:
-        """Return a name that is easy to find on a beamer, and that nobody has."""
+        """Return a name that is easy to find on a projector, and that nobody has."""
         taken = {each.person.name for each in self.devices} | set(self.people or ())
         return next(name for number in count(1) if (name := f"{GUEST}-{number}") not in taken)
 

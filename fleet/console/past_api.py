@@ -38,7 +38,7 @@ _TOO_MANY: Final = "Other looks of this person at recordings have no answer yet.
 
 
 class PastApi:
-    """The routes. place: the sessions folder. colors: returns the color of each car."""
+    """The routes. `place` is the sessions folder. colors: returns the color of each car."""
 
     def __init__(self, place: Path, colors: Callable[[], Mapping[str, str]]) -> None:
         self._place = place
@@ -91,13 +91,13 @@ def moment_question(text: str) -> dict[str, Any]:
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError):
-        raise BadPageMessage("this is no JSON") from None
+        raise BadPageMessage("this is not JSON") from None
     if not isinstance(fields, dict):
-        raise BadPageMessage("this is no question")
+        raise BadPageMessage("this is not a question about a moment")
     at_ms, span_s = _number(fields, "at_ms", _MAX_MS), _number(fields, "span_s", MAX_PLOT_S)
     car = fields.get("car") or ""
     if not isinstance(car, str) or (car and not is_name(car)):
-        raise BadPageMessage("car is no car")
+        raise BadPageMessage("`car` is not the name of a car")
     series = series_of(PageMessage({"series": fields.get("series", [])}))
     return {
         "at_ms": int(at_ms),

@@ -85,7 +85,7 @@ def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, 
 def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns: int) -> dict[str, Any]:
     """Return frames, commands, events and states of one car before a moment, as the inspect page shows them.
 
-    messages: its frames and events. known: the newest of everything else.
+    `messages` are its frames and events. `known` is the newest of everything else.
     """
     view, frames = CarView(car, ""), FrameLog()
     view.on_presence(0.0, present=True)
@@ -125,7 +125,7 @@ def samples_of(
 
 
 def lanes_as_dict(lanes: Lanes, end_ns: int) -> dict[str, Any]:
-    """Return lanes and marks as JSON values. end_ns: the end of the recording."""
+    """Return lanes and marks as JSON values. `end_ns` is the end of the recording."""
     marks = sorted(lanes.marks, key=lambda each: each.at_ns)
     spans = (*lanes.since(0), *lanes.silences(end_ns))
     return {

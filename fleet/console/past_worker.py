@@ -1,6 +1,6 @@
 """Reads sessions for the time line, in a process of its own (worker.py). The process runs this module.
 
-It keeps nothing: what a jump needs is read anew, from the chunks around the moment. So memory is flat however long a
+It keeps nothing: what a jump needs is read again, from the chunks around the moment. So memory is flat however long a
 session is, and one that grows or that the quota takes is read as it is.
 """
 

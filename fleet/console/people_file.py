@@ -50,7 +50,7 @@ class PeopleFile:
     def serve(self) -> None:
         """Let others see that a console serves the network with this file, until this process ends. Raises OSError.
 
-        Of two consoles of one fleet, the second one takes the place of the first one: call it again and again.
+        If a fleet has two consoles, the second one takes the place of the first one: call this again and again.
         """
         self._served.try_take()
 

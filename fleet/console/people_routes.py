@@ -31,7 +31,7 @@ def pair_routes(lan: "Lan") -> list[Route]:
     async def pair(request: Request) -> Response:
         code = await read_text(request, _MAX_BODY_BYTES)
         if request.client is None or code is None:
-            return _failure("This is no pairing code.", 400)
+            return _failure("This is not a pairing code.", 400)
         device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
         before = request.cookies.get(lan.cookie, "")
         try:

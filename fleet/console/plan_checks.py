@@ -26,7 +26,7 @@ IDLE_CHECKER_S: Final = 60.0
 
 
 class PlanChecks:
-    """The process that checks plans. file: the fleet file, which may not exist."""
+    """The process that checks plans. `file` is the fleet file, which may not exist."""
 
     def __init__(self, file: Path, idle_s: float = IDLE_CHECKER_S) -> None:
         self._file = file

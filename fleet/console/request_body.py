@@ -12,7 +12,7 @@ BODY_TIMEOUT_S: Final = 10.0
 
 async def read_start(request: Request, size: int) -> bytes:
     """Return the first `size` bytes of the body. The rest is not read. Raises HTTPException if it does not come."""
-    # Half a request that ends is no error of the console. uvicorn would log each with a traceback.
+    # Half a request that ends is not an error of the console. uvicorn would log each with a traceback.
     body = b""
     try:
         async with asyncio.timeout(BODY_TIMEOUT_S):

@@ -1,6 +1,6 @@
 """Decides which requests the console answers, on http and on the WebSocket. A pure ASGI middleware.
 
-Starlette's BaseHTTPMiddleware never sees a WebSocket, so this is none.
+Starlette's BaseHTTPMiddleware never sees a WebSocket, so this class does not use it.
 """
 
 import hmac
@@ -184,7 +184,7 @@ def cookie_value(headers: dict[str, str], name: str) -> str | None:
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """Return the headers by name. Of a repeated header, which no browser sends here, all values must be allowed."""
+    """Return the headers by name. All values of a repeated header, which no browser sends, must be allowed."""
     found: dict[str, str] = {}
     for name, value in scope["headers"]:
         key = name.decode("latin-1")

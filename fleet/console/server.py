@@ -176,7 +176,7 @@ async def serve(
 ) -> None:
     """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive.
 
-    place: the sessions folder. file: the fleet file. lan: what serves the network, too.
+    `place` is the sessions folder. `file` is the fleet file. `lan` is what serves the network, too.
     """
     rate = LogRate()
     for name in _LOGGERS:

@@ -11,7 +11,7 @@ _READ_BYTES: Final = 256 * 1024
 
 
 class NotInFolder(Exception):
-    """The name is none of a session in the folder."""
+    """There is no session with this name in the folder."""
 
 
 def session_path(place: Path, name: str) -> Path:

@@ -222,7 +222,7 @@ def session_row(listed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _moment(text: object) -> dict[str, int | None]:
-    """Return a time as ms since the epoch, with the offset of this computer's zone then, s. None if it is no time."""
+    """Return a time as ms since the epoch, with this computer's offset from UTC then, s. None if it is not a time."""
     try:
         at_s = datetime.fromisoformat(str(text)).timestamp()
         return {"at_ms": round(at_s * 1000), "zone_s": time.localtime(at_s).tm_gmtoff}

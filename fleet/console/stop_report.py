@@ -117,7 +117,7 @@ class StopReport:
         }
 
     def _began_since(self, safety: Any, stamp_ns: int, now: float) -> bool:
-        """Return True if this claim about the motors began after this STOP. An older one is no result of it."""
+        """Return True if this claim about the motors began after this STOP. An older one is not a result of it."""
         if not safety.HasField("trust_since_s"):
             return False
         # By both clocks: a bus that hung hands over old states, and the clock of another computer may be ahead.

@@ -1,6 +1,6 @@
 """The coordinator: a client of the bus with a policy. Samples come in, commands and publications go out.
 
-policy/ takes all decisions, also to leave a car on hold alone; the gateway enforces that once more.
+policy/ makes all decisions, even the decision to leave a car on hold alone. The gateway enforces that as well.
 """
 
 import time
@@ -62,7 +62,7 @@ class Coordinator:
     people: People | None = None
     """The people in the fleet file, who may change the plan. If it is None, the people of the gateways may."""
     run_name: str = ""
-    """Name of its `fleet up` run: in a new run the plan begins anew."""
+    """Name of its `fleet up` run. In a new run, the plan starts from the beginning."""
     sleep: SleepWatch = field(default_factory=lambda: SleepWatch(clock_pair()))
     _memory: PolicyState = field(default_factory=PolicyState)
     _state_file: CoordinatorStateFile | None = None

@@ -81,7 +81,7 @@ class FleetObserver:
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         if (state := self.states.get(car)) is not None:
-            # Whoever comes counts anew: a recording that is played in a loop has its gateways again.
+            # A gateway that comes back counts as new: a recording that is played in a loop has its gateways again.
             readings = {topic: each for topic, each in state.newest_by_topic.items() if topic.startswith("sensor/")}
             self.states[car] = CarState(car, alive, readings)
 

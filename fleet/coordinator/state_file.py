@@ -15,7 +15,7 @@ from schemas.atomic_file import DAMAGE, write_state
 from schemas.state_dir import directory_of
 
 MAX_CLOCK_NOISE_S: Final = 1.0
-"""Maximum change of the start of a phase that is no step of the wall clock."""
+"""Maximum change of the start of a phase that is not a step of the wall clock."""
 
 
 class CoordinatorStateFile:
@@ -32,7 +32,7 @@ class CoordinatorStateFile:
     def load(self) -> PersistedPolicy:
         """Return the persisted state; an empty one if the file cannot be read or belongs to another bus.
 
-        Phase and rules count within one `fleet up` run: in a new run the plan begins anew with the same roles.
+        Phase and rules count within one `fleet up` run. In a new run, the plan starts again with the same roles.
         """
         if self.path is None:
             return PersistedPolicy()

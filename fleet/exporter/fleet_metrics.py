@@ -80,7 +80,7 @@ class FleetMetrics:
                     yield of_recorder, labels, value
 
     def _on_event(self, car: str, sample: Sample) -> None:
-        if car not in self.observer.states:  # anybody may publish for a car that is none
+        if car not in self.observer.states:  # anybody may publish for a name that is not a car
             return
         event = _parsed(EVENTS, sample)
         record = ("", "", "") if event is None else (car, event.id, event.phase)
@@ -96,7 +96,7 @@ class FleetMetrics:
 
 
 def _parsed(topic: str, sample: Sample) -> Any:
-    """Return the message of a sample, None if it is none of this version."""
+    """Return the message of a sample, or None if this version does not know it."""
     try:
         return messages.parse(topics.TOPICS[topic].message, sample.payload, sample.encoding)
     except messages.BadPayload:

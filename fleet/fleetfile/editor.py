@@ -1,7 +1,7 @@
 """Writes a link into the text of a fleet file; everything else, comments too, stays as it is. Pure.
 
-The editor inserts into the text at YAML marks and never dumps it anew. It parses the result and refuses it if anything
-but the link has changed.
+The editor inserts into the text at YAML marks, and never writes all of the YAML again. It parses the result and
+refuses it if anything but the link has changed.
 """
 
 from dataclasses import replace

@@ -24,7 +24,7 @@ _SERVER: Final = ExtendedKeyUsageOID.SERVER_AUTH
 
 
 class BadRequestForCertificate(ValueError):
-    """A request for a certificate that is none, or is not signed with its own key."""
+    """A text that is not a request for a certificate, or is not signed with its own key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime, a
     try:
         asked = x509.load_pem_x509_csr(request)
     except ValueError:
-        raise BadRequestForCertificate("it is no request for a certificate") from None
+        raise BadRequestForCertificate("it is not a request for a certificate") from None
     key = asked.public_key()
     if not asked.is_signature_valid or not isinstance(key, ec.EllipticCurvePublicKey):
         raise BadRequestForCertificate("the request is not signed with its own key, or the key is not on a curve")
@@ -73,7 +73,7 @@ def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime, a
     try:
         return _signed(authority, key, name, now, usages, names)
     except ValueError:
-        raise BadRequestForCertificate("these are no names of a computer") from None
+        raise BadRequestForCertificate("these are not names of a computer") from None
 
 
 def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str] = ()) -> KeyPair:
@@ -108,7 +108,7 @@ def renew(authority: KeyPair, certificate: bytes, request: bytes, name: str, now
 
 
 def is_due(certificate: bytes, now: datetime, addresses: Iterable[str] = ()) -> bool:
-    """Return True if a certificate must be renewed: it ends soon, lacks an address, or is none."""
+    """Return True if a certificate must be renewed: it ends soon, lacks an address, or is not a certificate."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
     except ValueError:
@@ -127,17 +127,17 @@ def _names(certificate: x509.Certificate) -> set[str]:
 
 
 def names_of(certificate: bytes) -> list[str]:
-    """Return the IP addresses and host names of a certificate. Raises ValueError if it is none."""
+    """Return the IP addresses and host names of a certificate. Raises ValueError if it is not one."""
     return sorted(_names(x509.load_pem_x509_certificate(certificate)))
 
 
 def expires(certificate: bytes) -> datetime:
-    """Return when a certificate ends. Raises ValueError if it is none."""
+    """Return when a certificate ends. Raises ValueError if it is not one."""
     return x509.load_pem_x509_certificate(certificate).not_valid_after_utc
 
 
 def belong(certificate: bytes, key: bytes) -> bool:
-    """Return True if a private key is that of a certificate. False if one of them is none."""
+    """Return True if a private key is that of a certificate. False if one of them is not valid."""
     try:
         found: Any = serialization.load_pem_private_key(key, None)
         public = x509.load_pem_x509_certificate(certificate).public_key()
@@ -155,7 +155,7 @@ def only_certificate(text: bytes) -> bytes:
 
 
 def fingerprint(certificate: bytes) -> bytes:
-    """Return the SHA-256 of a certificate. Raises ValueError if it is none."""
+    """Return the SHA-256 of a certificate. Raises ValueError if it is not one."""
     return hashlib.sha256(x509.load_pem_x509_certificate(certificate).public_bytes(serialization.Encoding.DER)).digest()
 
 

@@ -73,5 +73,5 @@ def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterato
 
 
 def _instance(code: JoinCode) -> str:
-    """Return the name of an announcement. The begin of the authority's fingerprint is no secret."""
+    """Return the name of an announcement. The beginning of the authority's fingerprint is not a secret."""
     return f"hub-{code.pin[:8].lower()}"

@@ -81,7 +81,7 @@ class HubStore:
             pass
         except (OSError, ValueError, TypeError, AttributeError) as error:
             raise BrokenHub(
-                f"{path} is damaged: {error}. Restore it from a copy, or begin anew: move {self.directory} away, "
+                f"{path} is damaged: {error}. Restore it from a copy, or start again: move {self.directory} away, "
                 "`fleet hub init`, and let everyone join again."
             ) from None
 
@@ -123,7 +123,7 @@ class HubStore:
         """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
 
         `addresses` are IP addresses and names under which others reach the hub. `listens` are its endpoints, if new.
-        take: more identities, also if another computer has their certificate, which is worthless then.
+        `take` has more identities. If another computer has their certificate, it becomes worthless.
         Raises OSError, BrokenHub.
         """
         now = datetime.now(UTC) if now is None else now
@@ -163,7 +163,7 @@ class HubStore:
     def sign(self, request: bytes, identity: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
         """Return the certificate of a reserved identity, PEM. addresses: of the computer, if it is to be a hub.
 
-        Raises BadRequestForCertificate, also if the identity was revoked or invited again meanwhile, and OSError.
+        Raises BadRequestForCertificate (even if the identity was revoked or invited again meanwhile) and OSError.
         """
         reserved = self.known[identity]
         with self._changing():
@@ -180,7 +180,7 @@ class HubStore:
     def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
         """Return the next certificate of an identity, PEM, for the key that it has. See `certificate_authority.renew`.
 
-        Raises BadRequestForCertificate, also if the identity is revoked, and OSError.
+        Raises BadRequestForCertificate (even if the identity is revoked) and OSError.
         """
         with self._changing():
             entry = self.known.get(identity)

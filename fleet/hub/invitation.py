@@ -29,7 +29,7 @@ from schemas.printable import printable
 JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
 _MAX_DISCARDED_BYTES: Final = 4 * MAX_JOIN_REQUEST_BYTES
-"""Of a request that is too long: more of it is left unread, and the answer may be lost then."""
+"""Maximum size of a request that is read although it is too long. With more unread, the answer may be lost."""
 MAX_HUB_NAMES: Final = 32
 SOCKET_TIMEOUT_S: Final = 10.0
 """Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
@@ -140,7 +140,7 @@ class Invitation:
             timeout = SOCKET_TIMEOUT_S
 
             def do_GET(self) -> None:
-                """Return the certificate of the authority, which is no secret."""
+                """Return the certificate of the authority, which is not a secret."""
                 self._send(200, {"ca": invitation._ca.decode()})
 
             def do_POST(self) -> None:
@@ -155,7 +155,7 @@ class Invitation:
                     guess, request = str(asked["secret"]), base64.b64decode(asked["request"], validate=True)
                     addresses = [str(each) for each in list(asked.get("addresses", ()))[:MAX_HUB_NAMES]]
                 except (ValueError, KeyError, TypeError):
-                    self._send(400, {"error": "it is no request to join"})
+                    self._send(400, {"error": "it is not a request to join"})
                     return
                 self._send(*invitation._take(guess, request, addresses, str(self.client_address[0])))
 
@@ -251,6 +251,6 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
     except (OSError, http.client.HTTPException) as error:
         raise NotThisHub(f"{where} does not answer: {error}. `fleet hub invite NAME` must run there now.") from None
     except (ValueError, KeyError, TypeError):
-        raise NotJoined(f"{where} is no hub: its answer is not understood") from None
+        raise NotJoined(f"{where} is not a hub: its answer is not understood") from None
     finally:
         connection.close()

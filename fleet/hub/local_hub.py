@@ -22,7 +22,7 @@ from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Where the programs of the hub's own computer find it."""
 SOMEBODY: Final = "operator"
-"""The name of a user whose login is no name of a person."""
+"""The name of a user whose login is not a name of a person."""
 
 
 def local_person() -> str:
@@ -74,7 +74,7 @@ def use(endpoint: str) -> None:
 def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:
     """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined.
 
-    A computer may join once more, for a car or a service: its user stays the person who has joined. site: the address
+    A computer may join again, for a car or a service. Its user stays the person who joined first. `site` is the address
     of the hub that it uses, if that is not the one it has joined at; site_port: its port, if it is another one.
     """
     first = f"tls/{host}:{joined.port}"

@@ -36,7 +36,7 @@ def main() -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     except (ValueError, KeyError, TypeError):
-        sys.stderr.write("it is no request for a certificate\n")
+        sys.stderr.write("it is not a request for a certificate\n")
         return 1
     return 0
 

@@ -36,7 +36,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 def builder(
     subject: x509.Name, issuer: x509.Name, key: Any, now: datetime, lifetime: timedelta = LIFETIME
 ) -> x509.CertificateBuilder:
-    """Return the begin of a certificate of a public key."""
+    """Return the beginning of a certificate for a public key."""
     return (
         x509.CertificateBuilder()
         .subject_name(subject)

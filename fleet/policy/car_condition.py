@@ -24,7 +24,7 @@ _STALE_NS: Final = {
 
 
 def parse_condition(text: str) -> Expression:
-    """Return a condition over the names of plans. Raises BadExpression, also if it can never be true."""
+    """Return a condition over the names of plans. Raises BadExpression if it is wrong, or can never be true."""
     expression = parse(text, NAMES, ALIASES, FUNCTIONS)
     if never := explain_impossible(expression):
         raise BadExpression(text, 1, never)

@@ -126,7 +126,7 @@ def is_reworded(decision: Decision, before: Mapping[str, Decision]) -> bool:
 def explain_role(
     car: str, held_role: HeldRole, candidates: Candidates, allocation: RoleAllocation, phase: str, last: Decision | None
 ) -> Decision:
-    """Explain a mode that a role gives the car. `last`: its last decision in this phase, reused if unchanged."""
+    """Explain a mode that a role gives the car. `last` is its last decision in this phase, reused if unchanged."""
     plan, name = candidates.plan, held_role.role
     role = plan.roles[name]
     pinned = candidates.pinned.get(car)
@@ -305,7 +305,7 @@ def explain_inactive(name: str, candidates: Candidates, phase: str) -> Decision:
 
 
 def explain_origin(car: str, name: str, candidates: Candidates, before: str | None, lost: str) -> HeldRole:
-    """Explain how this car got this role. `before`: the car that lost it, `lost`: the reason."""
+    """Explain how this car got this role. `before` is the car that lost it, `lost`: the reason."""
     role = candidates.plan.roles[name]
     used = candidates.snapshot.used(role.needs, car, candidates.now) if role.needs is not None else ()
     if before is not None:

@@ -54,7 +54,7 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
     match request:
         case PlanRequest.RESTART:
             begins = f" with phase {plan.first}" if plan.first else ""
-            return PolicyState(started_at=memory.started_at), f"plan {plan.version} begins anew{begins}"
+            return PolicyState(started_at=memory.started_at), f"plan {plan.version} starts again{begins}"
         case PlanRequest.NEXT:
             name = _next_phase(plan, memory)
             phase = PhaseState(name, now, why=f"{keys.name_of(by)} went on to it from {memory.phase.name}")

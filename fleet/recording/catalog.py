@@ -48,7 +48,7 @@ _PERSON_OF: Final = (
 )
 """`schemas.keys.name_of` for questions: the person of a sender, without the host and the process."""
 MAX_QUERY_ATTEMPTS: Final = 4
-"""Each attempt looks for the sessions anew: the quota deletes them, and those that grow have other tables then."""
+"""Each attempt looks for the sessions again: the quota deletes some, and those that grow have other tables by then."""
 _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
 
 
@@ -308,7 +308,7 @@ def _empty(topic: Topic) -> "pa.Table":
 
 
 def _column(name: str, kind: str, there: str | None) -> str:
-    """Return the expression of a column of ours. there: its type in the files, or None if they lack it."""
+    """Return the expression of a column of ours. `there` is its type in the files, or None if they lack it."""
     quoted = _quoted(name)
     if there is None:
         return f"NULL::{kind} AS {quoted}"

@@ -39,7 +39,7 @@ class Pin:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self | None:
-        """Return the pin of JSON values, or None if they are none."""
+        """Return the pin in these JSON values, or None if they are not a pin."""
         try:
             begin_ns, end_ns = iso_ns(values["from"]), iso_ns(values["to"])
             cars = tuple(str(car) for car in values.get("cars", ()))
@@ -92,7 +92,7 @@ def _merge(old: Pin, new: Pin) -> Pin:
 
 
 def pins_of(pins: Iterable[Mapping[str, Any]], marks: Iterable[Mapping[str, Any]]) -> list[Pin]:
-    """Return the pins of a session and those of its marks, sorted by time. What is no pin is left out."""
+    """Return the pins of a session and those of its marks, sorted by time. What is not a pin is left out."""
     found = [pin for values in pins if (pin := Pin.from_dict(values)) is not None]
     for mark in marks:
         try:

@@ -128,7 +128,7 @@ class SequenceTracker:
             del self._early[next(iter(self._early))]
 
     def _begin(self, sender: Hashable, number: int) -> None:
-        """Add a sender. Messages before its first number precede this recording, and are no gap."""
+        """Add a sender. Messages before its first number precede this recording, and are not a gap."""
         if len(self.last) >= MAX_TRACKED_SOURCES:
             oldest = next(iter(self.last))
             self._forget(oldest)

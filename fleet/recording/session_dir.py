@@ -34,7 +34,7 @@ INDEX_FILE: Final = "index.json"
 SPARE_FILE: Final = "session.json.spare"
 REMOVED_FILE: Final = "removed.json"
 TABLES_PREFIX: Final = ".tables-"
-"""Begin of the names of directories with tables for questions (table_cache.py)."""
+"""Beginning of the names of directories with tables for questions (table_cache.py)."""
 SPARE_BYTES: Final = 256 * 1024
 """Reserved space: enough for the drops by key of 100 cars. Copy-on-write file systems (btrfs) may not honor it."""
 FLEET_FILE: Final = "fleet.yaml"
@@ -70,7 +70,7 @@ class SessionInfo:
     drops: Mapping[str, int] = field(default_factory=dict)
     missed: Mapping[str, int] = field(default_factory=dict)
     error: str = ""
-    """Last error, also if the recording continued."""
+    """Last error, even if the recording continued."""
     recovered: Mapping[str, int] = field(default_factory=dict)
     """Backfilled messages by key. They lie in the file later than their sequence numbers."""
     continues: str = ""
@@ -121,7 +121,7 @@ class SessionInfo:
 
 
 def gone_of(info: SessionInfo) -> list[Mapping[str, Any]]:
-    """Return the segments that the quota has taken from a session. Entries that are none are left out."""
+    """Return the segments that the quota has taken from a session. Invalid entries are left out."""
     wanted = {"file": str, "from": str, "to": str}
     return [each for each in info.gone if all(isinstance(each.get(name), kind) for name, kind in wanted.items())]
 
@@ -134,7 +134,7 @@ def gone_messages(info: SessionInfo) -> int | None:
 
 
 def add_gone(directory: Path, gone: Sequence[Mapping[str, Any]]) -> None:
-    """List segments that the quota takes in `session.json`. Raises OSError, also if that cannot be read."""
+    """List segments that the quota takes in `session.json`. Raises OSError, even if the file cannot be read."""
     path = directory / SESSION_FILE
     values = read_json(path)
     if not _is_valid(values):

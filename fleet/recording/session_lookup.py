@@ -55,9 +55,9 @@ def _begun(info: SessionInfo | None, path: Path) -> tuple[str, float]:
 
 
 def find_session(session: str | os.PathLike[str], place: Path | None = None) -> Path:
-    """Return the path that a name means, also if nothing is there. Raises NoLatest.
+    """Return the path that a name means, even if nothing is there. Raises NoLatest.
 
-    place: the directory of sessions.
+    `place` is the directory of sessions.
     """
     path = Path(session)
     # `os.path.exists` is false for a path that is too long or may not be read. The reader then says why.

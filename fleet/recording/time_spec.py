@@ -20,7 +20,7 @@ _NUMBER: Final = re.compile(r"-?\d+([.,]\d+)?")
 
 
 def at_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> int:
-    """Return a time in ns since the epoch: the begin of `span_ns`."""
+    """Return a time in ns since the epoch: the beginning of `span_ns`."""
     return span_ns(text, start_ns, end_ns, now_s)[0]
 
 
@@ -29,7 +29,7 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
 
     A time of day and a date without a zone are local. A time of day without a day is that of the session. Raises
     ValueError with the syntax and the range of the session, or with the days if the time of day is on several.
-    now_s: the wall clock.
+    `now_s` is the wall clock.
     """
     try:
         return _span_ns(text, start_ns, end_ns, now_s)
@@ -55,7 +55,7 @@ def _span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, 
 
 
 def _days_before(day: str, now_s: float) -> int | None:
-    """Return how many days ago a named day was: 0 for today, 0 to 6 for a weekday. None if it is no name of a day."""
+    """Return how many days ago a named day was: 0 for today, 0 to 6 for a weekday. None for another text."""
     if day in _WEEKDAYS:
         return (datetime.fromisoformat(date(now_s)).weekday() - _WEEKDAYS.index(day)) % len(_WEEKDAYS)
     return _DAYS.get(day)
@@ -84,7 +84,7 @@ def past_ns(text: str, now_s: float) -> int:
     """Return a time in the past as a person types it: a duration ago (`5m` or `-5m`), a local time, or a date.
 
     The result is in ns since the epoch. A time of day without a day is the last one that has passed. Raises ValueError
-    with the syntax, also for a time that is not over. now_s: the wall clock.
+    with the syntax, also for a time that is not over. `now_s` is the wall clock.
     """
     if _NUMBER.fullmatch(text):  # 18.21 may be meant for 18:21
         raise ValueError(f"{text} has no unit: write {text}s for that many seconds ago, or a time such as 14:05.")
@@ -149,7 +149,7 @@ def iso(ns: int) -> str:
 
 
 def iso_ns(text: str) -> int:
-    """Return a stored time (ISO 8601), ns since the epoch. Raises ValueError, OverflowError if it is none."""
+    """Return a stored time (ISO 8601), ns since the epoch. Raises ValueError, OverflowError if it is not one."""
     when = datetime.fromisoformat(text)
     return int(when.replace(microsecond=0).timestamp()) * _NS + when.microsecond * 1000
 

@@ -100,7 +100,7 @@ COMMAND_TOPIC: Final = "event/command"
 ASSIGNMENT: Final = "@coordinator/assignment"
 PLAN_TOPIC: Final = "@coordinator/plan"
 ON_CHANGE_TOPICS: Final = (PLAN_TOPIC, ASSIGNMENT)
-"""Topics that are published only on change. Who begins to look asks for the last message."""
+"""Topics that are published only on change. A viewer that starts asks for the last message."""
 
 DISTANCE: Final = Curve("sensor/range", "range_m!", f"distance ({_unit('sensor/range', 'range_m')})")
 BATTERY: Final = Curve("sensor/battery", "voltage_v", f"battery ({_unit('sensor/battery', 'voltage_v')})")

@@ -80,7 +80,7 @@ class CarStatus:
                 return ""
 
     def reset(self, running: str = "") -> None:
-        """Note that the car's gateway has ended. running: the boot_id of the next one, if it is known."""
+        """Note that the car's gateway has ended. `running` is the boot_id of the next one, if it is known."""
         self.state.on_gateway_end(running)
         self.rate_hz = self._counted = None
         self._reported.clear()
@@ -93,7 +93,7 @@ class CarStatus:
             self._counted = (now, frames)
 
     def _change(self, what: str, words: str) -> str:
-        """Return the words if they are news. A growing time is no news, nor are normal values in the first message."""
+        """Return the words if they are news. A growing time is not news, nor are normal values in the first message."""
         essence = _SECONDS.sub("", words)
         before, self._reported[what] = self._reported.get(what), essence
         return "" if essence == before or (before is None and words in _AT_FIRST) else words
@@ -154,7 +154,7 @@ def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str
 def describe_old_stops(car: str, safety: Any, began_s: float) -> str:
     """Describe a hold and e-stops older than `began_s` (s since the epoch). Return an empty string if there are none.
 
-    safety: a fleet.v1.Safety.
+    `safety` is a fleet.v1.Safety.
     """
     estops = [each for each in safety.estops if each.stamp.ToDatetime(UTC).timestamp() < began_s]
     held = safety.HasField("hold") and safety.hold.since.ToDatetime(UTC).timestamp() < began_s

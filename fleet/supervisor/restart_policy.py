@@ -1,6 +1,6 @@
 """Decides when a process is started, killed as hung, and restarted. Pure: time is an argument.
 
-A car that is switched off is no failure: its gateway runs, sends heartbeats, and retries the link by itself.
+A car that is switched off is not a failure: its gateway runs, sends heartbeats, and retries the link by itself.
 """
 
 from dataclasses import dataclass, field
@@ -95,7 +95,7 @@ class ProcessState:
     def turn(self, now: float, listening_since: float | None, leave_s: float = 0.0) -> RestartAction:
         """Return the next action.
 
-        listening_since: start of uninterrupted reception of heartbeats, None if there is no reception now.
+        `listening_since` is the start of uninterrupted reception of heartbeats, None if there is no reception now.
         leave_s: allowed silence (from `hang`), if it is longer than the patience.
         """
         if self.state in (RunState.WAITING, RunState.REFUSED) and now >= self.due:
@@ -124,7 +124,7 @@ class ProcessState:
         return first
 
     def on_exit(self, code: int, why: str, now: float, chance: float) -> None:
-        """Note the exit code (negative: the signal). why: the process's last error line. chance: see `delay_s`."""
+        """Note the exit code (negative: the signal). `why` is the process's last error line. chance: see `delay_s`."""
         if self.state is RunState.ENDING:
             self._set(RunState.WAITING if self._again else RunState.ENDED, now)
             self.due = now

@@ -95,7 +95,7 @@ class SupervisorService:
             try:
                 value = sample.message()
             except (messages.BadPayload, KeyError):
-                return  # a publisher that is no program of this fleet
+                return  # a publisher that is not a program of this fleet
             if key is not None:
                 on_message(key.car, key.topic, value)
 

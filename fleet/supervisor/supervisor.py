@@ -442,7 +442,7 @@ class Supervisor:
         elif car == COORDINATOR:
             self._on_plan(value)
         elif row is not None and topic == "state/health":
-            # A late message of an earlier process is no heartbeat of its successor.
+            # A late message of an earlier process is not a heartbeat of its successor.
             if self.processes.on_heartbeat(car, value.pid):
                 row.reset(value.boot_id)
         elif row is not None:

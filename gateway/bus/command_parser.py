@@ -76,7 +76,7 @@ def parse(
     verb = request.verb
     blank = Command(_id(request, now_ns), verb, Sender(), Stop(), asked_ns=now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
-        words = f"{verb!r} is no command. Commands: {', '.join(COMMANDS)}"
+        words = f"{verb!r} is not a command. Commands: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
     if request.by_wildcard and verb not in WILDCARD_VERBS:
         words = f"{verb} takes no wildcard: name one car (only {', '.join(WILDCARD_VERBS)} take one)"

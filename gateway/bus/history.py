@@ -55,7 +55,7 @@ class Bound:
         """Return how long the bound is before a value, ns.
 
         A date is compared with the stamp, which is what a reader has seen. An age is counted by the monotonic clock, so
-        that it holds also if the wall clock was set meanwhile.
+        that it holds even if the wall clock was set meanwhile.
         """
         return (round((value.at - now) * 1e9) if self.from_now else value.stamp_ns) - self.ns
 

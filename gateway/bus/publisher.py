@@ -77,7 +77,7 @@ class CarPublisher:
         """When the bus was last unreachable."""
         self._pending: deque[tuple[bus.Publisher, Any, int]] = deque()
         self.dropped = 0
-        """Number of dropped records, and of poses that are none."""
+        """Number of dropped records, and of payloads that are not poses."""
 
     # ------------------------------------------------------------------ readings
 
@@ -117,7 +117,7 @@ class CarPublisher:
     def keep_pose(self, sample: bus.Sample, now: float) -> None:
         """Keep a pose that a program outside of the car has published, so that queries are answered with it.
 
-        One that is no pose, or has a number that is none, is dropped: it came from no program of ours.
+        A payload that is not a pose, or has no finite numbers, is dropped, because no program of ours sent it.
         """
         name = "sensor/pose"
         if sample.deleted or sample.unread:

@@ -25,7 +25,7 @@ class Pending:
 
 
 class CommandLog:
-    """Records each transition. Of a stream it records the start, the end, and the first rejection of each reason."""
+    """Records each transition. For a stream, it records start, end, and the first rejection for each reason."""
 
     def __init__(self) -> None:
         self._records: list[Record] = []
@@ -69,7 +69,7 @@ class CommandLog:
             self.record(pending, Phase.SENT, now, reason=reason, words=words)
 
     def record_rejection(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
-        """Record a rejection. Of a stream record only the first of each reason."""
+        """Record a rejection. For a stream, record only the first rejection for each reason."""
         sender = pending.command.sender.name
         if pending.command.streamed:
             if self._rejected.get(sender) is reason:

@@ -36,7 +36,7 @@ class HeldMotion:
 
     @property
     def ends_at(self) -> float:
-        """Return the latest time that it ends, also if it still waits for the car."""
+        """Return the latest time at which it ends, even if it still waits for the car."""
         return self.expires_at + (self.duration_s if self.began_at is None else 0.0)
 
     def begin(self, now: float, range_cm: float | None) -> None:

@@ -64,7 +64,7 @@ class Controller(Generic[D_co]):
         now: float = 0.0,
         now_ns: int = 0,
     ) -> None:
-        """Take over the state from before a restart. `now_ns`: the wall clock at `now`."""
+        """Take over the state from before a restart. `now_ns` is the wall clock at `now`."""
         self.car = car
         self.people = people
         self.safety = Safety.restore(persisted or PersistedSafety(), now, now_ns)
@@ -565,7 +565,7 @@ class Controller(Generic[D_co]):
     # ------------------------------------------------------------------ answers
 
     def _done(self, pending: Pending, words: str, now: float, reason: Reason | None = None) -> Answer:
-        """Answer what needed no frame. reason: why the car is still not usable."""
+        """Answer what needed no frame. `reason` is why the car is still not usable."""
         if not pending.command.streamed:
             self._log.record_sent(pending, now, words, reason)
         return Answer(Phase.SENT, reason, words)

@@ -84,7 +84,7 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A whole line of text between frames with its line end, such as a debug print. It is no damage.
+    """A whole line of text between frames with its line end, such as a debug print. It is not damage.
 
     `at` is the time of the last byte of the junk that it came with.
     """
@@ -404,7 +404,7 @@ class Driver(ABC):
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
+        """Return how long a mode would wait for its frame at most, s. `busy_s` is the wait of a motion."""
         del now
         return busy_s
 

@@ -51,7 +51,7 @@ class Safety:
 
     @classmethod
     def restore(cls, persisted: PersistedSafety, now: float = 0.0, now_ns: int = 0) -> "Safety":
-        """Return the state from before a restart. `now_ns`: the wall clock at `now`."""
+        """Return the state from before a restart. `now_ns` is the wall clock at `now`."""
         loan = persisted.loan
         return cls(
             persisted.hold,

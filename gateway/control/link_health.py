@@ -55,7 +55,7 @@ class LinkHealth:
         self.last_reading_at = at
 
     def on_rejected(self, cause: str, count: int = 1) -> None:
-        """Count received bytes that are no reading."""
+        """Count received bytes that are not readings."""
         self.rejects[cause] = self.rejects.get(cause, 0) + count
 
     def on_written(self, count: int, now: float) -> None:

@@ -102,7 +102,7 @@ TABLE: Final[dict[type[Action], Needs]] = {
     SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is no `PartAction`. Who may end which e-stop and hold: `_resume`."""
+"""Needs of each action that is not a `PartAction`. Who may end which e-stop and hold: `_resume`."""
 
 Refusal = tuple[Reason, str]
 
@@ -139,7 +139,7 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
 
 
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
-    """Return why the time of the command is no time of now, or None if it is, or if the command has no time."""
+    """Return why the command's time is too far from now, or None if it is near, or if the command has no time."""
     age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
     if age_s is None:
         if context.now < context.slept_at + AFTER_SLEEP_S:

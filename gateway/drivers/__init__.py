@@ -42,7 +42,7 @@ class Family(Protocol):
         """Return the profile of each platform that is known, with all parts that such a car may have."""
 
     def driver_of(self, name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
-        """Return the driver of a car. `kept`: what `Driver.kept` has returned, empty if nothing was kept."""
+        """Return the driver of a car. `kept` is what `Driver.kept` has returned, empty if nothing was kept."""
 
 
 def check_platform(text: str) -> str:

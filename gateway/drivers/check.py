@@ -175,10 +175,10 @@ def check_profile(family: Family, platform: str) -> Iterator[str]:
     topics = {each.removeprefix("sensor/") for each in TOPICS if each.startswith("sensor/")}
     for mode in profile.modes:
         if unknown := profile.measurable(mode) - topics:
-            yield f"it measures {', '.join(sorted(unknown))}, which are no topics"
+            yield f"it measures {', '.join(sorted(unknown))}, which are not topics"
     for word in CAPABILITIES:
         if word not in profile.capabilities and not profile.why_lacking(word):
-            yield f"why_lacking({word!r}) says nothing, and it is no capability"
+            yield f"why_lacking({word!r}) says nothing, and it is not a capability"
 
 
 def check_bytes(family: Family, platform: str) -> Iterator[str]:
@@ -214,7 +214,7 @@ def check_connect(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_motions(family: Family, platform: str) -> Iterator[str]:
-    """Check that there is a frame for each motion at each speed, and that a stop is none of them."""
+    """Check that there is a frame for each motion at each speed, and that a stop is not among them."""
     driver = _connected(family, platform).control.driver
     if not isinstance(driver, PlainDriver):
         return  # its frames are its own; `check_drive` sees what it writes
@@ -270,7 +270,7 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
             yield f"nothing is measured in {sample!r}"
         for topic, fields in found:
             if topic not in TOPICS:
-                yield f"{topic} is no topic"
+                yield f"{topic} is not a topic"
                 continue
             known = messages.message_class(TOPICS[topic].message).DESCRIPTOR.fields_by_name
             for name in fields.keys() - known.keys():

@@ -454,7 +454,7 @@ class PlainDriver(Driver):
             return None
         pending, held = self.queue.one_shots[0], self.queue.held
         data = pending.frames[0]
-        if isinstance(pending.command.what, ChangeSpeed):  # the motion of now: that of its arrival may be over
+        if isinstance(pending.command.what, ChangeSpeed):  # the motion at its arrival may be over
             is_driven = held is not None and held.pending.sent and self._stop is None
             data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
         return self._write(data, FrameOrigin.COMMAND, pending)
@@ -553,7 +553,7 @@ class PlainDriver(Driver):
                 return None
 
     def frames(self, what: Action) -> tuple[bytes, ...]:
-        """Return the frames of an action on a part of the car. One that is no frame still takes its turn."""
+        """Return the frames of an action on a part of the car. One that is not a frame still takes its turn."""
         if isinstance(what, ChangeSpeed):
             return (self.motion_frame(Motion.STOP),)  # its place; what is written is the motion of that moment
         return self.part_frames(what) or ()

@@ -26,7 +26,7 @@ _RUNS: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class BaudDoubt:
-    """Why the baud rate may be wrong. `cause`: how it is counted, `wrong_baud` or `no_frames`."""
+    """Why the baud rate may be wrong. `cause` is how it is counted, `wrong_baud` or `no_frames`."""
 
     cause: str
     words: str
@@ -60,7 +60,7 @@ class BaudWatch:
         self._counts = None
 
     def _words(self, total: int, *, looks_so: bool) -> str:
-        fact = f"{total} bytes came, and never a frame"
+        fact = f"{total} bytes came, but never a frame"
         if looks_so:
             fact += ": they look like a wrong baud rate"
         return f"{fact}. {self._url.doubt_baud()}"

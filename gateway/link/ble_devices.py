@@ -24,7 +24,7 @@ BLE_START_TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class BleDevice(Device):
-    """An advertising Bluetooth LE device. `uart`: its UART service, which cars' modules have."""
+    """An advertising Bluetooth LE device. `uart` is its UART service, which cars' modules have."""
 
     address: str
     url: str

@@ -6,7 +6,7 @@ class LinkError(Exception):
 
 
 class BadUrl(LinkError):
-    """A URL that is no link: wrong use."""
+    """A URL that is not a link: wrong use."""
 
 
 class CannotOpen(LinkError):

@@ -17,7 +17,7 @@ BY_ID: Final = Path("/dev/serial/by-id")
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this computer. `url`: its most stable URL. vid and pid: four hexadecimal digits."""
+    """A serial port of this computer. `url` is its most stable URL. vid and pid: four hexadecimal digits."""
 
     device: str
     url: str
@@ -42,7 +42,7 @@ def by_id(directory: Path) -> dict[str, str]:
 
 
 def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> list[SerialPort]:
-    """Return pyserial's ports, each with its most stable URL. `lasting`: the result of `by_id`."""
+    """Return pyserial's ports, each with its most stable URL. `lasting` is the result of `by_id`."""
     ports = sorted(found)
     same = Counter((port.vid, port.serial_number) for port in ports)
     result = []

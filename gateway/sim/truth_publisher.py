@@ -149,7 +149,7 @@ class TruthPublisher:
 
 
 def world_message(world: World, state: WorldState) -> fleet_v1_pb2.World:
-    """Return the message of the world. `state`: its lamps and things as in the control channel."""
+    """Return the message of the world. `state` are its lamps and things as in the control channel."""
     walls = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in world.walls]
     return fleet_v1_pb2.World(
         lamps=[fleet_v1_pb2.SimLamp(name=name, **fields) for name, fields in state["lamps"].items()],

@@ -31,7 +31,7 @@ class LinkStatistics:
     )
 
     def count(self, event: Event, profile: Profile) -> None:
-        """Count an event. `profile`: the configured platform."""
+        """Count an event. `profile` is the configured platform."""
         self.detector.on_event(event)
         match event:
             case Sensors():

@@ -54,7 +54,7 @@ class HubRenewals:
         payload = query.payload
         if payload is None or len(payload) > MAX_RENEWAL_BYTES:
             with query:
-                query.reply_err("it is no request for a certificate")
+                query.reply_err("it is not a request for a certificate")
             return
         try:
             self._queue.put_nowait(query)
@@ -94,7 +94,7 @@ class HubRenewals:
         return subprocess.run(command, input=request, capture_output=True, timeout=SIGN_TIMEOUT_S, check=False)
 
     def _renew_own(self) -> None:
-        """Renew the hub's own certificate if it is due. The hub sees the new file, and opens its session anew."""
+        """Renew the hub's own certificate if it is due. The hub sees the new file, and opens its session again."""
         now, dates = datetime.now(UTC), self._credentials.dates(HUB)
         if dates is None or not dates.is_due(now):
             return

@@ -50,11 +50,11 @@ class Publisher:
         self._next = self._declared_in(session)
 
     def move(self) -> None:
-        """Publish in that session from now on. The cache begins anew there, and Zenoh's number; `seq` goes on."""
+        """Publish in that session from now on. The cache and Zenoh's number start again there. `seq` goes on."""
         self._publisher = self._next
 
     def put(self, message: Any, stamp_ns: int) -> bytes:
-        """Publish a message and return its payload. stamp_ns: time of its measurement, ns since the epoch."""
+        """Publish a message and return its payload. `stamp_ns` is the time of its measurement, ns since the epoch."""
         self.sequence += 1
         if self._headed:
             message.stamp.seconds, message.stamp.nanos = divmod(stamp_ns, 1_000_000_000)

@@ -58,7 +58,7 @@ class Failure:
 
 
 def messages_of(answers: "Iterable[Sample | Failure]") -> "Iterator[Any]":
-    """Yield the messages of answers. Skip error replies, and those of programs that are none of this fleet."""
+    """Yield the messages of answers. Skip error replies, and those of programs that are not of this fleet."""
     for answer in answers:
         if isinstance(answer, Sample):
             with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
@@ -71,7 +71,7 @@ def sequence_of(info: zenoh.SourceInfo) -> int:
 
 
 def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
-    """Convert a Zenoh sample. largest: maximum size of the payload in bytes."""
+    """Convert a Zenoh sample. `largest` is the maximum size of the payload in bytes."""
     stamp = sample.timestamp
     info = sample.source_info
     unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)

@@ -112,7 +112,7 @@ class Bus:
                     raise BusError(why) from error
                 may_be = f", or refuses the certificate of {identity}" if identity else ""
                 raise BusError(
-                    f"{where} does not answer, or is no Zenoh router{may_be}. Name the fleet's address with --connect."
+                    f"{where} does not answer, or is not a Zenoh router{may_be}. Give the fleet's address by --connect."
                 ) from error
             return cls(session, where, identity)._with_keeper()
 
@@ -433,7 +433,7 @@ class Bus:
         return tuple(sorted(str(hub) for hub in self._session.info.routers_zid()))
 
     def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 1) -> None:
-        """Publish one command of a stream (drive). sequence: its number within the stream, from 1."""
+        """Publish one command of a stream (drive). `sequence` is its number within the stream, from 1."""
         self.put_again(key, payload, encoding, sequence, Qos.COMMAND)
 
     def put_again(self, key: str, payload: bytes, encoding: str, sequence: int, qos: Qos) -> None:

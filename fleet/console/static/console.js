@@ -41,7 +41,7 @@ export const store = {
   lost: false,
   silent_s: 0, // whole seconds since the console said anything, while it is lost
   stopUnsent: false, // the last STOP has not reached the console
-  refusedWhy: "", // why the console lets this page not in, in its own words
+  refusedWhy: "", // why the console does not let this page in, in its own words
   unpaired: "", // "revoked": not even STOP works. "expired": STOP by fetch works
   press: null, // the motion that is driven: {id, motion, cars}
   results: [],
@@ -161,7 +161,7 @@ export function estopAll(why) {
 
 // ---------------------------------------------------------------- who may do what
 
-// A person without host and process, also if it is this one by another program; a sender without a person as it is.
+// A person without host and process, even if it is this person in another program; a sender without a person as it is.
 const personOf = (sender) => seen(sender.split("@")[0] || sender);
 export const who = (sender) => (sender === store.hello?.sender ? describe.you : personOf(sender));
 

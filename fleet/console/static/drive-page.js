@@ -149,7 +149,7 @@ const Chip = ({ car }) => {
   </label>`;
 };
 
-// Who has cars of their own sees those; the cars of others are one press away, since nobody here drives them.
+// A person with cars of their own sees those. The cars of others are one press away, because nobody here drives them.
 function Selection({ cars }) {
   const chooser = useRef(null);
   // A phone has room for a few chips: the chosen one shall be among them.

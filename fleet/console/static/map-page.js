@@ -1,4 +1,4 @@
-// The map: the floor from above with the cars, and a list of their places. Of now, or of the moment that is looked at.
+// The map: the floor from above with the cars, and a list of their places. They are the places of now, or of the moment that is shown.
 
 import { driverOf, isLost, modeWords, motionWords, troublesOf } from "./car-words.js";
 import { carsInPlace, clock, consoleNow, on, store, unwish, who, wish } from "./console.js";

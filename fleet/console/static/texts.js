@@ -114,7 +114,7 @@ export const t = {
   refusedWhy: (why) => `The console refuses this page: ${why}.`,
   connection: {
     live: "live",
-    past: "connected", // what is shown is not of now
+    past: "connected", // what is shown is past
     old: (ago) => `${ago} old`,
     bus: "bus lost",
     none: "not connected",

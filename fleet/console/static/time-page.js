@@ -1,4 +1,4 @@
-// The time line: a lane for each car, live and of a recording. Who scrubs looks back: all pages show that moment then.
+// The time line: a lane for each car, live and of a recording. Scrubbing looks back: all pages show that moment then.
 
 import { modeWords } from "./car-words.js";
 import { carsInPlace, changed, clock, consoleNow, store, when, who } from "./console.js";
@@ -10,7 +10,7 @@ import { t } from "./texts.js";
 import { Component, html, useState } from "./ui.js";
 import { lengthWords, momentOf } from "./when.js";
 
-const LATE_MS = 2000; // the newest span of now ends with the last state, which is up to two seconds old
+const LATE_MS = 2000; // the newest span ends with the last state, which is up to two seconds old
 const NEAR_MS = 30_000;
 const NEAR_AT_FIRST = 6;
 const MAX_NEAR = 40;

@@ -27,7 +27,7 @@ export function lengthWords(s) {
 }
 
 // The newest moment, not after now, with this time of day on the clock of the wall; `at_ms`: a moment of the day that is
-// meant. "14:05", "14:05:30", "1405". null: this is no time of day.
+// meant. "14:05", "14:05:30", "1405". null: this is not a time of day.
 const TIME_OF_DAY = /^\s*(\d{1,2})[:.h ]?(\d{2})(?:[:. ]?(\d{2}))?\s*$/;
 export function momentOf(text, at_ms, zone_s, now_ms) {
   const found = TIME_OF_DAY.exec(text);

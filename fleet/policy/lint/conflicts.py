@@ -21,7 +21,7 @@ def _contradictory(both: Expression) -> bool:
 
 
 def implies(one: PlanCondition, other: PlanCondition) -> bool:
-    """Return True if `other` is certainly true whenever `one` is. False also if that cannot be shown."""
+    """Return True if `other` is certainly true whenever `one` is. Return False if that cannot be shown."""
     if one.for_s < other.for_s or (other.role is not None and one.role != other.role):
         return False
     same = one.of is other.of and one.car == other.car and (one.of is not Quantifier.ALL or one.role == other.role)

@@ -50,7 +50,7 @@ LATEST: Final = "latest"
 
 
 class NoSession(Exception):
-    """The path is no session. The message names the path and the reason."""
+    """The path is not a session. The message names the path and the reason."""
 
 
 def _near(path: Path) -> str:
@@ -82,7 +82,7 @@ class Recorded:
 class Session:
     """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
-    path: a session's directory, an .mcap file, the name of a session in `./sessions` (or where the fleet
+    `path` is a session's directory, an .mcap file, the name of a session in `./sessions` (or where the fleet
     file here records to), or `latest` (`latest~1` is the
     one before). Raises NoSession. Reading never changes a session, and finds what is damaged: see `damage_words`.
     """
@@ -352,7 +352,7 @@ class Session:
         return data_frame(spans_table(self._spans_without(of, self.to_arrow(MODE.name))))
 
     def _spans_without(self, of: str, modes: "pa.Table") -> list[ModeSpan]:
-        """Return the times without this reading of the cars that `of` names. modes: a table of `state/mode`."""
+        """Return the times without this reading of the cars that `of` names. `modes` is a table of `state/mode`."""
         sensor, named = sensor_of(of), self.selection(of)
         if not sensor:
             return []

@@ -46,7 +46,7 @@ class CarTimeline:
     _last: dict[str, str] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any, at_ns: int) -> None:
-        """Take in a message of the car, or a decision of the plan. at_ns: its time on the recorder's clock."""
+        """Take in a message of the car, or a decision of the plan. `at_ns` is its time on the recorder's clock."""
         if topic in TIMELINE_TOPICS:
             self.stops.add(self.car, topic, message, at_ns)
         if topic in _CLAIMS:

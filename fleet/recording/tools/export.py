@@ -23,7 +23,7 @@ BATCH_BYTES: Final = 4 << 20
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
 STRAY_PREFIX: Final = "stray."
-"""Begin of the names of tables with messages that are not of the type of their key."""
+"""Beginning of the names of tables with messages whose type is not the type of their key."""
 
 
 @dataclass(frozen=True, slots=True)

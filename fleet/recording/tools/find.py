@@ -68,7 +68,7 @@ class ConditionRun:
         """The longest time for which the condition held, s; negative if it never did."""
 
     def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
-        """Take in a message. at_ns: its stamp; ahead_ns: what the recorder's clock showed more."""
+        """Take in a message. `at_ns` is its stamp; ahead_ns: what the recorder's clock showed more."""
         # The schema is that of the recording, and may lack a field.
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
             self._command = asked_by(message)

@@ -1,7 +1,7 @@
 """What was known at one moment of a session: the newest message of each key, and the lanes of the whole session.
 
 The moment is one of the recorder's clock, as `start_ns` and `end_ns` of `Session.messages`: the clock of a gateway may
-be wrong, and two of them differ. What the recorder had not got by then is not known yet. Of the messages that it had,
+be wrong, and two of them differ. What the recorder had not received is not known yet. Of the messages that it had,
 the newest by the time of publishing counts, as in the tables: a backfilled one comes late and is old.
 """
 

@@ -56,7 +56,7 @@ class SessionCheckup:
             yield row
 
     def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
-        """Count one message. at_ns: its time if it has no stamp."""
+        """Count one message. `at_ns` is its time if it has no stamp."""
         self.unshown.add(car, topic, message, at_ns)
         if topic == "event/log":
             self.broken[car] += log_code(message) == "link_lost"

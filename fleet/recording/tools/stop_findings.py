@@ -68,7 +68,7 @@ class StopFindings:
     """The newest states by car and topic."""
 
     def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
-        """Take in a message of `WATCHED_TOPICS`. at_ns: its time if it has no stamp."""
+        """Take in a message of `WATCHED_TOPICS`. `at_ns` is its time if it has no stamp."""
         if topic.startswith("state/"):
             self._states.setdefault(car, {})[topic] = message
         elif not (code := failed_stop_code(topic, message)):
@@ -108,7 +108,7 @@ class StopFindings:
 
 
 def failed_stop_code(topic: str, message: Any) -> str:
-    """Return the code of a stop that failed, by a message of `event/command` or `event/log`. Empty if it is none."""
+    """Return the code of a stop that failed, by a message of `event/command` or `event/log`. Empty if it is not one."""
     if topic == "event/log":
         code = log_code(message)
         return code if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE) else ""

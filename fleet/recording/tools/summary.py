@@ -32,7 +32,7 @@ class SessionState(StrEnum):
     WHOLE = "whole"
     RECORDING = "recording"
     CUT = "cut"  # the recorder did not close it
-    DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is no MCAP file
+    DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is not an MCAP file
     THINNED = "thinned"  # whole but for what the quota took
     RECOVERED = "recovered"  # whole, but made from an incomplete session
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
@@ -227,7 +227,7 @@ def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[t
 
 
 def _state(session: Session, read: Session) -> tuple[SessionState, str]:
-    """Return the state and why. read: the damage of the files that have no usable index, and were read."""
+    """Return the state and why. `read` is the damage of the files that have no usable index, and were read."""
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words

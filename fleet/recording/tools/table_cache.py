@@ -54,9 +54,9 @@ _OPEN: Final = "recording"
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
 _STAMP: Final = "stamp-"
-"""Begin of the name of the empty file that says for which state of the session the digest was made."""
+"""Beginning of the name of the empty file that tells for which state of the session the digest was made."""
 _FORMAT: Final = "4"
-"""Increase it if what is in a directory changes, so that all are made anew."""
+"""Increase it if the contents of a directory change, so that all directories are made again."""
 STALE_PART_S: Final = 600.0
 """Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
 every few seconds: a thousand messages each."""
@@ -78,7 +78,7 @@ class CachedTables:
 
     @classmethod
     def of(cls, session: Path, directory: Path) -> Self:
-        """Return what is in a directory. Raises OSError, also if another question deletes it now."""
+        """Return what is in a directory. Raises OSError, for example if another question deletes it now."""
         names = tuple(sorted(os.listdir(directory)))  # noqa: PTH208 - a path for each name costs half of a question
         note = directory / _NOTE
         return cls(session, directory, note.read_text(encoding="utf-8") if _NOTE in names else "", names)
@@ -299,7 +299,7 @@ class _State:
 
     def digest(self, session: Path) -> str:
         """Return the digest of this state. It reads the description."""
-        # Where a version names a column differently, all are made anew.
+        # Where a version names a column differently, all are made again.
         return _hash(_FORMAT, _layouts_text(), *self.segments, _described(session))
 
 

@@ -141,7 +141,7 @@ class RequestColumns:
 
     @classmethod
     def of(cls, descriptor: Any) -> Self | None:
-        """Return the columns for messages of this type, or None if it is no event of a command."""
+        """Return the columns for messages of this type, or None if it is not an event of a command."""
         return cls(descriptor) if descriptor.full_name == TOPICS["event/command"].message else None
 
     def fill(self, events: Sequence[Any]) -> list[Values]:

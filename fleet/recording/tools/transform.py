@@ -122,7 +122,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
 def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> tuple[int, int, str]:
     """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
 
-    What several recorders have got is written once: the same key, number, time of publication and payload. Return the
+    What several recorders received is written once: the same key, number, time of publication and payload. Return the
     number of messages, of those that came again, and the losses in words. Raises Exists, OSError, and NoSession if the
     sessions are of several fleets, or none has an intact message.
     """
@@ -253,7 +253,7 @@ def _copy_others(session: Session, new: Path) -> None:
 
 
 def _has(selection: Selection, begin: object, end: object) -> bool:
-    """Return True if a stored span of time has a moment in the selection, or is none: somebody wrote it by hand."""
+    """Return True if a stored span of time has a moment in the selection, or is invalid: somebody wrote it."""
     try:
         return selection.overlaps(time_spec.iso_ns(str(begin)), time_spec.iso_ns(str(end)))
     except (ValueError, OverflowError):

@@ -6,7 +6,7 @@ touches its time, because the time before a pin may be in another session.
 Unpinned segments go first, the oldest of all sessions. Pinned ones may have half of the quota: if they have more, the
 oldest of them go before anything else. So a condition that is always true leaves room for what comes. Tables for
 questions go with the first segment of their session, as they are of no use then. If no other segment is left, all
-tables go, which can be made again. What is pinned stays within its half, also where marked sessions, which stay whole,
+tables go, which can be made again. What is pinned stays within its half, even where marked sessions, which stay whole,
 leave less than that: all together are more than the quota then, and the recorder says so.
 """
 

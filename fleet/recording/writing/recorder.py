@@ -54,7 +54,7 @@ MAX_READ_BATCH: Final = 4_096
 SHUTDOWN_DRAIN_S: Final = 0.3
 """Time at shutdown for messages that are still in transit, and timeout of the hub's answer after it."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""Maximum delay of both together. Beyond it, hub or recorder stood still, and the time begins anew."""
+"""Maximum delay of both together. Beyond it, hub or recorder stood still, and the time starts again."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all of it, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64

@@ -62,7 +62,7 @@ class Options:
 class SessionWriter:
     """Writes one new session. Raises OSError if the session cannot be created or written.
 
-    A full disk is no error: `full` names it, new messages are buffered, and writing resumes when there is space.
+    A full disk is not an error: `full` names it, new messages are buffered, and writing resumes when there is space.
     If the disk is full from the start, `path` is the future directory of the session.
     """
 
@@ -103,7 +103,7 @@ class SessionWriter:
         self._written = self._closed_bytes = self._buffered_bytes = 0
         self._stops = StopCount()
         self._unended = 0
-        """Rows at the begin of the buffer that are in a segment whose end a full disk did not take."""
+        """Rows at the beginning of the buffer that are in a segment whose end did not fit on a full disk."""
         self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
         self._open(now_ns, self._options.reserve.to_begin)

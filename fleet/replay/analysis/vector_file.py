@@ -29,7 +29,7 @@ _ESTIMATED: Final = frozenset({"charge", "charge_error", "level"})
 
 
 class BadVector(Exception):
-    """A file that is no vector. The message names the file, the line and the fault."""
+    """A file that is not a vector. The message names the file, the line and the fault."""
 
 
 def select_range(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:

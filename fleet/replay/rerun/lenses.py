@@ -38,7 +38,7 @@ def component(topic: str) -> str:
 def is_drawn(topic: str, names: Iterable[str]) -> bool:
     """Return True if a chunk with these components has messages of the own type of its topic.
 
-    Of a topic that is not ours, any type that Rerun decodes counts.
+    For a topic that is not ours, any type that Rerun decodes counts.
     """
     if topic not in TOPICS:
         return RAW not in names

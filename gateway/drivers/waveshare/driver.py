@@ -5,16 +5,16 @@ that the first family lacks: a dead-man, and on some chassis encoders. This essa
 
 *One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
 on one without, and nearly nothing on the factory's first program. Nothing in the command tells them apart. So no motion
-goes out before the car has said by its feedback which firmware it has, and has got the number of its chassis (`T:900`)
-from us. A reset forgets that number on one of the firmwares. So the text of a boot, or a silence in the stream of
-feedback, takes the permission back, and all begins anew.
+goes out before the car's feedback has told which firmware it has, and before it has received the number of its chassis
+(`T:900`) from us. On one of the firmwares, a reset clears that number. So the text of a boot, or a silence in the
+stream of feedback, takes the permission back, and all starts again.
 
 *The dead-man.* Three seconds after the last `T:1` the motors stop. On one firmware `T:13` drives without feeding it,
 and nothing ever stops such a car; `T:136` below zero turns it off. So `T:1` alone drives here, sent again four times
 within the second that we set the dead-man to, and clamped before it is sent: beyond 2.0 the car ignores the numbers and
 takes the line as a sign of life. A list of what may be sent stands below, and nothing else is ever written.
 
-*What a stop can show.* The car repeats each line that it could parse, if asked to (`T:143`). That is no proof that it
+*What a stop can show.* The car repeats each line that it could parse, if asked to (`T:143`). That is not proof that it
 obeys. But it puts an order into what we read: a feedback after the repeated stop was made after the stop. If its wheel
 speeds are measured, and are zero from then on for a quarter of a second, the car stands. Measured means three things:
 the chassis has encoders, the configuration is ours, and both wheels were seen to turn in a drive of ours since then,

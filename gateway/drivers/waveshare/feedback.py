@@ -1,7 +1,7 @@
 """Turns one line of such a car into events. Pure; any bytes are allowed.
 
 The firmwares mix JSON with text, and print some JSON without a line end. So a line may hold text, several objects, and
-the begin of one that the link has cut. Each becomes an event of its own.
+the beginning of a line that the link has cut. Each becomes an event of its own.
 """
 
 import json
@@ -17,7 +17,7 @@ FEEDBACK: Final = 1001
 """`T` of a feedback."""
 MAX_M_S: Final = 5.0
 MAX_V: Final = 13.0
-"""Maximum speed of a wheel, and of the voltage of three cells. A greater number is no measurement."""
+"""Maximum speed of a wheel, and of the voltage of three cells. A greater number is not a measurement."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
 """Fields of an arm. Its places have the names of the yaw, or of the acceleration, and stand in their place."""

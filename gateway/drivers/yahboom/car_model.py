@@ -45,7 +45,7 @@ class CarModel:
     """The case of the stop, if the claim of rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
-    """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""
+    """When the last frame that leaves a mode was written, and the latest time at which the car has left the mode."""
     range_cm: float | None = None
     """The last distance that was measured, and when."""
     range_at: float = float("-inf")

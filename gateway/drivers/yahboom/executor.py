@@ -112,7 +112,7 @@ class Executor(Driver):
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
         if not self.stops.is_step_due(running, now):
             return None
-        # A color that clears a string is the last one, also if somebody has set another one during this stop.
+        # A color that clears a string is the last one, even if somebody has set another one during this stop.
         frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
         return self._write(frame, running.why, running, running.commands[0] if running.commands else None)
 
@@ -153,7 +153,7 @@ class Executor(Driver):
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode would wait for its frame at most, s. busy_s: the wait of a motion."""
+        """Return how long a mode would wait for its frame at most, s. `busy_s` is the wait of a motion."""
         model = self.model
         if model.rest_is_sure and self.stops.running is None:
             return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)

@@ -45,7 +45,7 @@ class Pacing:
 
     # A ranging without an echo blocks the car for 1.0 s, less than `REPEAT_INTERVAL_S`. A frame then waits unread in
     # the buffer. The car reads it earlier if it was awake at the write, or has sent a report since. Frames that waited
-    # before it may then block the car once more. An echo in the last ranging does not predict the next one.
+    # before it may then block the car again. An echo in the last ranging does not predict the next one.
 
     def __init__(self, profile: Profile, learned: Learned) -> None:
         self.profile = profile

@@ -254,7 +254,7 @@ class RaspberryPiCar(Firmware):
 
 
 def _number(text: str, word: str, end: str) -> int:
-    """Return the number between the FIRST occurrences of two words; the program dies if it is no number."""
+    """Return the number between the FIRST occurrences of two words; the program dies if it is not a number."""
     start, stop = text.find(word) + len(word), text.find(end)
     if stop < start or not text[start:stop].strip().lstrip("+-").isdecimal():
         raise _Died

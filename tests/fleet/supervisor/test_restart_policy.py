@@ -55,7 +55,7 @@ def test_what_dies_is_started_again_after_the_delay() -> None:
     state = running()
     state.on_exit(-9, "", 101.0, 0.5)
     assert state.state is RunState.WAITING
-    assert state.words == "was ended by signal 9"
+    assert state.words.endswith(" signal 9")
     assert state.turn(101.0 + FIRST_RESTART_DELAY_S - 0.01, 0.0) is RestartAction.NOTHING
     assert state.turn(101.0 + FIRST_RESTART_DELAY_S, 0.0) is RestartAction.START
     state.on_started(102.0)
@@ -75,14 +75,14 @@ def test_crash_loop_backs_off_and_steady_run_resets() -> None:
     state.on_heartbeat(at)
     state.on_exit(1, "no", at + STABLE_RUN_S, 0.5)
     assert state.due - at - STABLE_RUN_S == pytest.approx(FIRST_RESTART_DELAY_S)
-    assert state.words == "ended with exit code 1: no"
+    assert state.words.endswith(" 1: no")
 
 
 def test_rejected_arguments_are_retried_each_minute_or_after_reload() -> None:
     state = running()
     state.on_exit(2, "no such platform", 101.0, 0.5)
     assert state.state is RunState.REFUSED
-    assert state.words == "ended with exit code 2: no such platform"
+    assert state.words.endswith(" 2: no such platform")
     assert state.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is RestartAction.NOTHING
     assert state.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is RestartAction.START
     state.end(120.0, 5.0, again=True)
@@ -119,7 +119,7 @@ def test_who_is_silent_hangs_if_it_could_have_been_heard(
     state = running(100.0)
     assert state.turn(now, listening_since) is act
     if act is RestartAction.KILL:
-        assert state.words.startswith("hung: no heartbeat for ")
+        assert state.words.startswith("hung: ")
         assert state.killed
         assert state.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
         state.on_exit(-9, "", now + 0.1, 0.5)

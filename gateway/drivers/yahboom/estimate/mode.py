@@ -49,7 +49,7 @@ class ModeEstimator:
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
     _settled_at: float = field(default=float("-inf"))
-    """When an obedient car is in the commanded mode at the latest."""
+    """The latest time at which an obedient car is in the commanded mode."""
     _obeys_by: float = field(default=float("-inf"))
     """The same for a car that was in that mode before the last frame."""
     _heard_at: float = field(default=float("-inf"))
@@ -170,7 +170,7 @@ class ModeEstimator:
     def allow_silence(self, silent_s: float) -> None:
         """Take a silence that a report has ended for one that this car has at times, on this link.
 
-        A silence of over `FIRST_SILENCE_S` is none: the car was off or out of range.
+        A silence of over `FIRST_SILENCE_S` does not count: the car was off or out of range.
         """
         if silent_s <= FIRST_SILENCE_S:
             self._ended_silence_s = max(self._ended_silence_s, silent_s)

@@ -27,7 +27,7 @@ _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi car
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
 _CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
 _WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
-_WITH_MODES: Final = "arduino (or stm32: their bytes are mostly the same)"
+_WITH_MODES: Final = "arduino (or stm32: their bytes are usually the same)"
 TWO_CELLS_V: Final = 9.0
 """Voltage over which a battery has more than two cells: they have 8.4 V when full."""
 
@@ -89,7 +89,7 @@ class PlatformDetector:
     """True if readings have contradicted that option."""
     _head: str = ""
     _heads: int = 0
-    """The first word of the last sensors frames if it is none of this profile, and their number."""
+    """The first word of the last sensors frames if this profile does not use it, and the number of these frames."""
     _is_read: bool = False
     """True if a frame with the head of this profile has arrived on this link."""
 
@@ -103,7 +103,7 @@ class PlatformDetector:
 
     @property
     def doubted(self) -> bool:
-        """Return True if readings contradict the profile now. An option that is not configured is no contradiction."""
+        """Return True if readings contradict the profile now. A missing option is not a contradiction."""
         return any(shown.holds for words, shown in self._against.items() if words not in self._extra_options)
 
     @property

@@ -26,8 +26,8 @@ _MIN_FRAME: Final = 64  # a sensors frame in its longest observed spelling has 4
 MISSING_END_SILENCE_S: Final = (
     0.050  # docs/reference/protocol.md#readings: a missing `#` is accepted when nothing follows for 50 ms
 )
-# A link that was dead joins the begin of one frame with the end of another. Such a frame was never measured. A radio
-# repeats lost bytes in less time.
+# A link that was dead joins the beginning of one frame and the end of another. Such a frame was never measured. A
+# radio repeats lost bytes in less time.
 CUT_FRAME_SILENCE_S: Final = 0.5
 """Silence that ends an incomplete frame. It is rejected as truncated (docs/reference/protocol.md#readings)."""
 ECHO_S: Final = 2.0  # docs/reference/protocol.md#readings: bytes equal to a frame that we sent in the last 2 s
@@ -48,7 +48,7 @@ class Decoder:
     """Decodes the bytes of one connection, so that a new link never completes an old frame."""
 
     def __init__(self, max_frame: int = MAX_FRAME, *, head: str = STANDARD_HEAD) -> None:
-        """`head`: the first word of the frames of this car."""
+        """`head` is the first word of the frames of this car."""
         if not _MIN_FRAME <= max_frame <= MAX_FRAME:
             raise ValueError(f"max_frame: {max_frame}, allowed are {_MIN_FRAME}..{MAX_FRAME}")
         self._max = max_frame
@@ -57,7 +57,7 @@ class Decoder:
         self._last = 0.0  # time of the last byte in the buffer
         self._silence_s = inf  # silence after the last byte that would complete an event
         self._late_end = False  # True if silence ended the last frame: its `#` may still come
-        self._is_mid_line = False  # True if an earlier event has the begin of this line
+        self._is_mid_line = False  # True if an earlier event has the beginning of this line
         self._sent: dict[bytes, float] = {}
 
     def use_head(self, head: str) -> None:
@@ -67,7 +67,7 @@ class Decoder:
         self._match_ended = self._matcher.match_ended
 
     def feed(self, data: bytes, now: float) -> list[Event]:
-        """Return the events that these bytes complete. `now`: their time of arrival in seconds, any fixed origin."""
+        """Return the events that these bytes complete. `now` is their time of arrival in seconds, any fixed origin."""
         events = self.tick(now) if self._buffer else []
         buffer, sent, pos, size, most = self._buffer, self._sent, 0, len(data), self._max
         match_ended = self._match_ended

@@ -1,6 +1,6 @@
 """The events of a decoder, one value each.
 
-`Sensors`, the event of a sensors frame, is in `sensors`; what is no reading is an event of every family.
+`Sensors`, the event of a sensors frame, is in `sensors`; what is not a reading is an event of every family.
 Everything that depends on the platform is in `platforms`.
 """
 

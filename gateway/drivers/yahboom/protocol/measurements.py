@@ -33,7 +33,7 @@ def verdict_of(event: Event) -> str:
 def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
     """Return the measured fields by topic, in the order of publication, in the units of the messages.
 
-    `confirmed`: the confirmed mode of the car, or None. Fields that were not measured are omitted.
+    `confirmed` is the confirmed mode of the car, or None. Fields that were not measured are omitted.
     """
     match event:
         case Sensors():

@@ -18,7 +18,7 @@ class ModeRow:
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
     longest block of one turn of the mode's own loop. `rate_hz` is the maximum of sensors frames per second. `measures`:
-    what a frame of this mode measures, also if only other programs than the vendor's print it.
+    what a frame of this mode measures, even if only other programs than the vendor's print it.
     """
 
     digit: int

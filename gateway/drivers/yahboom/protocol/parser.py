@@ -35,7 +35,7 @@ _NUMBER: Final = {
 def parse(raw: bytes, at: float, head: str) -> Event:
     """Return the event of one frame, whose `raw` goes from its `$` to its `#`; never raise.
 
-    `head`: the first word of the frames of this car.
+    `head` is the first word of the frames of this car.
     """
     if found := sensors_matcher(head).match_ended(raw):
         return read_sensors(found, at)

@@ -114,7 +114,7 @@ SPECIAL_CAPABILITIES: Final[Mapping[str, Frame]] = {
 def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> frozenset[str]:
     """Return the measurements that all these modes have in common. A silent mode excludes none.
 
-    `shown`: the modes whose text the frame has. In one of them, a program prints that is silent elsewhere.
+    `shown` are the modes whose text the frame has. In one of them, a program prints that is silent elsewhere.
     """
     counted = (mode for mode in modes if mode not in SILENT_MODES or mode in shown)
     common = EVERY_MEASUREMENT.intersection(*(MODES[mode].measures for mode in counted))
@@ -191,12 +191,12 @@ class Profile:
 
     @property
     def voltage_max(self) -> float:
-        """The maximum of PV, V. A greater value is no measurement."""
+        """The maximum of PV, V. A greater value is not a measurement."""
         return _PV_MAX[self.cells]
 
     @property
     def grayscale_max(self) -> int:
-        """The maximum of GS. A greater value is no measurement."""
+        """The maximum of GS. A greater value is not a measurement."""
         return _GRAY_12_BIT if self.kind in {Platform.STM32, Platform.UNKNOWN} else GRAY_10_BIT
 
     @property
@@ -295,7 +295,7 @@ class Profile:
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
         """Return the modes that this frame may come from.
 
-        The confirmed `mode` decides between the candidates. If it is none of them, the frame may be a corrupted frame
+        The confirmed `mode` decides between the candidates. If it is not among them, the frame may be a corrupted frame
         of that mode, until three frames in a row contradict it.
         """
         candidates = candidate_modes(event)

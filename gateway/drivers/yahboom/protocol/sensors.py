@@ -153,7 +153,7 @@ def read_sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, 
 def sensors_pattern(filler: Mapping[str, bytes] | None = None, *, head: bytes = b"[0-9A-Za-z]+") -> bytes:
     """Return the pattern of a sensors frame without its `#`, one group per field.
 
-    `filler`: the exact text of some fields, by measurement. `head`: the pattern of its first word.
+    `filler` is the exact text of some fields, by measurement. `head` is the pattern of its first word.
     """
     texts = {name: re.escape(text) for name, text in (filler or {}).items()}
     return (
@@ -188,7 +188,7 @@ _ANY_HEAD: Final = re.compile(rb"\$([A-Za-z0-9]{2,8})" + sensors_pattern(head=b"
 
 
 def head_of(raw: bytes) -> str | None:
-    """Return the first word of a sensors frame, whatever it is. None if these bytes are no sensors frame."""
+    """Return the first word of a sensors frame, whatever it is. None if these bytes are not a sensors frame."""
     found = _ANY_HEAD.fullmatch(raw)
     return found[1].decode() if found else None
 

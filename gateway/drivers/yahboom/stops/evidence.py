@@ -148,7 +148,7 @@ class StopEvidence:
     _last_at: float = _NEVER
     """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
-    """When the last frame arrived, whole or corrupted, that is no report of mode 0."""
+    """When the last frame arrived, whole or corrupted, that is not a report of mode 0."""
     _before: float | None = None
     """When the last report with an echo arrived, if nothing else has arrived since."""
     _before_no_echo: float | None = None
@@ -266,7 +266,7 @@ class StopEvidence:
         """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly its block."""
         self._pending = now if awake else None
         if not awake:
-            self._blocking.append(_Block(None, self.close_s, now))  # this interval is no measure
+            self._blocking.append(_Block(None, self.close_s, now))  # this interval does not count
         self._delay_s = None
         self._unjudged = False
         self.settles_at = None
@@ -282,7 +282,7 @@ class StopEvidence:
     # ------------------------------------------------------------------ readings
 
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
-        """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
+        """Record bytes that are not readings. `damaged`: they begin like a frame, so the next may be corrupted too."""
         self._last_at = at
         self._before = self._before_no_echo = self.settles_at = None
         self._fast_before = False
@@ -399,7 +399,7 @@ class StopEvidence:
     def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
         """Learn the rhythm of a car that reports faster than it did."""
         if self._pending is not None and event.at > self._pending + self._left_s + ROUND_TRIP_S:
-            self._pending = None  # its block is over, and no report in the rhythm of before came to show it
+            self._pending = None  # its block is over, and no report came in the earlier rhythm to show it
         clean = self._fast_before and self._pending is None and not self._blocking
         self._fast_before = bool(event.range_cm)
         if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:
@@ -505,7 +505,7 @@ class StopEvidence:
         if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
             return Finding.NOTHING
         opening_s = self.profile.shortest_opening_s
-        # Opening alone blocks for so long. During it a slow link delivers older reports: less silence is no evidence.
+        # Opening alone blocks for so long. During it a slow link delivers older reports: less silence is not evidence.
         earliest_at = self._opened_at + opening_s + self.close_s - EARLY_S
         if silent is not None and (quiet_s < opening_s - LATE_S or at < earliest_at):
             return Finding.NOTHING

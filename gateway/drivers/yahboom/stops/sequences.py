@@ -18,7 +18,7 @@ JUDGED_S: Final = 2.3
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a sequence. `after_s`: the minimum time since the previous frame was written, or the try began."""
+    """One frame of a sequence. `after_s` is the minimum time since the previous frame was written, or the try began."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
@@ -63,7 +63,7 @@ FULL_MODE: Final = StopSequence(
 )
 
 # The same if a frame of ours may be unread. Behind that frame the car would read `MODE00` at the wrong place, so it
-# waits. The general stop does not wait: behind an unread frame it is lost without harm, and mostly there is none.
+# waits. The general stop does not wait: behind an unread frame it is lost without harm, and usually there is none.
 FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(STOP_FRAME, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
 # docs/reference/protocol.md#stops, general stops only

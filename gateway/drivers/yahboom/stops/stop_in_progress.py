@@ -127,7 +127,7 @@ class StopInProgress:
     """When the newest `MODE00` was written."""
     tries: int = 1
     worst_at: float = float("-inf")
-    """When the motors are off at the latest, if all steps are in time and all frames arrive."""
+    """The latest time at which the motors are off, if all steps are in time and all frames arrive."""
     timeout_s: float = EVIDENCE_TIMEOUT_S
     """Timeout for the evidence, from the arrival of each command."""
     reported_s: float = 0.0

@@ -80,7 +80,7 @@ def test_a_restarted_plan_begins_with_its_first_phase() -> None:
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
     run.memory, words = on_request(PlanRequest.RESTART, PLAN, run.memory, "ann", 12.1)
-    assert words == f"plan {PLAN.version} begins anew with phase work"
+    assert {PLAN.version, "work"} <= set(words.split())
     step = run.at(12.1)
     assert step.memory.phase.name == "work"
     assert [each.decided for each in step.changed if each.subject == "phase"] == ["work"]

@@ -82,7 +82,7 @@ def test_full_disk_keeps_written_data_and_recording_resumes(kind: str, endpoint:
         found = fleet(endpoint, "record", "status")
         assert found.returncode == 0
         assert found.stdout.startswith("full:")
-        assert "Recording pauses until there is room" in found.stdout
+        assert "Recording pauses" in found.stdout
         for _ in range(100):
             publish()
         there.free()
@@ -95,8 +95,8 @@ def test_full_disk_keeps_written_data_and_recording_resumes(kind: str, endpoint:
         # The recorder buffered the messages meanwhile, and has recorded them, too.
         assert numbers == list(range(1, sent + 1))
         assert (process.returncode, end["drops"], end["missed"]) == (0, {}, {})
-        assert "Recording pauses until there is room" in errors
-        assert "there is room again" in errors
+        assert "Recording pauses" in errors
+        assert "room again" in errors
         verdict = verify(Session(session))
         assert verdict.whole, "also the file whose end the full disk did not take at once"
 
@@ -146,7 +146,7 @@ def test_stop_on_full_disk_writes_what_fits_and_tells_drops(kind: str, endpoint:
             assert process.returncode == 1
             total = sum(end["drops"].values())
             assert total >= dropped > 100
-            assert f"The disk stayed full: {total} waiting messages are lost" in errors.splitlines()[-1]
+            assert f"stayed full: {total} " in errors.splitlines()[-1]
             assert f"{total} waiting messages" in description.error
 
 
@@ -176,8 +176,8 @@ def test_disk_full_at_start_is_waited_for_without_leftovers(kind: str, endpoint:
         assert verify(opened).whole
         assert opened.description is not None
         assert [mark["text"] for mark in opened.description.marks] == ["full"]
-        assert "Recording pauses until there is room" in errors
-        assert f"there is room again: recording continues to {session}" in errors
+        assert "Recording pauses" in errors
+        assert f"room again: recording continues to {session}" in errors
 
 
 @pytest.mark.parametrize("kind", DISKS)
@@ -194,7 +194,7 @@ def test_stop_on_disk_full_from_start_says_so_without_leftovers(kind: str, endpo
             return
         assert process.returncode == 1
         dropped = sum(json.loads(text)["drops"].values())
-        assert f"The disk stayed full: {dropped} waiting messages are lost" in errors.splitlines()[-1]
+        assert f"stayed full: {dropped} " in errors.splitlines()[-1]
         assert list(there.root.glob("*")) == []
         with pytest.raises(NoSession):
             Session(session)
@@ -255,7 +255,7 @@ def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Pat
     assert process.returncode == 0
     assert Path(json.loads(text)["session"]) != session
     assert f"{session} is removed" in errors
-    assert errors.count("more than its quota") <= 2  # reported once at the begin, not with each status
+    assert errors.count("its quota") <= 2  # reported once at the beginning, not with each status
     assert all(verify(Session(path)).whole for path in tmp_path.iterdir() if path.is_dir())
 
 
@@ -268,7 +268,7 @@ def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, 
     text, errors = process.communicate(timeout=60)
     assert (process.returncode, text) == (1, "")
     (line,) = errors.splitlines()
-    assert f"recording to {session} failed: " in line
+    assert f"{session} failed: " in line
     assert "No such file or directory" in line
     wait_for(lambda: "failed" in states, "that on the bus")
 
@@ -279,7 +279,7 @@ def test_a_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert len(errors.splitlines()) == 1
-    assert "Name another place with --sessions." in errors
+    assert "--sessions" in errors
 
 
 def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, tmp_path: Path) -> None:
@@ -287,15 +287,13 @@ def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, 
     first = ready(process)
     marked = fleet(endpoint, "mark", "the cat came", "--by", "me")
     assert (marked.returncode, marked.stdout) == (0, f"marked in {first}\n")
-    assert fleet(endpoint, "record", "start").stderr.startswith(
-        "fleet: the recorder says: The fleet is recorded already"
-    )
+    assert "recorder says: " in fleet(endpoint, "record", "start").stderr
     stopped = fleet(endpoint, "record", "stop")
     assert stopped.stdout.startswith(f"stopped: {first}")
     assert verify(Session(first)).whole
     refused = fleet(endpoint, "mark", "nobody hears it")
     assert refused.returncode == 1
-    assert "Nothing is being recorded" in refused.stderr
+    assert "being recorded" in refused.stderr
     started = json.loads(fleet(endpoint, "record", "start", "--json").stdout)
     assert started["state"] == "recording"
     second = Path(started["session"])
@@ -320,7 +318,7 @@ def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Pat
         assert isinstance(answer, Failure), payload
     (answer,) = bus.query("fleet/@recorder/@cmd/explode", timeout_s=10.0)
     assert isinstance(answer, Failure)
-    assert "There are start, stop, status, mark" in answer.words
+    assert "start, stop, status, mark" in answer.words
     process.send_signal(signal.SIGTERM)
     assert process.communicate(timeout=60)[1] == ""
     assert fleet(endpoint, "mark", " ").returncode == 2

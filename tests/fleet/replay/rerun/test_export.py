@@ -195,7 +195,7 @@ def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert words in result.stderr
     if sys.platform == "linux":
         missing = CliRunner().invoke(replay, [str(tmp_path / "none")])
-        assert "There is no session at" in missing.stderr, "what is missing comes before a missing display"
+        assert "no session" in missing.stderr, "what is missing comes before a missing display"
 
 
 def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,7 +215,8 @@ def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert len(result.stderr.splitlines()) == 1
-    assert f"has no intact message: {cut} is cut" in result.stderr
+    assert "no intact message" in result.stderr
+    assert str(cut) in result.stderr
     assert "byte " in result.stderr
 
 

@@ -34,7 +34,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
     assert answer.status is QUEUED
-    assert answer.words == "the e-stop lasts until `fleet resume red --estops`"
+    assert answer.words.endswith("`fleet resume red --estops`")
     assert answer.worst_case_s > 0
     desk.run(600.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
@@ -42,12 +42,14 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     for what in (FORWARD, SetMode(Mode.MANUAL), Led(1, 2, 3), TakeLease(), Drive(Motion.STOP)):
         refused = desk.ask(what, PERSON)
         assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
-        assert 'red is emergency-stopped (mia: "smoke"). Release it with `fleet resume red --estops`.' in refused.words
+        assert '(mia: "smoke")' in refused.words
+        assert "`fleet resume red --estops`" in refused.words
     assert desk.ask(Stop(), SCRIPT).status is QUEUED
     assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
     still = desk.ask(Resume(), PERSON)
     assert (still.status, still.reason) == (SENT, Reason.ESTOPPED), "without ids it ends the hold"
-    assert still.words == 'still emergency-stopped by mia ("smoke"). Release it with `fleet resume red --estops`'
+    assert 'by mia ("smoke")' in still.words
+    assert "`fleet resume red --estops`" in still.words
     assert desk.control.safety.hold is None
     assert desk.ask(Resume(("e1",)), SCRIPT).status is SENT
     assert desk.logs[-1].code == "estop_ended"
@@ -58,7 +60,9 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
 def test_the_hold_outlives_the_e_stop(desk: Workbench) -> None:
     desk.ask(EmergencyStop("smoke"), COORDINATOR, identity="e1")
     desk.run(5.0)
-    assert desk.ask(Resume(("e1",)), PERSON).words == "e-stop released; still on hold by plan: `fleet resume red`"
+    released = desk.ask(Resume(("e1",)), PERSON).words
+    assert released.startswith("e-stop released; ")
+    assert released.endswith("by plan: `fleet resume red`")
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
@@ -68,21 +72,18 @@ def test_several_e_stops_in_force_are_named_by_their_ids(desk: Workbench) -> Non
     desk.ask(EmergencyStop(), BOB, identity="e2")
     desk.ask(EmergencyStop(fleet_wide=True), BOB, identity="e3")
     released = desk.ask(Resume(("e2",)), PERSON).words
-    assert released == (
-        'e-stop released; still emergency-stopped by mia ("smoke") [e1], by bob [e3]. '
-        "Release them with `fleet resume red --estops`"
-    )
-    assert desk.ask(Resume(("e1", "e3")), PERSON).words.startswith("2 e-stops released; still on hold by mia")
+    assert released.startswith("e-stop released; ")
+    assert 'by mia ("smoke") [e1], by bob [e3]' in released
+    assert "`fleet resume red --estops`" in released
+    assert desk.ask(Resume(("e1", "e3")), PERSON).words.startswith("2 e-stops released; ")
 
 
 def test_estop_of_unreachable_car_is_latched(desk: Workbench) -> None:
     desk.control.driver.link_down("unplugged", desk.now)
     answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
     assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
-    assert answer.words == (
-        "NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car. "
-        "It is emergency-stopped when its link is back."
-    )
+    assert answer.words.startswith("NOT STOPPED: red ")
+    assert "emergency-stopped" in answer.words
     desk.control.link_up(desk.now)
     desk.run(10.0)
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
@@ -104,7 +105,7 @@ def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) ->
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.logs[0].code == "estop_joined"
-    assert "with the whole fleet by mia: smoke (e-stop e1, seen from blue)" in desk.logs[0].words
+    assert "by mia: smoke (e-stop e1, seen from blue)" in desk.logs[0].words
     desk.sent.clear()
     desk.control.merge_estops([estop], [], "green", desk.now)
     desk.run(3.0)
@@ -127,7 +128,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
     other = Sender("other")
     refused = desk.ask(Drive(Motion.LEFT), other)
     assert (refused.status, refused.reason) == (REJECTED, Reason.LEASED)
-    assert "red is driven by script (script) for another 5.0 s. Wait until the car is free." in refused.words
+    assert "script (script) for another 5.0 s" in refused.words
     desk.run(4.9)
     assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
     assert desk.ask(Led(1, 2, 3), other).status is QUEUED
@@ -179,13 +180,13 @@ def test_person_outranks_script_and_loser_learns_by_whom(desk: Workbench) -> Non
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert next(record.words for record in desk.records if record.phase is SUPERSEDED) == "left by mia"
     assert desk.logs[-1].code == "lease_taken"
-    assert "taken over by mia (person) from script (script)" in desk.logs[-1].words
-    assert "driven by mia (person)" in desk.ask(FORWARD, SCRIPT).words
+    assert "by mia (person) from script (script)" in desk.logs[-1].words
+    assert "mia (person)" in desk.ask(FORWARD, SCRIPT).words
 
 
 def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Workbench) -> None:
     desk.ask(FORWARD, PERSON, identity="d")
-    assert desk.ask(FORWARD, BOB).words.endswith("Wait, or take the car over (--take).")
+    assert "(--take)" in desk.ask(FORWARD, BOB).words
     assert desk.ask(Drive(Motion.BACK, 1.0), BOB, take=True).status is QUEUED
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.ask(FORWARD, PERSON).reason is Reason.LEASED
@@ -211,7 +212,7 @@ def test_taking_the_lease_alone_stops_what_the_other_drove(desk: Workbench) -> N
 
 def test_a_lease_can_be_given_back(desk: Workbench) -> None:
     desk.ask(FORWARD, PERSON, identity="d")
-    assert "bob had no lease" in desk.ask(TakeLease(release=True), BOB).words
+    assert "no lease" in desk.ask(TakeLease(release=True), BOB).words
     assert desk.ask(TakeLease(release=True), PERSON).words == "red is free"
     assert desk.end("d") == (Phase.SENT, None)
     assert desk.ask(FORWARD, BOB).status is QUEUED

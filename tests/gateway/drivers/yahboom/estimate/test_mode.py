@@ -47,7 +47,8 @@ def asked(mode: Mode) -> ModeEstimator:
     truth.on_reading(reading(SHAPES[before], -0.1))
     assert truth.confirmed is before
     truth.on_mode_sent(mode, now=0.0, block_s=BLOCK_S)
-    assert (truth.verdict, truth.evidence) == (ASSUMED, f"mode {mode} was commanded, no reading since")
+    assert truth.verdict is ASSUMED
+    assert f"mode {mode} " in truth.evidence
     return truth
 
 
@@ -64,7 +65,8 @@ def test_its_own_shape_confirms_a_mode(mode: Mode) -> None:
     truth = asked(mode)
     truth.on_reading(reading(SHAPES[mode], 3.0))
     assert (truth.verdict, truth.inferred, truth.confirmed, truth.candidates) == (CONFIRMED, mode, mode, (mode,))
-    assert (truth.evidence, truth.evidence_at) == (f"a reading as in mode {mode}", 3.0)
+    assert f"mode {mode}" in truth.evidence
+    assert truth.evidence_at == 3.0
 
 
 def test_ambiguous_shape_neither_confirms_nor_contradicts() -> None:
@@ -131,7 +133,9 @@ def test_silence_contradicts_a_mode_that_talks(mode: Mode, limit_s: float) -> No
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=10.01 + limit_s, fan=False)
     assert truth.verdict is CONTRADICTED
-    assert truth.evidence == f"silent for {limit_s:.1f} s, but mode {mode} reports at least every {limit_s:g} s"
+    assert f"{limit_s:.1f} s, " in truth.evidence
+    assert f" {limit_s:g} s" in truth.evidence
+    assert f"mode {mode} " in truth.evidence
     truth.on_silence(now=13.5, fan=False)
     assert (truth.candidates, truth.inferred) == (SILENT, None)
     truth.on_reading(reading(SHAPES[mode], 20.0))
@@ -171,7 +175,9 @@ def test_fan_silences_car_and_confirmation_fades() -> None:
     truth.on_silence(now=13.0, fan=True)
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=70.0, fan=True)
-    assert (truth.verdict, truth.evidence) == (ASSUMED, "silent for 60 s, as expected while its fan runs")
+    assert truth.verdict is ASSUMED
+    assert "60 s, " in truth.evidence
+    assert "fan runs" in truth.evidence
     assert (truth.candidates, truth.inferred) == (tuple(Mode), None)
     truth.on_silence(now=73.0, fan=False)
     assert truth.verdict is ASSUMED, "the clock began when the fan was off"
@@ -188,7 +194,8 @@ def test_mode_without_own_readings_is_contradicted_by_silence() -> None:
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=11.0, fan=False)
     assert truth.verdict is CONTRADICTED
-    assert truth.evidence == "no reading as in mode tracking for 1.1 s, the last one is as in mode manual"
+    assert "mode tracking for 1.1 s, " in truth.evidence
+    assert truth.evidence.endswith("mode manual")
 
 
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING])
@@ -216,7 +223,7 @@ def test_silence_that_contradicts_mode_0_is_learned(interval_s: float, limit_s: 
 def test_silence_never_confirms(mode: Mode) -> None:
     truth = asked(mode)
     truth.on_silence(now=3.4, fan=False)
-    assert truth.evidence == f"mode {mode} was commanded, no reading since"
+    assert f"mode {mode} " in truth.evidence
     truth.on_silence(now=12.0, fan=False)
     assert (truth.verdict, truth.evidence) == (ASSUMED, "silent for 12 s, as expected")
     assert (truth.candidates, truth.inferred) == (SILENT, None)
@@ -265,7 +272,7 @@ def test_silence_of_car_without_silent_modes_is_no_mode(platform: str, fits: tup
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=8.1, fan=False)
     assert (truth.verdict, truth.candidates) == (CONTRADICTED, fits)
-    assert ("its program has ended" in truth.evidence) is (not fits)
+    assert ("program has ended" in truth.evidence) is (not fits)
 
 
 def test_the_fan_of_a_raspberry_pi_car_silences_nothing() -> None:
@@ -279,4 +286,5 @@ def test_a_lost_link_forgets() -> None:
     truth.on_reading(reading(SHAPES[Mode.TRACKING], 4.0))
     truth.forget()
     assert (truth.asked, truth.inferred, truth.verdict, truth.candidates) == (None, None, ASSUMED, ())
-    assert (truth.evidence, truth.evidence_at) == ("the link was lost", None)
+    assert "link was lost" in truth.evidence
+    assert truth.evidence_at is None
