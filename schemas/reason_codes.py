@@ -1,4 +1,4 @@
-"""The codes that texts end with or events are named by, each with its meaning. The docs print these tables. Pure.
+"""The codes at the end of texts, and the codes of events, each with its meaning. The docs print these tables. Pure.
 
 docs/how-to/troubleshooting.md has a section for each code. A test compares tables, source and page.
 """
@@ -14,7 +14,7 @@ REASONS: Final[dict[str, str]] = {
     Reason.WRONG_MODE: "The car ignores this command in its mode.",
     Reason.LEASED: "Another sender drives the car.",
     Reason.LENT: "The car is lent to another person.",
-    Reason.NOT_ALLOWED: "The people of the fleet file do not allow it to this sender.",
+    Reason.NOT_ALLOWED: "The people in the fleet file do not allow this to the sender.",
     Reason.PAUSED: "The whole fleet is paused.",
     Reason.HELD: "The car is on hold after a stop.",
     Reason.ESTOPPED: "An emergency stop is in force.",
@@ -27,10 +27,10 @@ REASONS: Final[dict[str, str]] = {
     Reason.SUPERSEDED: "A later command ended this one.",
     Reason.DUPLICATE: "A command with this id was accepted before.",
     Reason.STALE: "The command arrived too late, or its time is in the future.",
-    Reason.NOT_SHOWN: "The car could have confirmed the stop and did not.",
+    Reason.NOT_SHOWN: "The car could have confirmed the stop, but did not.",
     Reason.STUCK: "A wheel stood during the drive, so the gateway ended it.",
     "no_answer": "No gateway answered for this car.",
-    "no_result": "The gateway took the command, and its result did not arrive.",
+    "no_result": "The gateway accepted the command, but its result did not arrive.",
 }
 """Reasons of the gateway (`schemas.words.Reason`), and `no_answer` and `no_result` of the client."""
 
@@ -46,23 +46,23 @@ class EventCode:
 EVENTS: Final[dict[str, EventCode]] = {
     "link_open": EventCode(Level.INFO, "The link is open, and the gateway brings the car to a known state."),
     "link_lost": EventCode(Level.WARNING, "The link is lost. The text has the cause."),
-    "recovered": EventCode(Level.INFO, "The car is stopped in mode manual, and takes commands."),
+    "recovered": EventCode(Level.INFO, "The car is stopped in mode manual, and accepts commands."),
     "platform_settled": EventCode(Level.INFO, "The readings show which program the car runs."),
     "platform_contradicted": EventCode(Level.WARNING, "The readings do not fit the platform in the fleet file."),
     "mode_contradicted": EventCode(Level.WARNING, "The readings do not fit the commanded mode."),
-    "not_obeyed": EventCode(Level.WARNING, "A car that has shown its stops before did not get one."),
+    "not_obeyed": EventCode(Level.WARNING, "A car that has shown its stops before did not get a stop."),
     "hears": EventCode(Level.INFO, "The car reacts to stops again."),
     "cannot_show": EventCode(
         Level.INFO, "The car's reports do not react to frames, so nothing shows that a stop arrived."
     ),
     "rhythm_changed": EventCode(Level.WARNING, "The car reports in another rhythm: another program, or another car."),
     "learns_again": EventCode(
-        Level.INFO, "What was learned of a car is of another link or platform, and does not count."
+        Level.INFO, "What was learned about the car belongs to another link or platform, and does not count."
     ),
     "unheard": EventCode(Level.WARNING, "The car is silent for longer than any normal silence. It may be moving."),
     "answers_again": EventCode(Level.INFO, "The car sends readings again, and the gateway stops it first."),
-    "not_shown": EventCode(Level.ERROR, "The car could have confirmed a stop and did not in time. The stop goes on."),
-    "not_stopped": EventCode(Level.ERROR, "The gateway ended, and the car has not confirmed its stop."),
+    "not_shown": EventCode(Level.ERROR, "The car could have confirmed a stop, but did not in time. The stop goes on."),
+    "not_stopped": EventCode(Level.ERROR, "The gateway ended, but the car has not confirmed its stop."),
     "stalled": EventCode(Level.ERROR, "The gateway stood still during a drive, and stops the car."),
     "slept": EventCode(Level.WARNING, "The computer slept, and the gateway stops the car first."),
     "car_restarted": EventCode(
@@ -86,7 +86,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     "duplicate": EventCode(Level.WARNING, "A command came twice with the same id."),
     "trust": EventCode(Level.DEBUG, "The gateway's knowledge about the motion has changed."),
     "flood": EventCode(Level.WARNING, "More bytes arrive than any car sends."),
-    "no_frames": EventCode(Level.WARNING, "Bytes arrive, and never a frame: the baud rate may be wrong."),
+    "no_frames": EventCode(Level.WARNING, "Bytes arrive, but never a frame: the baud rate may be wrong."),
     "port_shared": EventCode(Level.WARNING, "Another program reads the car's port, and bytes are missing."),
     "not_saved": EventCode(Level.ERROR, "The gateway could not save holds and e-stops to the disk."),
     "other_link": EventCode(Level.WARNING, "A hold, loan or e-stop of another link is not taken over."),

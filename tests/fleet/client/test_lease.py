@@ -66,7 +66,7 @@ def test_second_program_of_same_person_is_told_apart() -> None:
     theirs = LeaseMonitor("red", "bot@laptop-17")
     for holder in ("bot@laptop-17", "mia@laptop-17"):
         theirs.on_safety(safety(holder))
-    assert theirs.lost.endswith("by mia (person)")
+    assert theirs.lost == "red was taken by mia (person)"
 
 
 def test_late_publication_of_old_state_is_no_news() -> None:

@@ -198,7 +198,7 @@ def test_lost_stop_is_never_complete_and_goes_on() -> None:
         last = pair.last_of("stop")
         assert last is not None
         assert (last.phase, last.reason) == (Phase.FAILED, Reason.NOT_SHOWN)
-        assert last.words.startswith("NOT CONFIRMED: red ")
+        assert last.words.startswith("NOT CONFIRMED: red has not reacted to the stop yet. Look at the car.")
         lost = next(log.words for log in pair.logs if log.code == "not_obeyed")
         assert lost.startswith("red did not ")
         codes = [log.code for log in pair.logs]
