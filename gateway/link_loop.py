@@ -47,7 +47,7 @@ class LinkLoop:
         on_gap: Callable[[float], None],
         on_open: Callable[[], None],
     ) -> None:
-        """`on_gap`: looks for a gap of the loop before bytes are judged. `on_open`: the link is proven to be open."""
+        """`on_gap` looks for a gap of the loop before bytes are judged. `on_open`: the link is proven to be open."""
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self.url = url
@@ -74,7 +74,7 @@ class LinkLoop:
     async def keep_open(self, *, may_fail: bool, is_in_use: Callable[[], Awaitable[bool]]) -> None:
         """Keep the link open, and read from it. Raises LinkError if the first attempt fails and must not (`may_fail`).
 
-        is_in_use: True if another gateway, which has to end, may still have the port open.
+        `is_in_use` is True if another gateway, which has to end, may still have the port open.
         """
         looked_again = False
         while True:

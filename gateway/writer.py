@@ -27,7 +27,7 @@ class Writer:
         on_opened: Callable[[float], None],
         notifier: ServiceNotifier,
     ) -> None:
-        """`on_gap`: looks for a gap of the loop before a frame is chosen. `on_opened`: `Driver.opened_as` changed.
+        """`on_gap` looks for a gap of the loop before a frame is chosen. `on_opened`: `Driver.opened_as` changed.
 
         `notifier`: is fed by each turn and each frame, and by nothing else. So if no frame can be written any more,
         systemd starts another gateway, which stops the car.

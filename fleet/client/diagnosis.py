@@ -110,7 +110,7 @@ class DoctorFinding:
 
 @dataclass(frozen=True, slots=True)
 class DoctorCheck:
-    """One row of the table. cause: returns words about the cause, empty if the condition is not met."""
+    """One row of the table. `cause` returns words about the cause, empty if the condition is not met."""
 
     code: str
     cause: Callable[[CarEvidence], str]

@@ -94,7 +94,7 @@ class Lease(Generic[C_co]):
     """A lease, made by `Car.lease`. Use it with `with`, which raises LeaseLost if another sender has the car."""
 
     def __init__(self, fleet: LeasingFleet, name: str, leased: "Callable[[Lease[C_co]], C_co]", *, take: bool) -> None:
-        """`leased`: makes the car that the block gets."""
+        """`leased` makes the car that the block gets."""
         self._fleet = fleet
         self._name = name
         self._leased = leased

@@ -42,7 +42,7 @@ def json_text(reading: Reading) -> str:
 
 
 def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
-    """Return a line: key (padded to `width`), fields with units, age. past: True to leave out the staleness."""
+    """Return a line: key (padded to `width`), fields with units, age. With `past`, leave out the staleness."""
     topic = topics.of_key(reading.key)
     units = topic.units if topic is not None else {}
     fields = [

@@ -19,7 +19,7 @@ _MAX_MAP_KEYS: Final = 1024
 
 
 class MapFeed(PageFeed):
-    """The live map, and the pages that show it. has_place: returns True if a page may be told of a car."""
+    """The live map, and the pages that show it. `has_place` returns True if a page may be told of a car."""
 
     def __init__(self, has_place: Callable[[str], bool]) -> None:
         self._view = MapView()

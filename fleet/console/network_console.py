@@ -267,7 +267,7 @@ class Lan:
     async def run(self, people: Callable[[], People | None]) -> None:
         """Close pages of revoked devices and renew the certificate until the task is cancelled.
 
-        people: returns the people of the fleet, None if no gateway has named them yet.
+        `people` returns the people of the fleet, None if no gateway has named them yet.
         """
         next_look = time.monotonic() + ADDRESS_INTERVAL_S
         while True:

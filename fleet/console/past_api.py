@@ -38,7 +38,7 @@ _TOO_MANY: Final = "Other looks of this person at recordings have no answer yet.
 
 
 class PastApi:
-    """The routes. `place` is the sessions folder. colors: returns the color of each car."""
+    """The routes. `place` is the sessions folder. `colors` returns the color of each car."""
 
     def __init__(self, place: Path, colors: Callable[[], Mapping[str, str]]) -> None:
         self._place = place

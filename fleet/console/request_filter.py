@@ -46,7 +46,7 @@ _HTTPS_PORT: Final = 443
 class Guard:
     """Passes requests of our own pages to the app, and refuses all others.
 
-    hosts: the allowed values of Host, as `127.0.0.1:7448`. token: the value of the cookie. on_refusal: called with
+    hosts: the allowed values of Host, as `127.0.0.1:7448`. token: the value of the cookie. `on_refusal` is called with
     words for the log.
     """
 
@@ -107,8 +107,8 @@ class Guard:
 class NetworkGuard(Guard):
     """The same for the network: only paired devices pass. All others can read the page that pairs, and nothing else.
 
-    names: returns the host names of this computer. device_of: returns the device of a cookie, and what the cookie
-    may do. on_device: called with the address of each connection that has shown a cookie.
+    `names` returns the host names of this computer. `device_of` returns the device of a cookie, and what the cookie
+    may do. `on_device` is called with the address of each connection that has shown a cookie.
     """
 
     def __init__(

@@ -89,7 +89,7 @@ class StopReport:
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float, *, lost_bus: bool = False) -> None:
         """Handle the final outcomes. A car without an outcome was not reached.
 
-        lost_bus: True if the bus was lost before the stop was answered.
+        `lost_bus` is True if the bus was lost before the stop was answered.
         """
         by_car = {outcome.car: outcome for outcome in outcomes}
         for car in {*self._cars, *by_car}:

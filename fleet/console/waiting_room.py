@@ -50,7 +50,7 @@ class _AddressLine:
 
 @dataclass(slots=True)
 class WaitingRoom:
-    """The lines by address. choose: returns a random one of some connections."""
+    """The lines by address. `choose` returns a random one of some connections."""
 
     choose: Callable[[Sequence[Hashable]], Hashable]
     _lines: dict[str, _AddressLine] = field(default_factory=dict)

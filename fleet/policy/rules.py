@@ -181,7 +181,7 @@ def follow_phase(
 ) -> PhaseState:
     """Return the phase now. Each phase lasts HYSTERESIS_S at least, so that two phases do not alternate quickly.
 
-    `ready`: True if every car is known and in its mode. The phase's timeout does not start before.
+    `ready` is True if every car is known and in its mode. The phase's timeout does not start before.
     """
     phase = plan.phases.get(before.name)
     if phase is None:

@@ -53,7 +53,7 @@ class Trial:
 def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, now: float) -> Trial:
     """Return what this plan would decide for these cars, first of all. Conditions over time have just begun.
 
-    `in_force`: None if no plan runs. Roles and the phase go on if both plans have them, as under `fleet plan set`.
+    `in_force` is None if no plan runs. Roles and the phase go on if both plans have them, as under `fleet plan set`.
     """
     # The states of all cars that speak are there already: nobody has to be waited for.
     begun = now - FIRST_STATE_TIMEOUT_S

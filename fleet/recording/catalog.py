@@ -72,7 +72,7 @@ class Catalog:
         *,
         on_session: Callable[[Path], None] | None = None,
     ) -> None:
-        """`directory`: None for `sessions` here. `on_session`: called for each session that is looked at."""
+        """`directory`: None for `sessions` here. `on_session` is called for each session that is looked at."""
         try:
             import duckdb
         except ImportError:

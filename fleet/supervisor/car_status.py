@@ -109,7 +109,7 @@ class StartProgress:
     def has_ended(self, missing: int, now: float, *, unreachable: bool) -> bool:
         """Return True if nobody is missing, or if nobody has become ready for a while.
 
-        unreachable: True if only links of cars cannot be opened.
+        `unreachable` is True if only links of cars cannot be opened.
         """
         if self.fewest is None or missing < self.fewest:
             self.fewest, self.since = missing, now

@@ -116,9 +116,9 @@ class Child:
         on_line: Callable[[str], bool | None],
         on_exit: Callable[[int], None],
     ) -> "Child":
-        """Start a process. on_exit: called with the exit code.
+        """Start a process. `on_exit` is called with the exit code.
 
-        on_line: called with each line of stdout; returns False for a line that is not to be logged.
+        `on_line` is called with each line of stdout; returns False for a line that is not to be logged.
 
         Raises OSError.
         """

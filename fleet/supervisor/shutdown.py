@@ -38,7 +38,7 @@ class GatewayShutdown:
     A gateway that crashed or was killed before its car stopped is replaced once in any case. If a gateway reports that
     it could not stop its car, it is replaced until `hurry`, provided that the car was ever reached.
 
-    on_result: called with a car's name and the result. exists: returns False if the car was a simulated one whose
+    `on_result` is called with a car's name and the result. `exists` returns False if the car was a simulated one whose
     simulator has ended.
     """
 

@@ -75,7 +75,7 @@ class LinkHealth:
         """Update the state. Return True on a change.
 
         `limit_s`: the longest normal silence; None if every silence is normal. `unheard_s`: the time without a reading
-        beyond the blocks of our frames (see `ModeEstimator`). `is_heard`: False if control counts the car as silent.
+        beyond the blocks of our frames (see `ModeEstimator`). `is_heard` is False if control counts the car as silent.
         """
         if self.state is LinkState.LOST:
             return False

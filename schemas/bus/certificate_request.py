@@ -31,7 +31,7 @@ def identity_in(path: Path) -> str:
 def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[bytes], bytes]) -> str:
     """Store the next certificate of an identity. Return why there is none, or an empty text if it is stored.
 
-    file: name of the certificate's file. ask: sends a request to the hub, and returns the answer; empty if there is
+    file: name of the certificate's file. `ask` sends a request to the hub, and returns the answer; empty if there is
     none.
     """
     path = credentials.directory / f"{file}.pem"

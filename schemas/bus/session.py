@@ -83,7 +83,7 @@ class Bus:
     ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
-        start_hub: True to start a hub if there is none. Otherwise a missing hub raises NoFleet.
+        With `start_hub`, start a hub if there is none. Otherwise a missing hub raises NoFleet.
         identity: the one to connect as, such as `car.red`; by default that of the user. It matters only to a hub with
         certificates. Raises NoCredentials if this computer has no such certificate.
         """

@@ -71,7 +71,7 @@ class _Reading:
 
 
 class SleepWatch:
-    """Measures the sleeps of the computer. `clocks`: None if the system has none, and no sleep is noticed.
+    """Measures the sleeps of the computer. `clocks` is None if the system has none, and no sleep is noticed.
 
     A process may be interrupted between its readings of the two clocks. So it reads the one without sleep before and
     after the other. Only what is certainly a sleep counts: an interruption never does.

@@ -49,7 +49,7 @@ class RecordScanner:
     def parts(self, *, extras: bool = False) -> Iterator[ChunkPart]:
         """Yield the records that contain messages or describe channels, in order.
 
-        extras: True to yield the attachments and metadata instead.
+        With `extras`, yield the attachments and metadata instead.
         """
         wanted = _EXTRAS if extras else _HOLDS_MESSAGES
         size, at = self._size, len(MAGIC)

@@ -38,7 +38,7 @@ class Prepared:
 def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole: bool) -> Prepared | None:
     """Return the session's own files if Rerun can read them as they are, else None.
 
-    wanted: as for `copied`. whole: True if all of the session is selected.
+    wanted: as for `copied`. `whole` is True if all of the session is selected.
     """
     indexes = list(session.indexes().values())
     if session.damage or len(indexes) != len(session.segments):
