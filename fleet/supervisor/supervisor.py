@@ -82,7 +82,7 @@ class SupervisorEvent:
 class Supervisor:
     """Keeps the processes of a fleet running. `run` returns True if every car was stopped.
 
-    `read` reads the spec again for a reload, and raises ValueError if it is invalid. `on_event` is called with each event.
+    `read` reads the spec again for a reload, and raises ValueError if it is invalid. `on_event` gets each event.
     """
 
     def __init__(
