@@ -1,4 +1,4 @@
-"""The links of a fleet file: those of `gateway run --link`, and `sim`. Finds links that name the same port."""
+"""The links in a fleet file: those of `gateway run --link`, and `sim`. Finds links that name the same port."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

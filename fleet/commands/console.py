@@ -280,7 +280,7 @@ def _network() -> Any:
 
 
 def _people_of(file: Path) -> People:
-    """Return the people of a fleet file, none if it cannot be read."""
+    """Return the people in a fleet file, none if it cannot be read."""
     return people_table(read_people(file))
 
 

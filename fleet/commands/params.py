@@ -312,7 +312,7 @@ def _groups_of_file() -> Mapping[str, Sequence[str]]:
 
 
 def complete_people(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the people of the fleet file here for the shell. Never fails or prints."""
+    """Return the people in the fleet file here for the shell. Never fails or prints."""
     file = _file_here()
     return sorted(name for name in (file and file.people) or () if name.startswith(incomplete))
 

@@ -159,7 +159,7 @@ def _all_known(state: CarState) -> bool:
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:
-    """Return the cars of a fleet file as the policy knows them before their gateways are up."""
+    """Return the cars in a fleet file as the policy knows them before their gateways are up."""
     return {
         name: CarSnapshot(
             platform="" if car.platform.startswith(AUTO) else car.platform,

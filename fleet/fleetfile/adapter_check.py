@@ -1,4 +1,4 @@
-"""Adds up what the cars of a fleet file ask of the computer's Bluetooth adapters. Opens nothing.
+"""Adds up what the cars in a fleet file ask of the computer's Bluetooth adapters. Opens nothing.
 
 An adapter tells nobody how many connections it holds: the car that is one too many does not connect. So the numbers are
 those of most adapters.

@@ -135,7 +135,7 @@ def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) 
 
 
 def read_colors(path: Path) -> Mapping[str, Rgb]:
-    """Return the colors of the cars of a fleet file. Empty if it cannot be read."""
+    """Return the colors of the cars in a fleet file. Empty if it cannot be read."""
     try:
         file = read_fleet(path, unbound=True, moved=True)
     except BadFile:
@@ -144,7 +144,7 @@ def read_colors(path: Path) -> Mapping[str, Rgb]:
 
 
 def people_table(people: Mapping[str, FleetPerson] | None) -> People:
-    """Return the people of a fleet file as the rules know them. Whose cars they drive is for the gateways."""
+    """Return the people in a fleet file as the rules know them. Whose cars they drive is for the gateways."""
     if people is None:
         return NO_PEOPLE
     leads = {name for name, person in people.items() if person.rank is PersonRank.LEAD}
@@ -152,7 +152,7 @@ def people_table(people: Mapping[str, FleetPerson] | None) -> People:
 
 
 def read_people(path: Path) -> Mapping[str, FleetPerson] | None:
-    """Return the people of a fleet file by name. None if it lists none, or cannot be read."""
+    """Return the people in a fleet file by name. None if it lists none, or cannot be read."""
     try:
         return read_fleet(path, unbound=True, moved=True).people
     except BadFile:

@@ -1,4 +1,4 @@
-"""Checks the links of a fleet file without opening any that could move, reset or end a car.
+"""Checks the links in a fleet file without opening any that could move, reset or end a car.
 
 Opening a serial port resets an Arduino. Closing a connection to a Raspberry Pi car ends its program while the motors go
 on (docs/reference/protocol.md#hazards-of-raspberry-pi-programs), so only its host is checked. A car with a gateway is

@@ -1,6 +1,6 @@
 """Finds what can never work in a plan before anything moves: roles that no car can fill, rules that never fire. Pure.
 
-parser.py reports faults of the text itself. The lint checks the plan against the cars of a fleet file or, without one,
+parser.py reports faults of the text itself. The lint checks the plan against the cars in a fleet file or, without one,
 against cars of any platform.
 """
 
@@ -75,7 +75,7 @@ def find_faults(
 ) -> Faults:
     """Return the faults of a plan that should be put in force.
 
-    `cars` has the cars of the fleet file (observer.listed_cars), or is None if there is no such file. Then each car of
+    `cars` has the cars in the fleet file (observer.listed_cars), or is None if there is no such file. Then each car of
     the plan that is not among `present`, the cars on the bus, gives a warning and no error, because it may still come.
     If `present` is None, nobody knows which cars are on the bus.
     """
@@ -98,7 +98,7 @@ def _named(plan: Plan) -> set[str]:
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
-    """Return the faults of a plan by line. `fleet` has the cars of the fleet file, or is None if there is no file."""
+    """Return the faults of a plan by line. `fleet` has the cars in the fleet file, or is None if there is no file."""
     found = dict.fromkeys(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
     return tuple(sorted(found, key=_position))
 

@@ -68,7 +68,7 @@ class Outlook:
 class ModeReachability:
     """The modes that cars can get into under a plan.
 
-    `fleet` has the cars of the fleet file. If it is None, the cars are those that the plan names. If the plan is open
+    `fleet` has the cars in the fleet file. If it is None, the cars are those that the plan names. If the plan is open
     to other cars, ANY_CAR is among them.
     """
 

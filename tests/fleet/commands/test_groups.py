@@ -1,6 +1,7 @@
 """Groups of cars, where commands take cars: `@a`."""
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert "no group" in error("get", "@a")
     assert error("list", "@A").endswith(' mean "@a"?')
     for command in ("list", "stop", "pause"):
-        assert error(command, "--fleet", "flet").startswith('No fleet "flet" ')
+        assert re.fullmatch(r'No fleet "flet" .*: fleet\.', error(command, "--fleet", "flet"))
     named = CliRunner().invoke(cli, ["stop", "red", "--fleet", "flet", "--connect", client.bus.endpoint])
     assert named.exit_code == 1
     assert named.output.startswith("red: NOT STOPPED")

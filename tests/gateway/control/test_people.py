@@ -258,7 +258,7 @@ def test_pause_stops_like_a_stop_and_only_leads_drive(desk: Workbench) -> None:
             'red is paused with the whole fleet (teacher: "listen"). A lead ends it with `fleet unpause`.'
         )
     ended = desk.ask(Unpause(), ANN)
-    assert ended.reason in (Reason.PAUSED, Reason.NOT_ALLOWED)
+    assert ended.reason is Reason.NOT_ALLOWED
     assert "(teacher)" in ended.words
     assert desk.ask(Resume(all=True), ANN).words.endswith("paused by teacher: `fleet unpause`")
     assert desk.ask(FORWARD, TEACHER).status is Phase.QUEUED
