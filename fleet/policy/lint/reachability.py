@@ -211,7 +211,7 @@ class ModeReachability:
     def _find_modes(self, car: str, phase: str, condition: PlanCondition) -> dict[Mode, str]:
         """Return the modes that the plan can bring a watched car into, each with the only case in which it does so.
 
-        The text is empty if the mode is possible in several cases.
+        The text is empty if no single case is known.
         """
         roles, role = self._list_roles(car, phase), condition.role
         result = {each.mode: "" for each in roles if role in (None, each.name)}

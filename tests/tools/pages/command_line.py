@@ -172,4 +172,6 @@ def _action_row(action: argparse.Action) -> str:
     silent = action.default in (None, False, argparse.SUPPRESS) or action.default == []
     default = "required" if action.required and action.option_strings else "" if silent else f"`{action.default}`"
     words = (action.help or "") % {"prog": "gateway", "default": action.default}
+    if default and default != "required":
+        words = re.sub(r" \(default: [^()]*\)", "", words)  # the column has it
     return f"| `{names}{metavar}` | {default} | {cell(words)} |"
