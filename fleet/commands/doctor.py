@@ -35,7 +35,9 @@ examples:
   fleet doctor latest
   fleet doctor latest red     # why did red not stop
 
-The first line is the likely cause and what to type. The exit code is 1 if something is odd."""
+The first line is the likely cause and what to type.
+
+Exit codes: 0 nothing is odd, 1 something is odd."""
 )
 @click.argument("name", required=False, metavar="[CAR | SESSION]", shell_complete=complete_car)
 @click.argument("car", required=False, metavar="[CAR]")

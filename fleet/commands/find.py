@@ -41,7 +41,9 @@ examples:
   fleet find 'range_m < 0.3'
   fleet find 'not (line.left_inner or line.right_inner)' --car red --for 2s --since monday
   fleet find 'range_m < 0.1' --mark --csv > near.csv
-  fleet find "mode.verdict == 'contradicted'" /media/disk/sessions --json"""
+  fleet find "mode.verdict == 'contradicted'" /media/disk/sessions --json
+
+Exit codes: 0 there is a hit, 1 there is none, or a session with a hit could not be marked, 2 wrong use."""
 )
 @click.argument("condition", metavar="CONDITION")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
@@ -69,8 +71,8 @@ def find(
     """Find when CONDITION held, in every session in DIR (default: sessions).
 
     CONDITION is written as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is
-    unknown. A hit lasts from the first reading that shows it to the last one. The exit code is 1 if there is no hit, or
-    if a session with a hit could not be marked. The quota does not remove marked sessions.
+    unknown. A hit lasts from the first reading that shows it to the last one. The quota does not remove
+    marked sessions.
     """
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")

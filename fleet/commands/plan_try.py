@@ -35,7 +35,7 @@ examples:
   fleet plan try latest~1
   fleet plan try latest~1 new.yaml
 
-Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
+Exit codes: 0 no differences, 1 differences, or nothing to compare, 2 no plan."""
 )
 @session_argument
 @click.argument("path", metavar="[PLAN]", required=False, type=click.Path(path_type=Path, dir_okay=False))

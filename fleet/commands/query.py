@@ -22,7 +22,9 @@ from schemas.printable import printable
 examples:
   fleet query --tables
   fleet query "SELECT session, car, min(range_m) FROM sensor_range GROUP BY ALL"
-  fleet query "SELECT car, mode, count(*) FROM sensor_line_context GROUP BY ALL" --csv > modes.csv"""
+  fleet query "SELECT car, mode, count(*) FROM sensor_line_context GROUP BY ALL" --csv > modes.csv
+
+Exit codes: 0 done, 1 no session could be read, or no disk has room for the tables, 2 wrong use."""
 )
 @click.argument("sql", required=False, metavar="[SQL]")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
@@ -35,8 +37,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     SQL is that of DuckDB. Each topic is a table, such as sensor_range or event_command, with the columns of `fleet
     sessions export` and the column session. Tables named ..._context add the mode, motion, driver and plan at that
     time. Times are UTC. The sender of a command is a process (tom@host-4711): person_of(sender) is the person.
-    Sessions that are not whole are listed, and their intact part counts. The exit code is 1 if no session could be
-    read, or if no disk has room for the tables.
+    Sessions that are not whole are listed, and their intact part counts.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing

@@ -112,16 +112,14 @@ def _say_removed(place: Path) -> None:
 
 
 @sessions.command(
-    epilog="\b\nexamples:\n  fleet sessions at 14:05\n  fleet sessions at 'yesterday 14:05' /media/disk/sessions\n"
+    epilog="\b\nexamples:\n  fleet sessions at 14:05\n  fleet sessions at 'yesterday 14:05' /media/disk/sessions\n\n"
+    "Exit codes: 0 a session ran then, 1 none did, 2 wrong use."
 )
 @click.argument("time_text", metavar="TIME")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date.
-
-    The exit code is 1 if no session ran then.
-    """
+    """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date."""
     now_s = time.time()
     try:
         time_spec.is_within(time_text, 0, 0, now_s)  # refuses a wrong time even where there is no session
@@ -182,14 +180,13 @@ def _size(count: int) -> str:
     return f"{size:.1f} GB"
 
 
-@sessions.command(epilog="\b\nexample:\n  fleet sessions info\n")
+@sessions.command(
+    epilog="\b\nexample:\n  fleet sessions info\n\nExit codes: 0 it could be read, 1 no message could be read."
+)
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
-    """Show what is in a session: versions, cars, keys with their rates, marks, lost messages.
-
-    The exit code is 1 if no message could be read.
-    """
+    """Show what is in a session: versions, cars, keys with their rates, marks, lost messages."""
     from fleet.recording.tools.summary import SessionState, marks_of, of_session, stops_of
     from fleet.recording.tools.transform import origin_words
 
@@ -239,13 +236,13 @@ def _say_contents(about: "SessionSummary") -> None:
         click.echo(f"  {shown[key].ljust(width)}  {count:8}{rate}")
 
 
-@sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n")
+@sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n\nExit codes: 0 nothing is missing, 1 something is.")
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
     """Check a recording: checksums, missing messages, schemas, clocks.
 
-    The command lists exactly what is missing. The exit code is 1 if anything is missing.
+    The command lists exactly what is missing.
     """
     from fleet.recording.tools.summary import growing, total
     from fleet.recording.tools.verify import verify as look
