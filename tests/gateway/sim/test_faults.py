@@ -17,6 +17,7 @@ from gateway.sim.faults import (
 )
 from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
+from tests.support.text_parts import has_parts
 
 GOOD_FAULTS = [
     ("red:link_drop@5+2", Scheduled(5.0, Fault(FaultKind.LINK_DROP, "red", 2.0))),
@@ -157,16 +158,16 @@ def test_whom_it_is_for(act: Fault | Press, names: list[str]) -> None:
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (Fault(FaultKind.ECHO, "nobody"), "use red, blue, green, old"),
-        (Fault(FaultKind.BROWNOUT, "old"), "brownout needs a simulated car"),
-        (Press(Button.STOP, "old"), "ir needs a simulated car"),
-        (Fault(FaultKind.RENAME, path="/tmp/new"), "only with the name of a car"),
+        (Fault(FaultKind.ECHO, "nobody"), "red, blue, green, old"),
+        (Fault(FaultKind.BROWNOUT, "old"), "brownout … simulated car"),
+        (Press(Button.STOP, "old"), "ir … simulated car"),
+        (Fault(FaultKind.RENAME, path="/tmp/new"), "only with the name"),
         (Fault(FaultKind.RENAME, "blue", path="/tmp/new"), "whose link is pty:PATH"),
         (Fault(FaultKind.RENAME, "old", path="/tmp/new"), "whose link is pty:PATH"),
-        (Fault(FaultKind.RENAME, "red", path="/tmp/green"), "car green has it"),
+        (Fault(FaultKind.RENAME, "red", path="/tmp/green"), "car green"),
     ],
 )
 def test_whom_it_cannot_be_for(act: Fault | Press, words: str) -> None:
     with pytest.raises(BadSpec) as error:
         targets(CARS, act)
-    assert words in str(error.value)
+    assert has_parts(str(error.value), words)

@@ -8,6 +8,7 @@ import pytest
 from pydantic import Field
 
 from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile, Entry, read_text
+from tests.support.text_parts import has_parts
 from tests.support.yaml_text import read_yaml
 
 
@@ -52,42 +53,42 @@ def test_yaml_is_that_of_1_2() -> None:
 @pytest.mark.parametrize(
     ("text", "place", "words"),
     [
-        ("", "1:1", "the file is empty"),
-        ("# nothing but words\n", "1:1", "the file is empty"),
+        ("", "1:1", "file is empty"),
+        ("# nothing but words\n", "1:1", "file is empty"),
         ("wheels:\n\ta: 1", "2:1", "a tab"),
-        ("wheels: {a: {}\n", "2:1", "this is not YAML"),
-        ("- 1", "1:1", "a list is not allowed. Write fields"),
+        ("wheels: {a: {}\n", "2:1", "not YAML"),
+        ("- 1", "1:1", "a list … fields"),
         ("--- {}\n--- {}", "2:1", "a second document"),
-        ("wheels: {}\nwheels: {}", "2:1", "wheels: is given twice, first in line 1"),
+        ("wheels: {}\nwheels: {}", "2:1", "wheels: … twice, … line 1"),
         ("wheels: {a: {spokes: 2, spokes: 3}}", "1:25", "wheels.a.spokes: is given twice"),
-        ("mode: fast", "1:1", "wheels: is missing. At least one wheel."),
-        ("wheels:", "1:8", "wheels: has no value. Write fields"),
-        ("wheels: {1: {}}", "1:10", "key '1' is not a word"),
-        ("wheels: {[a]: {}}", "1:10", "is not a word"),
-        ("wheels: {a: {size_m: .nan}}", "1:22", "not a finite number"),
-        ("wheels: {a: {size_m: 1e999}}", "1:22", "not a finite number"),
-        ("wheels: {a: {size_m: true}}", "1:22", "true is not allowed. Write a number"),
-        ("wheels: {a: {spokes: '8'}}", "1:22", "'8' is not allowed. Write a whole number"),
-        ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long a number"),
-        ("wheels: {a: {spokes: " + "9" * 50 + "}}", "1:22", "too large a number"),
+        ("mode: fast", "1:1", "wheels: is missing. … one wheel."),
+        ("wheels:", "1:8", "wheels: … no value. … fields"),
+        ("wheels: {1: {}}", "1:10", "key '1' … word"),
+        ("wheels: {[a]: {}}", "1:10", "not a word"),
+        ("wheels: {a: {size_m: .nan}}", "1:22", "finite number"),
+        ("wheels: {a: {size_m: 1e999}}", "1:22", "finite number"),
+        ("wheels: {a: {size_m: true}}", "1:22", "true … number"),
+        ("wheels: {a: {spokes: '8'}}", "1:22", "'8' … whole number"),
+        ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long"),
+        ("wheels: {a: {spokes: " + "9" * 50 + "}}", "1:22", "too large"),
         ("wheels: !!python/object:os.system {a: {}}", "1:9", "the tag"),
-        ("wheels: {}\nspare: #ff8000", "2:7", "a # begins a comment. Write the color in quotes: '#ff8000'"),
-        ("wheels: {a: {size_m: #ff8000}}\nmode: fast", "1:22", "Write the color in quotes: '#ff8000'"),
-        ("wheels: {}\nnames: [#ff8000, #ff0000]", "2:9", "Write the color in quotes: '#ff8000'"),
-        ("wheels: {}\nnames: 3 #ff8000", "2:8", "3 is not allowed. Write a list"),
-        ("wheels: {}\nspare: true", "2:8", "true is not allowed. Write fields"),
-        ("wheels: {}\nnames: 7", "2:8", "7 is not allowed. Write a list"),
-        ("wheels: {}\nmode: !secret x", "2:7", "the tag '!secret' is not allowed"),
+        ("wheels: {}\nspare: #ff8000", "2:7", "a # … comment. … in quotes: '#ff8000'"),
+        ("wheels: {a: {size_m: #ff8000}}\nmode: fast", "1:22", "in quotes: '#ff8000'"),
+        ("wheels: {}\nnames: [#ff8000, #ff0000]", "2:9", "in quotes: '#ff8000'"),
+        ("wheels: {}\nnames: 3 #ff8000", "2:8", "3 … list"),
+        ("wheels: {}\nspare: true", "2:8", "true … fields"),
+        ("wheels: {}\nnames: 7", "2:8", "7 … list"),
+        ("wheels: {}\nmode: !secret x", "2:7", "tag '!secret' "),
         ("wheels: {}\nnames: ['\x01']", "2:10", "U+0001"),
         ('wheels: {}\nnames: ["\\ud800"]', "2:9", "half a character"),
         ("wheels: *nobody", "1:9", "undefined alias"),
-        ("spare: {spokes: 0}\nwheels: {}", "1:17", "spare.spokes: 0 is not allowed. Write a whole number, at least 1."),
+        ("spare: {spokes: 0}\nwheels: {}", "1:17", "spare.spokes: 0 … whole number, … 1."),
     ],
 )
 def test_one_fault(text: str, place: str, words: str) -> None:
     (line,) = _faults(text)
     assert line.startswith(f"f.yaml:{place}: ")
-    assert words in line
+    assert has_parts(line, words)
 
 
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(

@@ -6,6 +6,7 @@ from fleet.policy.lint.lint import Severity, check
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from tests.support.text_parts import has_parts
 
 
 def listed(platform: str) -> CarSnapshot:
@@ -38,28 +39,24 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
                 "roles: {guide: {mode: tracking}}\n"
                 "rules: [{when: {any_car: battery.level == 'low', with_role: guide}, then: {who: red, mode: manual}}]"
             ),
-            (
-                "rule 1: it never fires. It waits for battery.level from cars with role guide, but they are always in"
-                " tracking. A car measures it only in manual."
-            ),
+            "rule 1: it never fires. … battery.level … role guide, … always in tracking. … only in manual.",
         ),
         (
             GUIDE
             + "rules: [{when: {any_car: range.range_m < 0.3, with_role: guide}, then: {who: this_car, mode: manual}}]",
-            "rule 1: it never fires. It waits for range.range_m from cars with role guide",
+            "rule 1: it never fires. … range.range_m … role guide",
         ),
         (
             GUIDE
             + "rules: [{when: {any_car: light.left, with_role: guide}, then: {who: this_car, mode: light_seeking}}]",
-            "A car measures it only in manual or light_seeking.",
+            "only in manual or light_seeking.",
         ),
-        (PATROL + LIGHT, "rule 1: it never fires. It waits for light.left from cars, but they are always in"),
+        (PATROL + LIGHT, "rule 1: it never fires. … light.left … always in"),
         (
             SEARCH.replace("SEARCH", "roles: [patrol]"),
             (
-                "phase search: it never ends. It waits for light.left from cars, but they are always in"
-                " obstacle_avoidance in phase search. A car measures it only in manual or light_seeking."
-                " Or add timeout_s."
+                "phase search: it never ends. … light.left … obstacle_avoidance in phase search. … "
+                "only in manual or light_seeking. … timeout_s."
             ),
         ),
         # Two rules, each of which could only fire after the other one.
@@ -67,7 +64,7 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
             GUIDE
             + "rules:\n  - {when: {any_car: light.left}, then: {who: all_cars, mode: following}}\n"
             + "  - {when: {any_car: obstacle.left}, then: {who: all_cars, mode: light_seeking}}",
-            "rule 1: it never fires. It waits for light.left",
+            "rule 1: it never fires. … light.left",
         ),
         # A role that only such a rule assigns.
         (
@@ -76,7 +73,7 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
                 "rules:\n  - {when: {any_car: light.left}, then: {who: this_car, role: seek}}\n"
                 "  - {when: {any_car: light.right, with_role: seek}, then: {who: this_car, mode: manual}}"
             ),
-            "rule 2: it never fires. There are never cars with role seek.",
+            "rule 2: it never fires. … role seek.",
         ),
         # Each field is measured in some mode, but no mode of the plan measures both.
         (
@@ -84,14 +81,14 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
                 "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, count: all}}\n"
                 "rules: [{when: {any_car: light.left and line.left_outer}, then: {who: this_car, mode: manual}}]"
             ),
-            "rule 1: it never fires. It waits for all of light.left, line.left_outer from cars",
+            "rule 1: it never fires. … all of light.left, line.left_outer ",
         ),
     ],
 )
 def test_what_the_plan_never_lets_be_measured_is_an_error(
     text: str, told: str, fleet: dict[str, CarSnapshot] | None
 ) -> None:
-    assert any(told in each for each in found(text, fleet, Severity.ERROR)), check(parse(text), fleet)
+    assert any(has_parts(each, told) for each in found(text, fleet, Severity.ERROR)), check(parse(text), fleet)
 
 
 @pytest.mark.parametrize(
@@ -100,12 +97,12 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         (
             PATROL.replace("count: all", "count: all, needs: battery.voltage_v > 7") + LIGHT,
             None,
-            "rule 1: it fires only when a car has no role because it does not meet battery.voltage_v > 7",
+            "rule 1: it fires only … no role … battery.voltage_v > 7",
         ),
         (
             SEARCH.replace("SEARCH", "timeout_s: 60, roles: [patrol]"),
             THREE,
-            "phase search: only its timeout ends it. It waits for light.left from cars, but they are always in obs",
+            "phase search: only its timeout … light.left … always in obs",
         ),
         (
             SEARCH.replace("SEARCH", "roles: [patrol]")
@@ -116,14 +113,14 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         (
             SEARCH.replace("SEARCH", "timeout_s: 1.6, roles: [rest]").replace("for_s: 1", "for_s: 2"),
             THREE,
-            "phase search: only its timeout ends it. Its `until` takes 2 s, and timeout_s is 1.6.",
+            "phase search: only its timeout … `until` … 2 s, … timeout_s … 1.6.",
         ),
     ],
 )
 def test_what_may_be_measured_by_chance_is_a_warning(
     text: str, fleet: dict[str, CarSnapshot] | None, told: str
 ) -> None:
-    assert any(told in each for each in found(text, fleet, Severity.WARNING)), check(parse(text), fleet)
+    assert any(has_parts(each, told) for each in found(text, fleet, Severity.WARNING)), check(parse(text), fleet)
     assert found(text, fleet, Severity.ERROR) == []
 
 
