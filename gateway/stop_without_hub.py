@@ -49,7 +49,7 @@ async def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_di
 
 
 async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Open the link, stop the car, close the link. Return why it was not stopped; empty if it was. Raises LinkError."""
+    """Open the link, stop the car, close the link. Return why it was not stopped. Empty if it was. Raises LinkError."""
     learned = LearnedFile(state_dir, fleet, car, link=car_link(url), platform=platform)
     loop = asyncio.get_running_loop()
     make = learned.load(partial(drivers.driver_of, platform))

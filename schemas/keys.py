@@ -108,7 +108,7 @@ def recorder_token(fleet: str, site: str = "") -> str:
 
 
 def recorder_site(fleet: str, token: str) -> str | None:
-    """Return the site of a recorder's token, empty for the recorder of the fleet; None if the key is no such token."""
+    """Return the site of a recorder's token, empty for the recorder of the fleet, or None for another key."""
     start, _, site = token.partition(f"{fleet}/{RECORDER}")
     if start or not (site == "" or site.startswith("/")):
         return None

@@ -399,7 +399,7 @@ class Driver(ABC):
         """Return when the car can take a motion, as far as that is known."""
 
     def wait_words(self, now: float) -> str:
-        """Return what must happen before the car may be driven, for a person; empty if it may."""
+        """Return what must happen before the car may be driven, for a person. Empty if it may."""
         del now
         return ""
 

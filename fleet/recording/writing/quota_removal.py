@@ -45,7 +45,7 @@ class Enforced:
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """Maximum size of all sessions together, and of one, in bytes; 0 is no limit."""
+    """Maximum size of all sessions together, and of one, in bytes. 0 means no limit."""
 
     total: int = 0
     """The oldest unpinned segments of unmarked sessions are removed first."""
@@ -54,7 +54,7 @@ class Quota:
 
     @property
     def session_limit(self) -> int:
-        """Return the maximum size of one session in bytes; 0 is no limit."""
+        """Return the maximum size of one session in bytes. 0 means no limit."""
         return self.session or self.total // SESSIONS_PER_QUOTA
 
     @property

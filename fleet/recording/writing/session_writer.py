@@ -46,7 +46,7 @@ class Sync(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Limits and files of the sessions to write; 0 is no limit."""
+    """Limits and files of the sessions to write. 0 means no limit."""
 
     segment_bytes: int = 512 * MB
     """Size at which a segment is rolled over."""
