@@ -22,7 +22,7 @@ class BadCapture(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CapturedBytes:
-    """Bytes as they arrived. `at`: seconds since the start of the capture; the file has microseconds."""
+    """Bytes as they arrived. `at` is in seconds since the start of the capture. The file has microseconds."""
 
     at: float
     data: bytes

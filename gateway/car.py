@@ -86,7 +86,7 @@ class Settings:
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
     holds_of: str = ""
-    """The car that holds and loans belong to; empty for the car at this link."""
+    """The car that holds and loans belong to. Empty for the car at this link."""
 
 
 class CarGateway:

@@ -29,7 +29,7 @@ class WallClock:
         self._offset_ns, _ = self._measure_offset()
 
     def ns(self, at: float) -> int:
-        """Return nanoseconds since the epoch. `at`: seconds of the monotonic clock."""
+        """Return nanoseconds since the epoch. `at` is in seconds of the monotonic clock."""
         offset_ns, error_ns = self._measure_offset()
         if abs(offset_ns - self._offset_ns) > MIN_STEP_NS + error_ns:
             self._offset_ns = offset_ns

@@ -25,7 +25,7 @@ class LearnedFile:
         self._owner = {"link": link, "platform": platform}
         self._saved = ""
         self.trouble = ""
-        """Why nothing was taken from a file that exists, for a person; empty if all is well."""
+        """Why nothing was taken from a file that exists, for a person. Empty if all is well."""
 
     def load(self, use: Callable[[Mapping[str, Any]], T]) -> T:
         """Return what `use` makes of what was learned, or of nothing. `use` raises ValueError for damage."""

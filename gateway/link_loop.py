@@ -47,7 +47,7 @@ class LinkLoop:
         on_gap: Callable[[float], None],
         on_open: Callable[[], None],
     ) -> None:
-        """`on_gap` looks for a gap of the loop before bytes are judged. `on_open`: the link is proven to be open."""
+        """`on_gap` looks for a gap of the loop before bytes are judged. `on_open` hears that the link is proven."""
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self.url = url

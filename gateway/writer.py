@@ -44,7 +44,7 @@ class Writer:
         """Set when the driver has finished after `shut_down`."""
 
     async def run(self, flush: Callable[[], None]) -> None:
-        """Write frames when control needs it. `flush`: answer queries and publish records, after each turn."""
+        """Write frames when control needs it. After each turn, `flush` answers queries and publishes records."""
         while True:
             self._wake.clear()
             await self._write_due()

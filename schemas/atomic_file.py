@@ -12,7 +12,7 @@ DAMAGE: Final = (ValueError, TypeError, KeyError, AttributeError, OverflowError,
 def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bool = False) -> None:
     """Write a file, or replace it and keep its mode. With `sync`, it survives a power failure. Raises OSError.
 
-    private: nobody but the user may read it, at no time.
+    If `private`, only the user may read it, at any time.
     """
     scratch = path.with_name(f".{path.name}.new")
     try:

@@ -56,7 +56,7 @@ def car(name: str) -> str:
 
 
 def service(name: Service, at_site: str = "") -> str:
-    """Return the identity of a service. at_site: the name of the other site where it runs; empty at the first hub."""
+    """Return the identity of a service. `at_site` is the other site where it runs, or empty at the first hub."""
     return f"{IdentityRole.SERVICE}.{name}{_AT}{at_site}" if at_site else f"{IdentityRole.SERVICE}.{name}"
 
 
@@ -119,7 +119,7 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
 def may_locate(identity: str, of: str) -> bool:
     """Return True if an identity may publish the pose of this car: its own gateway, and a locator.
 
-    identity: empty on a hub without certificates; everyone may there.
+    `identity` is empty on a hub without certificates, where everyone may.
     """
     return identity in ("", car(of)) or parse(identity) == (IdentityRole.SERVICE, Service.LOCATOR)
 
@@ -127,7 +127,7 @@ def may_locate(identity: str, of: str) -> bool:
 def sender_for(identity: str, sender: str, verb: str) -> str:
     """Return the sender of a person's command to a service: as it is named, else the owner of the certificate.
 
-    identity: empty on a hub without certificates; every name is believed there. Raises NotTheSender.
+    `identity` is empty on a hub without certificates, where every name is believed. Raises NotTheSender.
     """
     sender = sender or identity.partition(".")[2] or ANONYMOUS
     if identity and not speaks_for(identity, sender, Rank.PERSON, verb):

@@ -81,7 +81,7 @@ def topic_key(fleet: str, car: str, topic: str) -> str:
 
 
 def command_key(fleet: str, car: str, verb: str, identity: str = "") -> str:
-    """Return the key of a car's command. identity: whose certificate it carries, on a hub with rules."""
+    """Return the key of a car's command. On a hub with rules, it carries the `identity` of the certificate."""
     by = f"{BY}/{identity}/" if identity else ""
     return f"{fleet}/{car}/@cmd/{by}{verb}"
 

@@ -9,7 +9,7 @@ _NS: Final = 1_000_000_000
 
 
 def clock(at_s: float) -> str:
-    """Return a time of day, such as `14:05:12 CET`. at_s: s since the epoch."""
+    """Return a time of day, such as `14:05:12 CET`. `at_s` is in s since the epoch."""
     return _local(at_s).strftime("%H:%M:%S %Z") if _is_date(at_s) else f"{at_s:.0f} s"
 
 
@@ -24,7 +24,7 @@ def date(at_s: float, days_before: int = 0) -> str:
 
 
 def exact(at_ns: int) -> str:
-    """Return a date and a time with milliseconds, `2026-11-25 14:05:12.345 CET`. at_ns: ns since the epoch."""
+    """Return a date and a time with milliseconds, `2026-11-25 14:05:12.345 CET`. `at_ns` is since the epoch."""
     if not _is_date(at_ns / _NS):
         return f"{at_ns} ns"
     seconds, rest = divmod(at_ns, _NS)

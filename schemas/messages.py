@@ -75,7 +75,7 @@ _FOXGLOVE_LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Leve
 
 
 def log_message(at_ns: int, level: Level, name: str, words: str) -> Message:
-    """Return a foxglove.Log. at_ns: ns since the epoch."""
+    """Return a foxglove.Log. `at_ns` is in ns since the epoch."""
     message: Any = message_class("foxglove.Log")(level=_FOXGLOVE_LEVELS[level], name=name, message=words)
     message.timestamp.seconds, message.timestamp.nanos = divmod(at_ns, 1_000_000_000)
     return message  # type: ignore[no-any-return]  # the class has no types

@@ -119,7 +119,7 @@ class People:
         return replace(sender, kind=Rank.LEAD if leads else Rank.PERSON)
 
     def role(self, person: str) -> PersonRole | None:
-        """Return what a person is to this car; None for a person who is not listed."""
+        """Return what a person is to this car, or None for a person who is not listed."""
         return PersonRole.DRIVER if self.roles is None else self.roles.get(person)
 
     def may_drive(self, person: str) -> bool:
@@ -170,7 +170,7 @@ def _parse(entry: str) -> tuple[str, PersonRole]:
 class Hold:
     """Keeps the coordinator from moving a stopped car; after the stop of a lead also persons and scripts.
 
-    `since_ns`: ns since the epoch.
+    `since_ns` is in ns since the epoch.
     """
 
     by: str
@@ -180,7 +180,7 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Estop:
-    """One latched emergency stop. `at_ns`: wall clock, ns since the epoch; `fleet_wide`: every gateway latches it."""
+    """One latched emergency stop. `at_ns` is the wall clock since the epoch. If `fleet_wide`, all gateways latch it."""
 
     id: str
     by: str
@@ -192,7 +192,7 @@ class Estop:
 
 @dataclass(frozen=True, slots=True)
 class FleetPause:
-    """One pause of the whole fleet. `at_ns`: wall clock, ns since the epoch."""
+    """One pause of the whole fleet. `at_ns` is the wall clock, ns since the epoch."""
 
     id: str
     by: str
@@ -203,7 +203,7 @@ class FleetPause:
 
 @dataclass(frozen=True, slots=True)
 class Loan:
-    """The car is lent to the person `to`. `since_ns`: wall clock, ns since the epoch. `duration_s` is not published."""
+    """The car is lent to the person `to`. `since_ns` is the wall clock. `duration_s` is not published."""
 
     to: str
     by: str
@@ -218,7 +218,7 @@ class Loan:
 
 @dataclass(frozen=True, slots=True)
 class LeaseState:
-    """The sender who controls the car. `until`: s, monotonic, of the gateway; elsewhere it is not known."""
+    """The sender who controls the car. `until` is the gateway's monotonic time, s. Elsewhere it is not known."""
 
     holder: Sender
     until: float = inf
@@ -231,7 +231,7 @@ class LeaseState:
         return self.holder.name
 
     def refuses(self, sender: Sender, *, take: bool) -> bool:
-        """Return True if `sender` may not drive. `take`: a person takes the car from another person."""
+        """Return True if `sender` may not drive. With `take`, a person takes the car from another person."""
         if sender == self.holder:
             return False
         mine, theirs = strength(sender.kind), strength(self.holder.kind)

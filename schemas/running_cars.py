@@ -12,7 +12,7 @@ _SUFFIX: Final = ".running"
 
 
 class RunningMark:
-    """The mark of one gateway. It ends with its process, however that ends. directory: of the state of its bus."""
+    """The mark of one gateway. It ends with its process, however that ends. `directory` has the state of its bus."""
 
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self._lock = FileLock(directory / f"{fleet}.{car}{_SUFFIX}")

@@ -95,7 +95,7 @@ class CarState:
 
     @classmethod
     def of_answers(cls, car: str, answers: Iterable[tuple[str, Reading]], now: float, *, present: bool) -> Self:
-        """Return the state of a car by the answers to queries, with their topics. now: s since the epoch."""
+        """Return the state of a car by the answers to queries, with their topics. `now` is in s since the epoch."""
         state = cls(car, present)
         for topic, reading in sorted(answers, key=lambda each: each[1].time):  # the newest gateway has the last word
             state.take(topic, reading.value, now - age_of_answer_s(reading.time.timestamp(), now))

@@ -125,7 +125,7 @@ def describe_age(age_s: float) -> str:
 
 
 def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | None, why: str) -> CarClaim:
-    """Return a claim of a message of this age. since_s: as the message says."""
+    """Return a claim from a message of this age. `since_s` is what the message says."""
     after_s = topics.TOPICS[topic].stale_after_s
     is_stale = after_s is not None and age_s > after_s
     if isinf(age_s):  # its stamp tells no age

@@ -253,8 +253,8 @@ class Fleet:
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
         """Wait until `when` holds of a fresh reading and return that reading. The current one counts.
 
-        for_s: the condition must have held of all readings for this time, by their stamps. timeout_s: None for no
-        timeout. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
+        With `for_s`, the condition must have held for this time in all readings, by stamp. Without
+        `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
         """
         written = self.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, written), for_s)
@@ -321,7 +321,7 @@ class Fleet:
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
         """End the e-stops with these ids, or without ids the hold. If `cars` is None, do so for every car.
 
-        everything: end the hold and every e-stop that this sender may end. The outcome is not ok if something stays.
+        With `everything`, end the hold and every e-stop that this sender may end. The outcome is not ok if some stay.
         """
         return self.ask(resume_request(ids, everything=everything), cars)
 
@@ -483,7 +483,7 @@ class Car(CarCommands[Outcome]):
         At the end of the block, the car is stopped and released. Within the block, nobody of the same rank can drive
         the car. A command that is not carried out raises NotCarriedOut. After another sender has taken or stopped the
         car, every command raises LeaseLost. Entering the block raises both, too.
-        take: as a person (`Fleet(kind="person")`), take the car over from another person.
+        With `take`, a person (`Fleet(kind="person")`) takes the car over from another person.
         """
         return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)
 

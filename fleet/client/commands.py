@@ -65,7 +65,7 @@ class CommandRequest:
 
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
-    """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). wait: wait for the end of the drive."""
+    """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). With `wait`, wait until it ends."""
     if not hasattr(duration_s, "__float__"):  # text, of a caller without a type checker
         raise TypeError(f"duration {duration_s!r} is not allowed: write a number of seconds, such as 1.5")
     if not (math.isfinite(duration_s) and 0 < duration_s <= MAX_DRIVE_S):
@@ -131,7 +131,7 @@ def fan_request(state: str | None = None) -> CommandRequest:
 
 
 def lease_request(*, take: bool = False, release: bool = False) -> CommandRequest:
-    """Request a lease for 2 s, or its release. take: as a person, take the car over from another person."""
+    """Request a lease for 2 s, or its release. With `take`, a person takes the car over from another person."""
     return CommandRequest(Verb.LEASE, pb.LeaseCommand(release=release), take=take)
 
 
@@ -141,12 +141,12 @@ def stop_request() -> CommandRequest:
 
 
 def estop_request(why: str, scope: str) -> CommandRequest:
-    """Request an e-stop. scope: car or fleet."""
+    """Request an e-stop. `scope` is car or fleet."""
     return CommandRequest(Verb.ESTOP, pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
-    """Request the end of the e-stops of these ids. Without ids, request the end of the hold. everything: of both."""
+    """Request the end of the e-stops with these ids, or without ids of the hold. With `everything`, of both."""
     return CommandRequest(Verb.RESUME, pb.ResumeCommand(ids=ids, all=everything))
 
 
@@ -237,7 +237,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
-        """End the e-stops of these ids. Without ids, end the hold. everything: end all that this sender may end."""
+        """End the e-stops with these ids, or without ids the hold. With `everything`, end all that the sender may."""
         return self.do(resume_request(ids, everything=everything))
 
     def lend(self, to: str, duration_s: float) -> R:

@@ -434,7 +434,7 @@ def describe_reports(health: Any) -> str:
 
 
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:
-    """Return the findings and what is known, for JSON. options: as for `diagnose`."""
+    """Return the findings and what is known, for JSON. `options` are those of `diagnose`."""
     found = [asdict(finding) for finding in diagnose(evidence, options)]
     return {"car": evidence.state.car, "findings": found, "facts": dict(describe(evidence))}
 

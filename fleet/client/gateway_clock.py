@@ -44,7 +44,7 @@ class GatewayClock:
 
 
 def describe_clock(car: str, off_s: float | None) -> str:
-    """Return words about a clock that is wrong by more than MAX_CLOCK_OFF_S; empty for any other."""
+    """Return words about a clock that is wrong by more than MAX_CLOCK_OFF_S. Empty for any other."""
     if off_s is None or abs(off_s) <= MAX_CLOCK_OFF_S:
         return ""
     side = "ahead of" if off_s > 0 else "behind"

@@ -129,7 +129,7 @@ class Progress:
         self._worst_case_s = 0.0
         self._queued = False
         self.waits = ""
-        """Why the command waits for its car, and how long at most, as the gateway said; empty once its frame is out."""
+        """Why the command waits for its car, and how long at most, as the gateway said. Empty once its frame is out."""
         self._sent_event = False
         self._gone_at: float | None = None
         self._is_supervised = False

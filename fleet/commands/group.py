@@ -102,7 +102,7 @@ def is_named() -> bool:
 
 
 def hint_options(fleet: str = "") -> str:
-    """Return the options that a proposed command needs. fleet: another one than that of the running command."""
+    """Return the options that a proposed command needs. `fleet` is given if it is not that of the running command."""
     context = click.get_current_context(silent=True)
     known = context.meta if context is not None else {}
     connect, chosen = known.get(_BUS, (None, DEFAULT_FLEET))

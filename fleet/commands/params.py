@@ -76,7 +76,7 @@ class Since(click.ParamType[float]):
 
 
 class Number(click.ParamType[N]):
-    """A number within a range. kind: int or float."""
+    """A number within a range. `kind` is int or float."""
 
     def __init__(self, kind: type[N], least: N, most: N | None = None) -> None:
         self.name = "N" if kind is int else "FACTOR"

@@ -97,7 +97,7 @@ class CarView:
         return self._since if self._heard_at is None else self._heard_at
 
     def on_message(self, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
-        """Handle a message of this car. topic: such as `sensor/range`. wall_ns: our wall clock, if it came just now."""
+        """Handle a message of this car, on a topic such as `sensor/range`. `wall_ns` is our clock, if it is new."""
         if wall_ns is not None and topic.startswith("state/"):
             self._clock.take(value.boot_id, messages.stamp_ns(value.stamp), wall_ns)
         if topic not in topics.FROM_OUTSIDE:

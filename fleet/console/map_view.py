@@ -33,7 +33,7 @@ _Points = list[tuple[int, float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One known place of a car. frame: empty for the truth about a simulated one."""
+    """One known place of a car. `frame` is empty for the truth about a simulated car."""
 
     x_m: float
     y_m: float

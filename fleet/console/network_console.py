@@ -350,7 +350,7 @@ def pairing_link(address: str, code: str) -> str:
 
 
 def show_code(address: str, code: str, person: PagePerson, write: Callable[[str], object], *, draws: bool) -> None:
-    """Write a pairing code to a terminal. draws: also as a QR code."""
+    """Write a pairing code to a terminal. With `draws`, also as a QR code."""
     if draws:
         picture = io.StringIO()
         segno.make(pairing_link(address, code)).terminal(picture, compact=True, border=2)

@@ -305,7 +305,7 @@ class GuessLimit:
 
 
 def new_code(choose: Callable[[str], str]) -> str:
-    """Return a code. choose: picks one letter at random, as `secrets.choice`."""
+    """Return a code. `choose` picks a letter at random, as `secrets.choice` does."""
     return "".join(choose(CODE_ALPHABET) for _ in range(CODE_LENGTH))
 
 

@@ -31,7 +31,7 @@ _S: Final = 1e9
 
 
 def cars_at(known: Iterable[Known], at_ns: int, colors: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return what a page shows of each car at a moment. known: by the time at which it was recorded."""
+    """Return what a page shows of each car at a moment. `known` has what was recorded by then."""
     view = FleetView(lambda name, index: colors.get(name) or hex_color(car_color(name, index)))
     of_cars = [each for each in known if is_told(each)]
     view.list_cars(sorted({each.key.car for each in of_cars}))
@@ -56,7 +56,7 @@ def is_told(each: Known) -> bool:
 
 
 def map_at(known: Iterable[Known], trail: Iterable[Known], at_ns: int) -> dict[str, Any]:
-    """Return what a map shows of a moment. trail: messages of PLACE_TOPICS before it."""
+    """Return what a map shows of a moment. `trail` has the messages of PLACE_TOPICS before it."""
     view, now = MapView(), at_ns / _S
     placed = [each for each in known if each.key.topic in PLACE_TOPICS]
     # The newest by the time of publishing comes last, as in the tables: a backfilled one was recorded late.

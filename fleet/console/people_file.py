@@ -32,7 +32,7 @@ class PeopleFile:
         self._served = FileLock(path.with_suffix(".served"))
 
     def read(self) -> PeopleBook:
-        """Return the book as it is now. A damaged or missing one is empty: everybody pairs again."""
+        """Return the book as it is now. If it is damaged or missing, it is empty, and everybody pairs again."""
         version = self._stat()
         if version != self._version:
             self._book, self._version = self._load(), version

@@ -40,7 +40,7 @@ class PlanQuestion:
 
 
 def answer_to(question: PlanQuestion, listed: Mapping[str, CarSnapshot]) -> dict[str, Any]:
-    """Return faults, roles, changes and dry run as JSON values. `listed`: the cars in the fleet file, empty: none."""
+    """Return faults, roles, changes and dry run as JSON values. `listed` has the cars in the fleet file, if any."""
     try:
         entry, plan = parse_entry(question.text)
     except BadPlan as error:

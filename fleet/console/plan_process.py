@@ -18,7 +18,7 @@ _COORDINATOR_POLL_S: Final = 0.1
 
 
 class PlanProcess:
-    """A process of `fleet plan run`, one at a time. file: the fleet file, with the abilities and roles of the cars."""
+    """A process of `fleet plan run`, one at a time. `file` is the fleet file with the abilities and roles of cars."""
 
     def __init__(self, fleet: Fleet, file: Path) -> None:
         self._fleet = fleet

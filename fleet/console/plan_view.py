@@ -25,7 +25,7 @@ class PlanView:
         self._log: list[dict[str, Any]] = []
 
     def on_message(self, topic: str, value: Any) -> None:
-        """Handle a message of the coordinator. topic: such as `@coordinator/plan`."""
+        """Handle a message of the coordinator, on a topic such as `@coordinator/plan`."""
         match topic:
             case "@coordinator/plan":
                 if self._plan is not None and value.boot_id != self._plan.boot_id:

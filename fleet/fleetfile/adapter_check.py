@@ -46,7 +46,7 @@ def list_adapters(directory: Path | None = None) -> list[str]:
 
 
 def check_adapters(links: Mapping[str, FleetLink], adapters: Sequence[str]) -> Iterator[AdapterCheck]:
-    """Yield the sums of each adapter that a car uses. `adapters`: those of the computer, empty if unknown."""
+    """Yield the sums of each adapter that a car uses. `adapters` are the computer's, or empty if unknown."""
     first = adapters[0] if adapters else _FIRST
     by_adapter: dict[str, list[str]] = {}
     for car, link in links.items():

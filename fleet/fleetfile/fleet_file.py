@@ -128,7 +128,7 @@ class FleetFile:
 def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
     """Read a fleet file. Raises BadFile if it has mistakes. `unbound` allows cars without a link.
 
-    `moved`: the file is a session's copy, so its plan and its world need not be beside it.
+    With `moved`, the file is a session's copy, so its plan and its world need not be beside it.
     """
     path = Path(path)
     return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)

@@ -43,7 +43,7 @@ class LinkCheck:
 
 
 def check_link(car: FleetCar, served: Mapping[str, tuple[str, str, str]]) -> LinkCheck:
-    """Check a car's link within HOST_TIMEOUT_S. `served`: state, reason and URL of the links of running gateways."""
+    """Check a car's link within HOST_TIMEOUT_S. `served` has state, reason and URL of the links of running gateways."""
     if car.name in served:
         state, reason, url = served[car.name]
         if url and not _is_same(url, car.link):

@@ -26,7 +26,7 @@ class ScanFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class FoundLink:
-    """A link that may be a car's. verdict: one of POSSIBLE_VERDICTS. platform: detected from readings, or `auto`."""
+    """A link that may be a car's. `verdict` is one of POSSIBLE_VERDICTS. `platform` is detected, or `auto`."""
 
     url: str
     verdict: str

@@ -47,7 +47,7 @@ def announced(port: int, code: JoinCode, addresses: Sequence[str]) -> Iterator[b
 
 
 def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterator[str]:
-    """Yield host:port of hubs that wait for somebody, as they are found. addresses: of this computer."""
+    """Yield host:port of hubs that wait for somebody, as they are found. `addresses` are this computer's."""
     try:
         browser = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
     except OSError:

@@ -55,7 +55,7 @@ class Joined:
     key: bytes
     fleet_file: str = ""
     rules: Mapping[str, Any] = field(default_factory=dict)
-    """The rules for the hub of another site; empty for all others."""
+    """The rules for the hub of another site. Empty for all others."""
 
 
 class Invitation:
@@ -75,7 +75,7 @@ class Invitation:
         ca = (store.directory / CA_FILE).read_bytes()
         self.code = JoinCode.new(certificate_authority.fingerprint(ca))
         self.joined_from = ""
-        """Address of the computer that has joined; empty before."""
+        """Address of the computer that has joined. Empty before."""
         self._answer = {"port": hub_port, "fleet_file": fleet_file, "identity": identity}
         self._store = store
         self._identity = identity
@@ -110,7 +110,7 @@ class Invitation:
         self._thread.join()
 
     def _take(self, guess: str, request: bytes, addresses: list[str], source: str) -> tuple[int, dict[str, Any]]:
-        """Return the answer to a request to join: HTTP status and fields. addresses: of the computer that asks."""
+        """Return the answer to a request to join: HTTP status and fields. `addresses` are the asking computer's."""
         is_site = role_of(self._identity) is IdentityRole.SITE
         with self._lock:
             if self._over.is_set():
@@ -181,7 +181,7 @@ def join(
     clock: Callable[[], float] = time.time,
     addresses: Iterable[str] = (),
 ) -> Joined:
-    """Join the hub on another computer. addresses: of this one, if it may be a hub itself. Raises NotJoined."""
+    """Join the hub on another computer, or raise NotJoined. `addresses` are this computer's, if it may be a hub."""
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code says whether it is the right one

@@ -138,7 +138,7 @@ def _watched(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debou
 
 
 def _all_of(each: list[bool | None]) -> bool | None:
-    """Return whether all values are true (Kleene's logic); None without values."""
+    """Return whether all values are true (Kleene's logic), or None without values."""
     if not each:
         return None
     return False if False in each else None if None in each else True

@@ -45,7 +45,7 @@ class Log(RotatingFileHandler):
         """Error of the last line, if it was not written."""
 
     def add(self, line: str, now: float) -> None:
-        """Add a line. now: s since the epoch."""
+        """Add a line. `now` is in s since the epoch."""
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now)) + f".{int(now % 1 * 1000):03d}Z"
         text = f"{stamp} {self.path.stem.lstrip('@')} | {line}"
         self.handle(logging.makeLogRecord({"msg": text}))

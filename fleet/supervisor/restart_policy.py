@@ -96,7 +96,7 @@ class ProcessState:
         """Return the next action.
 
         `listening_since` is the start of uninterrupted reception of heartbeats, None if there is no reception now.
-        leave_s: allowed silence (from `hang`), if it is longer than the patience.
+        `leave_s` is the allowed silence (from `hang`). It counts if it is longer than the patience.
         """
         if self.state in (RunState.WAITING, RunState.REFUSED) and now >= self.due:
             return RestartAction.START
@@ -124,7 +124,7 @@ class ProcessState:
         return first
 
     def on_exit(self, code: int, why: str, now: float, chance: float) -> None:
-        """Note the exit code (negative: the signal). `why` is the process's last error line. chance: see `delay_s`."""
+        """Note the exit code (negative: the signal). `why` is its last line of stderr. For `chance`, see `delay_s`."""
         if self.state is RunState.ENDING:
             self._set(RunState.WAITING if self._again else RunState.ENDED, now)
             self.due = now

@@ -211,7 +211,7 @@ class GatewayShutdown:
 
 
 def describe_end(results: Mapping[str, str]) -> str:
-    """Describe in one line what became of the cars. results: words by car, as in `GatewayShutdown.results`."""
+    """Describe in one line what became of the cars. `results` has words by car, as `GatewayShutdown.results`."""
     groups = {words: sorted(car for car, said in results.items() if said.startswith(words)) for words in _RESULTS}
     bad = [f"{words}: {', '.join(groups[words])}" for words in (NOT_STOPPED, NOT_CONFIRMED) if groups[words]]
     if bad:

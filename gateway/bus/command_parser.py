@@ -72,7 +72,7 @@ class BadRequest(ValueError):
 def parse(
     request: Request, now_ns: int, *, car: str = "this car", longest_drive_s: float = DEFAULT_MAX_DRIVE_S
 ) -> Command:
-    """Parse a request. now_ns: wall clock, ns since the epoch. Raises BadRequest."""
+    """Parse a request, or raise BadRequest. `now_ns` is the wall clock, ns since the epoch."""
     verb = request.verb
     blank = Command(_id(request, now_ns), verb, Sender(), Stop(), asked_ns=now_ns, streamed=request.streamed)
     if verb not in COMMANDS:

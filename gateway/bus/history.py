@@ -37,7 +37,7 @@ class BadRange(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One published value. `at`: s, monotonic. `stamp_ns`: its published stamp."""
+    """One published value. `at` is in s, monotonic. `stamp_ns` is its published stamp."""
 
     at: float
     stamp_ns: int
@@ -75,7 +75,7 @@ class HistoryBuffer:
         self._values = deque((replace(each, at=each.at - slept_s) for each in self._values), self._values.maxlen)
 
     def select(self, *, time_range: str | None, last: str | None, now: float) -> list[Value]:
-        """Return the latest value, or those in a time range, or the last ones. Raises BadRange. now: s, monotonic."""
+        """Return the latest value, those in a time range, or the last ones, or raise BadRange. `now` is monotonic."""
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)

@@ -51,11 +51,11 @@ class Request:
     unread: str = ""
     """Why the payload was not read, or an empty text if it was."""
     identity: str = ""
-    """Who sent it, proven by a certificate; empty on a bus without certificates."""
+    """Who sent it, proven by a certificate. Empty on a bus without certificates."""
     sampled_ns: int | None = None
-    """Zenoh timestamp of a sample, ns since the epoch; None for a query."""
+    """Zenoh timestamp of a sample, ns since the epoch. None for a query."""
     query: zenoh.Query | None = None
-    """The query that waits for an answer; None for a sample."""
+    """The query that waits for an answer. None for a sample."""
 
     @property
     def streamed(self) -> bool:

@@ -71,7 +71,7 @@ class Battery:
     """The other level that the readings show, and since when they are on that side of `level`."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
-        """Update the level with a measured voltage. Return True if it has changed. `loaded`: motors may be on."""
+        """Update the level with a measured voltage. Return True if it has changed. With `loaded`, motors may be on."""
         self.voltage_v = voltage_v
         self.measured_at = now
         if loaded:

@@ -30,7 +30,7 @@ class SetMode:
 class PartAction:
     """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue of a car in mode 0.
 
-    `needs_lease`: only the driver of a car may do it. It moves a part of the car, or changes how the car moves.
+    With `needs_lease`, only the driver of a car may do it. It moves a part of the car, or changes how the car moves.
     """
 
     needs_lease: ClassVar[bool] = True
@@ -105,7 +105,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class EmergencyStop:
-    """Stop the car, and refuse commands until a resume with this id. `fleet_wide`: all gateways latch it."""
+    """Stop the car, and refuse commands until a resume with this id. If `fleet_wide`, all gateways latch it."""
 
     why: str = ""
     fleet_wide: bool = False
@@ -113,7 +113,7 @@ class EmergencyStop:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the e-stops of these ids. Without ids, end the hold. `all`: end both, as far as the sender may."""
+    """End the e-stops with these ids, or without ids the hold. With `all`, end both, as far as the sender may."""
 
     ids: tuple[str, ...] = ()
     all: bool = False
@@ -192,7 +192,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The immediate answer to the sender. `status`: sent, queued or rejected."""
+    """The immediate answer to the sender. `status` is sent, queued or rejected."""
 
     status: Phase
     reason: Reason | None = None

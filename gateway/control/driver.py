@@ -53,7 +53,7 @@ MOVED_CM: Final = 5.0
 
 
 class Event(Protocol):
-    """One thing that a decoder found in the bytes. `at`: when its last byte arrived."""
+    """One thing that a decoder found in the bytes. `at` is when its last byte arrived."""
 
     @property
     def raw(self) -> bytes:

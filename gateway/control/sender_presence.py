@@ -16,7 +16,7 @@ class Senders:
     """Tokens and drive streams by the sender's name. Times: s, monotonic."""
 
     _tokens: dict[str, float | None] = field(default_factory=dict)
-    """When each token disappeared; None while it exists."""
+    """When each token disappeared. None while it exists."""
     _drives: dict[str, tuple[float, bool]] = field(default_factory=dict)
     """When the last drive of each sender arrived, and whether it was part of a stream."""
     _halted: set[str] = field(default_factory=set)

@@ -45,7 +45,7 @@ def kind_of(scheme: str) -> LinkKind[Any]:
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
     """Open the link within this time. The message of CannotOpen tells what is wrong and what to do.
 
-    The connects through one Bluetooth adapter take turns. `first`: the car may be moving, so it goes first.
+    Connections through one Bluetooth adapter take turns. With `first`, the car may be moving, so it goes first.
     """
     kind = kind_of(url.scheme)
     return await kind.open(url, kind.open_timeout_s if timeout_s is None else timeout_s, first=first)

@@ -58,7 +58,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def likely(self) -> str:
-        """What makes it a car's; empty for any other device."""
+        """What makes it a car's. Empty for any other device."""
 
 
 class LinkKind(ABC, Generic[Url]):

@@ -38,7 +38,7 @@ class BaudWatch:
     def __init__(self, url: LinkUrl) -> None:
         self._url = url
         self._counts: dict[int, int] | None = {}
-        """How often each byte came; None after the first frame, or after the judgment."""
+        """How often each byte came. None after the first frame, or after the judgment."""
 
     def on_bytes(self, data: bytes) -> BaudDoubt | None:
         """Count bytes. Return a doubt once if many bytes have no frame, else None."""

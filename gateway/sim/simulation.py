@@ -106,13 +106,13 @@ class SimCar:
 
     @property
     def truth(self) -> Truth | None:
-        """The true state now; None for a capture."""
+        """The true state now. None for a capture."""
         self._pump()
         return self.firmware.truth
 
     @property
     def pose(self) -> Pose | None:
-        """The true pose now; None for a capture."""
+        """The true pose now. None for a capture."""
         return self.firmware.pose(self._loop.time())
 
     async def start(self) -> None:

@@ -50,7 +50,7 @@ class Handover(Generic[T]):
         loop.call_soon(self._drain)
 
     def __call__(self, item: T, *, reserve: int = 0) -> bool:
-        """Queue an object, on a Zenoh thread. Return False if it was dropped. reserve: extra room for this object."""
+        """Queue an object, on a Zenoh thread. Return False if it was dropped. `reserve` is extra room for it."""
         with self._lock:
             if len(self._queue) >= self._limit + reserve:
                 self.dropped += 1

@@ -31,7 +31,7 @@ class Overlap:
         """True once everything comes over the newer session: nothing counts over the older one then."""
 
     def is_twin(self, what: Hashable, now: float, *, newer: bool, within_s: float = inf) -> bool:
-        """Return True if the same has come over the other session within this time. newer: over which one this came."""
+        """Return True if the same has come over the other session in time. `newer` tells over which one this came."""
         with self._lock:
             if self.older_is_deaf and not newer:
                 return True

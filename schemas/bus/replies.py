@@ -19,7 +19,7 @@ def refuse(query: zenoh.Query, words: str) -> None:
 
 
 def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str, *, express: bool = True) -> None:
-    """Reply with one value under a concrete key. express: send it at once, not in a batch with others."""
+    """Reply with one value under a concrete key. With `express`, send it at once, not in a batch with others."""
     query.reply(key, payload, encoding=encoding, express=express)
 
 

@@ -197,7 +197,7 @@ class Bus:
                 raise errors[0]
 
     def _is_twin(self, number: int, mark: Callable[[], Hashable], within_s: float = inf) -> bool:
-        """Return True if this came over another session, too, and was handled. number: of the session it came over."""
+        """Return True if this came over another session, too, and was handled. `number` is that of its session."""
         overlap, is_newest = self._overlap, number == self._number
         if overlap is None:
             return not is_newest
@@ -268,7 +268,7 @@ class Bus:
         return bool(self._session.info.routers_zid())
 
     def publisher(self, key: str, topic: Topic, source: str) -> Publisher:
-        """Declare a publisher of `topic` under `key`. source: the `car` of its messages."""
+        """Declare a publisher of `topic` under `key`. `source` is the `car` of its messages."""
         with self._changing:
             made = Publisher(self._declaring, key, topic, source, self.boot_id)
             self._publishers.append(made)

@@ -50,7 +50,7 @@ class ChunkPart:
     opcode: int
     body: bytes
     span: str = ""
-    """Time span of its messages as text; empty without an index."""
+    """Time span of its messages as text. Empty without an index."""
 
     def check(self) -> None:
         """Check its CRC; raises one of BROKEN."""

@@ -67,7 +67,7 @@ def as_published(messages: Iterable[RecordedMessage[Item]]) -> Iterator[tuple[in
 
 
 def _received_at_latest(stream: list[RecordedMessage[Item]]) -> list[int]:
-    """Return when each message, or one of a higher number, was first received. `stream`: sorted by number."""
+    """Return when each message, or one with a higher number, was first received. `stream` is sorted by number."""
     found, latest_ns = [], stream[-1].log_ns
     for each in reversed(stream):
         latest_ns = min(latest_ns, each.log_ns)

@@ -68,7 +68,7 @@ class SessionCheckup:
                 self.refused[message.reason or message.phase] += 1
 
     def findings(self, verdict: SessionVerdict, name: str) -> Iterator[DoctorFinding]:
-        """Yield what is odd, the most important first. name: of the session, as one types it."""
+        """Yield what is odd, the most important first. `name` is the session's, as a user types it."""
         replay, verify = f"fleet replay {name}", f"fleet sessions verify {name}"
         for code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
             if stops := self.unshown.of(code):

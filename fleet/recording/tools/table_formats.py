@@ -103,7 +103,7 @@ def _remove(file: IO[Any], path: Path) -> None:
 def csv_cells(
     columns: Sequence[Column], values: Sequence[Values], undated: Callable[[int], None] = lambda _: None
 ) -> Iterator[tuple[Any, ...]]:
-    """Return the rows of a CSV table from the values of its columns. undated: called with the number of bad times."""
+    """Return the rows of a CSV table from the values of its columns. `undated` gets the number of bad times."""
     for column, given in zip(columns, values, strict=True):
         if column.kind is ColumnKind.TIME and (bad := sum(_text_of_time(each) is None for each in _suspects(given))):
             undated(bad)

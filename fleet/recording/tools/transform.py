@@ -170,7 +170,7 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
 
 
 def _losses(session: Session, count: int) -> str:
-    """Return in words what could not be read of a session, or was lost before. count: the messages that were read."""
+    """Return in words what could not be read of a session, or was lost before. `count` messages were read."""
     found = (session.damage_words, session.lost_extras, session.lacking(count), lost_words(session))
     return "; ".join(filter(None, found))
 

@@ -40,7 +40,7 @@ class ConditionPins:
         """The topics that they use."""
 
     def add(self, car: str, topic: str, message: Any, at_ns: int, came_ns: int) -> Iterable[Pin]:
-        """Take in a reading, and yield pins. at_ns: its own time; came_ns: the recorder's time that belongs to it."""
+        """Take in a reading, and yield pins. `at_ns` is its own time, `came_ns` the recorder's time for it."""
         if car not in self._cars:
             self._cars[car] = [CarCondition(rule.condition) for rule in self._rules]
         for rule, condition in zip(self._rules, self._cars[car], strict=True):

@@ -37,7 +37,7 @@ def speaks_for_fleet(site: str, others: Iterable[str]) -> bool:
 
 
 class RecorderService:
-    """The declarations of a recorder in a bus session. site: empty, or the name of the other site where it runs."""
+    """The declarations of a recorder in a bus session. `site` is the other site where it runs, or empty."""
 
     def __init__(self, bus: Bus, fleet: str, site: str = "") -> None:
         self._bus = bus

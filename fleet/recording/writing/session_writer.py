@@ -455,7 +455,7 @@ class SessionWriter:
         self._drops[key] = self._drops.get(key, 0) + 1
 
     def drop_received(self, key: str, sender: Hashable, number: int, count: int) -> None:
-        """Count messages that did not fit the queue. number: of the last one. sender: None if they have no numbers."""
+        """Count messages that did not fit the queue. `number` is the last one's. Without numbers, `sender` is None."""
         if sender is None:
             self._drops[key] = self._drops.get(key, 0) + count
             return

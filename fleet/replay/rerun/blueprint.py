@@ -70,7 +70,7 @@ class _RerunLayout:
         self._axis = axis
 
     def fleet_tab(self, grounds: Mapping[str, _Ground | None]) -> _View:
-        """Return the tab of the fleet: a page of its cars and a page of its services. grounds: by topic of a place."""
+        """Return the tab of the fleet: a page of its cars and a page of its services. `grounds` are by topic."""
         session = self._session
         texts = [view for name, ours, theirs in panels.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
         if panels.PLAN_TOPIC in session.services:

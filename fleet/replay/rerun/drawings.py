@@ -50,7 +50,7 @@ _MAX_LEDS: Final = 256
 class Drawing:
     """Derived chunks and contents of a session. `limit` is the maximum of points per path. None means no limit.
 
-    `car_colors`: those of the fleet file, by car.
+    `car_colors` are those in the fleet file, by car.
     """
 
     def __init__(self, limit: int | None = None, car_colors: Mapping[str, Rgb] | None = None) -> None:
@@ -76,7 +76,7 @@ class Drawing:
         self.corners: list[tuple[float, float]] = []
         """Corners of the walls of the simulated world."""
         self.span_ns: tuple[int, int] | None = None
-        """Publish times of the first and last message, ns since the epoch; None without messages."""
+        """Publish times of the first and last message, ns since the epoch. None without messages."""
 
     def follow(self, chunks: Iterable[Any]) -> Iterator[Any]:
         """Yield each chunk, followed by the chunks derived from it."""

@@ -80,11 +80,11 @@ class Viewer:
 
     @property
     def ended(self) -> int | None:
-        """Return its exit code; None while it runs."""
+        """Return its exit code, or None while it runs."""
         return self._guard.poll()
 
     def wait(self, seconds: float | None = None) -> int | None:
-        """Wait until its window is closed. Return the exit code; None after `seconds`."""
+        """Wait until its window is closed. Return the exit code, or None after `seconds`."""
         try:
             return self._guard.wait(seconds)
         except subprocess.TimeoutExpired:

@@ -43,7 +43,7 @@ class YahboomDriver(Executor):
     """One car of this protocol."""
 
     def __init__(self, desk: Desk, profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> None:
-        """`auto`: find out the platform. `profile` is the unknown one then."""
+        """With `auto`, find out the platform. `profile` is then the unknown one."""
         super().__init__(desk, CarModel(desk.car, profile, auto, desk.log, desk.battery_policy, learned or Learned()))
         self._monitor = CarMonitor(self.model, self, desk.log)
         self._decoder = Decoder(head=profile.dialect.head)

@@ -38,7 +38,7 @@ class Executor(Driver):
         self.mode_sent: tuple[Pending, float] | None = None
         """A mode command whose effect was not seen yet, and when its frame was written."""
         self._source: StopInProgress | HeldMotion | Pending | None = None
-        """The stop, motion or command of the last frame of `poll`; None for a repetition."""
+        """The stop, motion or command of the last frame of `poll`. None for a repetition."""
 
     @property
     def model(self) -> CarModel:

@@ -75,7 +75,7 @@ class World:
     ) -> None:
         self.walls = tuple(walls)
         self.line = tuple(line)
-        """A closed polyline; empty for none."""
+        """A closed polyline. Empty for none."""
         self.lamps = tuple(lamps)
         self.things = tuple(things)
         self.cars_meet = cars_meet
@@ -324,7 +324,7 @@ class World:
     def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
         """Return True if nothing stands between two points, in either direction.
 
-        `without`: names of cars and things to ignore.
+        `without` has the names of cars and things to ignore.
         """
         a, b = sorted((a, b))
         sight: Segment = (*a, *b)

@@ -53,7 +53,7 @@ first interval it would be the rhythm, and each stop would wait that long for a 
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:
-    """Return the kind of a frame that may block; None for a frame that does not, or blocks in several ways."""
+    """Return the kind of a frame that may block. None for a frame that does not, or blocks in several ways."""
     match frame:
         case ModeClose():
             return Blocking.MODE_CLOSE
@@ -220,7 +220,7 @@ class Learned:
         return True
 
     def on_reaction(self, *, sure: bool) -> None:
-        """Record that a report came late by just the block of a frame. `sure`: a lost report cannot look so."""
+        """Record that a report came late by just the block of a frame. If `sure`, a lost report cannot look so."""
         self._unreacted = 0
         if self.shows is Shows.NO and sure:
             self._reacted += 1
@@ -250,7 +250,7 @@ class Learned:
         return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
 
     def on_fields(self, event: Sensors, rejects: tuple[Reject, ...]) -> None:
-        """Record the values of the fields of a report of mode 0. rejects: those out of the range of this car."""
+        """Record the values of the fields of a report of mode 0. `rejects` are out of the range of this car."""
         rejected = {reject.word for reject in rejects}
         for name in rejected:
             self.rejected[name] = self.rejected.get(name, 0) + 1

@@ -12,7 +12,7 @@ from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
 
 @dataclass(frozen=True, slots=True)
 class ArmReading:
-    """Six joints, 0..180 degrees; None where the joint was rejected. `at` is the time of the last byte."""
+    """Six joints, 0..180 degrees. None where the joint was rejected. `at` is the time of the last byte."""
 
     raw: bytes
     at: float

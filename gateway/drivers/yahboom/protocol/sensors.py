@@ -105,7 +105,7 @@ class Reject:
 
 
 class Sensors(NamedTuple):
-    """The sensors frame, each field as on the wire; None where the field was rejected.
+    """The sensors frame, each field as on the wire. None where the field was rejected.
 
     `at` is the time of its last byte. `range_cm` 0 means no echo, not a distance. `line` is left-outer, left-inner,
     right-inner, right-outer. `obstacle` is as on the wire; `Profile.obstacle` undoes the inversion of following.

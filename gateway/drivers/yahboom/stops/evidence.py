@@ -243,7 +243,7 @@ class StopEvidence:
         self._leave_nothing()
 
     def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
-        """Record the opening of a mode. `shown`: the car had shown its rest before."""
+        """Record the opening of a mode. If `shown`, the car had shown its rest before."""
         self.sent_motion()
         self._before = self._before_no_echo = None
         self._opened_at = now
@@ -263,7 +263,7 @@ class StopEvidence:
             self._blocking.append(_Block(kind, block_s, now))
 
     def closed(self, now: float, *, awake: bool) -> None:
-        """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly its block."""
+        """Record a `MODE00`. If `awake`, no block of our frames runs, so the reports pause for exactly its block."""
         self._pending = now if awake else None
         if not awake:
             self._blocking.append(_Block(None, self.close_s, now))  # this interval does not count
@@ -282,7 +282,7 @@ class StopEvidence:
     # ------------------------------------------------------------------ readings
 
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
-        """Record bytes that are not readings. `damaged`: they begin like a frame, so the next may be corrupted too."""
+        """Record bytes that are not readings. If `damaged`, they begin like a frame, so the next may be, too."""
         self._last_at = at
         self._before = self._before_no_echo = self.settles_at = None
         self._fast_before = False
@@ -469,7 +469,7 @@ class StopEvidence:
         return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
 
     def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
-        """Count a pause. `learn`: it is not as long as expected, and may be the block of this car."""
+        """Count a pause. With `learn`, it is not as long as expected, and may be the block of this car."""
         self._pauses += 1
         self.reacted_at = at
         self._delay_s = None

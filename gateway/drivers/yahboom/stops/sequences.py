@@ -27,7 +27,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class StopSequence:
-    """A way to stop. `rank`: only a sequence of a higher rank replaces the running one."""
+    """A way to stop. Only a sequence of a higher `rank` replaces the running one."""
 
     name: str
     rank: int

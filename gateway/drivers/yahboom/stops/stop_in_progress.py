@@ -61,7 +61,7 @@ def evidence_s(profile: Profile, learned: Learned) -> float:
 def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
     """Return the time after the last frame of a try in which a car that obeyed it has reported, s.
 
-    `slowest`: its rhythm is not known, and it may be as slow as any.
+    If `slowest`, its rhythm is not known, and it may be as slow as any.
     """
     # Without an echo the car ranges before it reads the frame, is blocked by it, and ranges again before it reports.
     interval_s = learned.interval_s(SLOWEST_S if slowest else profile.interval_s)
