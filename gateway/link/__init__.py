@@ -33,6 +33,7 @@ __all__ = [
     "parse_url",
 ]
 
+
 def kind_of(scheme: str) -> LinkKind[Any]:
     """Return what opens and lists the links of this scheme. Raises ImportError if a module that it needs is missing.
 
