@@ -250,8 +250,8 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
                 "127.0.0.1`."
             )
             return
-        cars = _cars_on(endpoint)
-    click.echo(f"You are {joined.identity} at {endpoint} now. Cars: {', '.join(cars) or 'none is on'}.")
+        said = _describe_cars_on(endpoint)
+    click.echo(f"You are {joined.identity} at {endpoint} now. {said}")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
         DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
         click.echo(f"{DEFAULT_FLEET_FILE} is a copy of the hub's.")
@@ -286,8 +286,8 @@ def _address(written: str, default: int) -> tuple[str, int]:
     return found[1], int(found[2] or default)
 
 
-def _cars_on(endpoint: str) -> list[str]:
-    """Return the cars that are on. The hub may be restarting with its new rules just now. Raises BusError."""
+def _describe_cars_on(endpoint: str) -> str:
+    """Return which cars are on, in a sentence. The hub may be restarting with its new rules just now, or be off."""
     deadline = time.monotonic() + HUB_RESTART_S
     while True:
         is_last = time.monotonic() > deadline
@@ -296,10 +296,10 @@ def _cars_on(endpoint: str) -> list[str]:
                 cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
         except BusError:
             if is_last:
-                raise
+                return "Its hub does not answer yet; `fleet list` shows the cars once it does."
             cars = []
         if cars or is_last:
-            return cars
+            return f"Cars: {', '.join(cars) or 'none is on'}."
         time.sleep(0.1)
 
 

@@ -86,10 +86,18 @@ class BadNetwork:
     def moves(self, car: str) -> bool:
         return driving(self.sims[car], car)
 
-    def stand_after(self, cars: list[str], began: float) -> float:
-        """Return the time until all these cars stand, s."""
-        wait_for(lambda: not any(map(self.moves, cars)), "they stand")
-        return time.monotonic() - began
+    def stand_after(self, *groups: tuple[list[str], float]) -> list[float]:
+        """Return the time until all cars of each group stand, s, each from its own moment."""
+        stood: dict[int, float] = {}
+
+        def all_stand() -> bool:
+            for number, (cars, began) in enumerate(groups):
+                if number not in stood and not any(map(self.moves, cars)):
+                    stood[number] = time.monotonic() - began
+            return len(stood) == len(groups)
+
+        wait_for(all_stand, "they stand")
+        return [stood[number] for number in range(len(groups))]
 
     def stay(self, cars: list[str]) -> None:
         end = time.monotonic() + QUIET_S
@@ -155,20 +163,19 @@ def _break(stage: BadNetwork, what: str, words: str) -> tuple[float, list[str]]:
     began = time.monotonic()
     if what == "hub killed":
         stage.made.kill_hub()
-        return stage.stand_after(stage.cars, began), []
+        return stage.stand_after((stage.cars, began))[0], []
     machine = OPERATOR if what.startswith("operator") else PI
     stage.made.cut(machine)
     lost, kept = (stage.cars, []) if machine == OPERATOR else (stage.at[PI], stage.at[HUB])
     if not what.endswith("e-stop"):
-        stopped_s = stage.stand_after(lost, began)
+        (stopped_s,) = stage.stand_after((lost, began))
         if kept:
             wait_for(lambda: all(map(stage.moves, kept)), "the others go on")
         return stopped_s, [machine]
     # The e-stop holds at once on its own side; the cars of the other side have lost their operator.
     asked = time.monotonic()
     estop = stage.made.start(HUB if machine == OPERATOR else OPERATOR, "-m", "fleet.cli", "estop", "--why", words)
-    stopped_s = stage.stand_after(lost, began)
-    own_s = stage.stand_after(stage.at[HUB], asked)
+    stopped_s, own_s = stage.stand_after((lost, began), (stage.at[HUB], asked))
     assert own_s < ESTOP_S, own_s
     assert estop.wait() in (0, 1), estop.stderr  # 1: cars that are cut off have not answered
     return stopped_s, [machine]
