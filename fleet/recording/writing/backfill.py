@@ -22,8 +22,9 @@ QUERY_AFTER_START_S: Final = (1.0,)
 QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 """Delays of the queries after a reconnect: others retry within half a second, and a loaded machine delays them."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
-GAP_MARGIN_S: Final = 1.0
-"""Time that the network may have taken for the last message before a gap."""
+GAP_MARGIN_S: Final = 2.0
+"""Time that the network may have taken for the last message before a gap, and takes for the query: a publisher counts
+the window from when the query arrives."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
 MAX_SINGLE_KEYS: Final = 16
@@ -113,11 +114,11 @@ class Backfill:
             self._keys.update(keys)
 
     def _query(self) -> None:
-        last_s = time.monotonic() - self._missing_since
         query_all = self._query_all or len(self._keys) > MAX_SINGLE_KEYS
         for expression in self._all if query_all else sorted(self._keys):
             found = []
-            for sample in self._bus.recall(expression, last_s):
+            # Counted anew for each: on a bad network the answers to one take seconds, and its window would move on.
+            for sample in self._bus.recall(expression, time.monotonic() - self._missing_since):
                 found.append(sample)
                 if len(found) + len(self._answers) > MAX_ANSWERS:
                     break
