@@ -45,6 +45,8 @@ class CommandType:
     """True if it needs no payload, and stops the car even if the payload is invalid."""
     max_duration_s: float = 0.0
     """Maximum of its field `duration_s`. 0 if it has none, or if each gateway has a limit of its own."""
+    min_duration_s: float = 0.0
+    """Minimum of that field. 0 if any duration above 0 is allowed."""
     signal: bool = False
     """True if the car gives a signal, and the verb and `duration_s` say all about it: control needs no class for it."""
     subcommand: str = ""

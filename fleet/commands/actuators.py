@@ -181,7 +181,7 @@ def _plain_command(row: CommandType) -> click.Command:
     example = f"fleet {row.subcommand} red"
     if row.max_duration_s:
         example += " --for 2s"
-        limit = Duration(row.max_duration_s)
+        limit = Duration(row.max_duration_s, row.min_duration_s)
         command = click.option("--for", "duration_s", type=limit, required=True, help="How long, such as 2s.")(command)
     return click.command(row.subcommand, help=row.summary, epilog=f"\b\nexample:\n  {example}")(command)
 

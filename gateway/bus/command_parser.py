@@ -172,8 +172,9 @@ def _action(verb: str, message: Any, car: str, longest_drive_s: float) -> Action
         return _WHAT[verb](message)
     row = COMMANDS[verb]
     if row.signal:
-        most_s = row.max_duration_s
-        return Signal(row.verb, _seconds("duration_s", message.duration_s, most_s) if most_s else 0.0)
+        if not row.max_duration_s:
+            return Signal(row.verb)
+        return Signal(row.verb, _seconds("duration_s", message.duration_s, row.max_duration_s, row.min_duration_s))
     plain = PLAIN_ACTIONS[verb]
     return plain(**{field.name: getattr(message, field.name) for field in fields(plain)})
 
@@ -233,9 +234,10 @@ def _resume(message: Any) -> Action:
     return Resume(tuple(message.ids), message.all)
 
 
-def _seconds(field: str, value: float, top: float) -> float:
-    if not (math.isfinite(value) and 0 < value <= top):
-        raise ValueError(f"{field} {value:g}: allowed are more than 0 and at most {top:g} s")
+def _seconds(field: str, value: float, top: float, bottom: float = 0.0) -> float:
+    if not (math.isfinite(value) and 0 < value <= top and value >= bottom):
+        least = f"at least {bottom:g}" if bottom else "more than 0"
+        raise ValueError(f"{field} {value:g}: allowed are {least} and at most {top:g} s")
     return value
 
 

@@ -1,11 +1,12 @@
 """Records the transitions of commands, and log records, until the loop publishes them."""
 
 from collections import OrderedDict, deque
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gateway.control.commands import Command
-from gateway.control.events import CommandRecord, LogRecord, Record
+from gateway.control.events import CommandRecord, Later, LogRecord, Record, frame_of
 from schemas.words import Level, Phase, Reason
 
 MAX_COMMAND_IDS: Final = 256
@@ -19,9 +20,38 @@ class Pending:
     command: Command
     received_at: float
     frames: deque[Any] = field(default_factory=deque)
+    """What is left of them. A `Later` is one with a delay before it."""
     sent: bool = False
     count: int = 1
     """Number of merged commands of a stream."""
+    due_at: float = float("-inf")
+    """When its next frame is due, after the delay before it."""
+    part: Hashable = None
+    """The part of the car that it acts on, as its driver names it."""
+
+    @property
+    def waits_since(self) -> float:
+        """Return since when it waits for the car, also in the future."""
+        return max(self.received_at, self.due_at)
+
+    @property
+    def next_frame(self) -> Any:
+        """Return the frame that is written next."""
+        return frame_of(self.frames[0])
+
+    @property
+    def is_delayed(self) -> bool:
+        """Return True if a delay stands before its next frame: nothing else needs to wait for it."""
+        return bool(self.frames) and isinstance(self.frames[0], Later)
+
+    @property
+    def lasts(self) -> bool:
+        """Return True if a delay stands before one of its frames."""
+        return any(isinstance(each, Later) for each in self.frames)
+
+    def begin_delay(self, now: float) -> None:
+        """Count the delay before its next frame from now on, if it has one."""
+        self.due_at = now + (self.frames[0].after_s if self.is_delayed else 0.0)
 
 
 class CommandLog:

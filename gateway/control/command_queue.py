@@ -4,7 +4,9 @@ Each command ends with a record. `Executor` decides when a frame is written.
 """
 
 from collections import deque
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.holds_and_leases import Safety
@@ -66,16 +68,76 @@ class CommandQueue:
     def deadlines(self) -> list[float]:
         """Return when the queued commands expire."""
         waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
-        times = [pending.received_at + MAX_QUEUE_TIME_S for pending in waiting]
+        times = [pending.waits_since + MAX_QUEUE_TIME_S for pending in waiting]
         return times if self.held is None else [*times, self.held_until]
 
     def expire(self, now: float) -> None:
-        """Expire the commands that have waited too long for a busy car."""
+        """Expire the commands that have waited too long for a busy car.
+
+        An action whose frames go out does not expire, however many there are: each of them waits anew.
+        """
         words = f"the car was busy for {MAX_QUEUE_TIME_S:g} s"
-        while self.one_shots and now >= self.one_shots[0].received_at + MAX_QUEUE_TIME_S:
-            self.log.record(self.one_shots.popleft(), Phase.EXPIRED, now, reason=Reason.EXPIRED, words=words)
-        if self.mode_change is not None and now >= self.mode_change.received_at + MAX_QUEUE_TIME_S:
+        for pending in [each for each in self.one_shots if now >= each.waits_since + MAX_QUEUE_TIME_S]:
+            self._end_part(pending, Phase.EXPIRED, Reason.EXPIRED, words, now)
+        if self.mode_change is not None and now >= self.mode_change.waits_since + MAX_QUEUE_TIME_S:
             self.close_mode_change(Phase.EXPIRED, Reason.EXPIRED, words, now)
+
+    # ------------------------------------------------------------------ actions on parts of the car
+
+    def add_part(self, pending: Pending, frames: Iterable[Any], part: Hashable, now: float) -> None:
+        """Queue an action on a part of the car. End what lasts on that part."""
+        words = f"another {pending.command.verb} by {pending.command.sender.text_name}"
+        for other in [each for each in self.one_shots if each.lasts and each.part == part]:
+            self._end_part(other, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        pending.part = part
+        pending.frames.extend(frames)
+        pending.begin_delay(now)
+        self.one_shots.append(pending)
+
+    @property
+    def turns(self) -> Iterator[Pending]:
+        """Yield the actions of which one may write next: each is written before the next one, but for delays."""
+        for pending in self.one_shots:
+            yield pending
+            if not pending.is_delayed:
+                return
+
+    def next_part(self, now: float) -> Pending | None:
+        """Return the action whose frame is due, if any."""
+        return next((each for each in self.turns if now >= each.due_at), None)
+
+    @property
+    def part_at(self) -> float:
+        """Return when the next frame of an action is due; inf if none waits."""
+        return min((each.due_at for each in self.turns), default=float("inf"))
+
+    @property
+    def has_undelayed(self) -> bool:
+        """Return True if an action waits for the car alone."""
+        return any(not each.is_delayed for each in self.one_shots)
+
+    def on_part_written(self, pending: Pending, now: float) -> None:
+        """Count the next frame of an action as written. One that lasts is recorded as sent when it begins."""
+        pending.frames.popleft()
+        pending.begin_delay(now)
+        if pending.lasts or not pending.frames:
+            self.log.record_sent(pending, now)
+        if not pending.frames:
+            self._remove(pending)
+
+    def end_lasting(self, words: str, now: float) -> None:
+        """End the actions that last: another command took their place."""
+        for pending in [each for each in self.one_shots if each.lasts]:
+            self._end_part(pending, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+
+    def _end_part(self, pending: Pending, phase: Phase, reason: Reason, words: str, now: float) -> None:
+        self._remove(pending)
+        self.log.record(pending, phase, now, reason=reason, words=words)
+
+    def _remove(self, pending: Pending) -> None:
+        self.one_shots = deque(each for each in self.one_shots if each is not pending)
+
+    # ------------------------------------------------------------------ the end of commands
 
     def drop(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
         """End all commands."""

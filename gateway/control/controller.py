@@ -213,10 +213,9 @@ class Controller(Generic[D_co]):
             case Fan(bool() as on) if on == self.driver.model.outputs.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case PartAction() | Find():
-                pending.frames.extend(self.driver.frames(what))
+                self._queue.add_part(pending, self.driver.frames(what), self.driver.part(what), now)
             case _:
                 assert_never(what)
-        self._queue.one_shots.append(pending)
         return self._queued(pending, now)
 
     def record_rejection(self, command: Command, reason: Reason, words: str, now: float) -> Answer:

@@ -13,14 +13,14 @@ Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` leads through a
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue
-from gateway.control.commands import Action
+from gateway.control.commands import Action, Signal
 from gateway.control.events import OutgoingFrame
 from gateway.control.trust import TrustEvent, TrustState
 from schemas.car_profile import CarProfile
@@ -388,7 +388,14 @@ class Driver(ABC):
 
     @abstractmethod
     def frames(self, what: Action) -> tuple[Any, ...]:
-        """Return the frames of an action on a part of the car. `poll` returns them again, one at a time."""
+        """Return the frames of an action on a part of the car. `poll` returns them again, one at a time.
+
+        One that is a `Later` is due after its delay: so an action lasts, and other commands go out meanwhile.
+        """
+
+    def part(self, what: Action) -> Hashable:
+        """Return the part of the car that an action is on. A new one ends what lasts on the same part."""
+        return (type(what), what.verb if isinstance(what, Signal) else "")
 
     @abstractmethod
     def accepts_commands(self, now: float) -> bool:

@@ -38,6 +38,20 @@ Record = CommandRecord | LogRecord
 
 
 @dataclass(frozen=True, slots=True)
+class Later:
+    """A frame of an action that lasts, as a driver gives it. Other commands go out in the delay before it."""
+
+    frame: Any
+    after_s: float
+    """Seconds from the frame before it, or from the command."""
+
+
+def frame_of(given: Any) -> Any:
+    """Return the frame that a driver gave, without its delay."""
+    return given.frame if isinstance(given, Later) else given
+
+
+@dataclass(frozen=True, slots=True)
 class OutgoingFrame:
     """One frame to write now, in a single write."""
 

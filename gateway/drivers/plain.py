@@ -35,7 +35,7 @@ from gateway.control.driver import (
     learn_trust,
     log_unstopped,
 )
-from gateway.control.events import OutgoingFrame
+from gateway.control.events import Later, OutgoingFrame
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from schemas.car_profile import CarProfile
 from schemas.limits import SHUTDOWN_S
@@ -273,8 +273,8 @@ class PlainDriver(Driver):
         return self.motion_frame(Motion.STOP)
 
     @abstractmethod
-    def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
-        """Return the frames of an action on a part of the car, or None if the car cannot do it."""
+    def part_frames(self, what: Action) -> tuple[bytes | Later, ...] | None:
+        """Return the frames of an action on a part of the car (`Later` if it lasts). None if the car cannot do it."""
 
     @property
     def can_show(self) -> bool:
@@ -450,10 +450,9 @@ class PlainDriver(Driver):
 
     def _next_part(self, now: float) -> OutgoingFrame | None:
         """Return the next frame of an action on a part of the car, if one is due."""
-        if not self.queue.one_shots or now < self._part_at:
+        if now < self._part_at or (pending := self.queue.next_part(now)) is None:
             return None
-        pending, held = self.queue.one_shots[0], self.queue.held
-        data = pending.frames[0]
+        data, held = pending.next_frame, self.queue.held
         if isinstance(pending.command.what, ChangeSpeed):  # the motion at its arrival may be over
             is_driven = held is not None and held.pending.sent and self._stop is None
             data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
@@ -485,13 +484,9 @@ class PlainDriver(Driver):
                     held.begin(now, self._model.range_cm)
                     self._log.record_sent(held.pending, now)
             case Pending():
-                source.frames.popleft()
-                self._part_at = now + (self.PART_GAP_S if source.frames else 0.0)
+                self.queue.on_part_written(source, now)
+                self._part_at = now + (self.PART_GAP_S if source.frames and not source.is_delayed else 0.0)
                 self._apply(source.command.what, now)
-                if not source.frames:
-                    self._log.record_sent(source, now)
-                    if self.queue.one_shots and self.queue.one_shots[0] is source:
-                        self.queue.one_shots.popleft()
             case None:
                 pass
 
@@ -517,13 +512,13 @@ class PlainDriver(Driver):
             if stop.index >= self.STOP_FRAMES:
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
             times += [stop.next_at, *(each for each in later if each > now)]
-            if (self._has_new_motion(stop) or self.queue.one_shots) and not self.wait_words(now):
-                times.append(max(self.free_at(now), self._part_at if self.queue.one_shots else now))
+            if not self.wait_words(now):
+                part_at = now if self._has_new_motion(stop) else max(self._part_at, self.queue.part_at)
+                times.append(max(self.free_at(now), part_at))
         elif not self.wait_words(now):
             if held is not None and not held.pending.sent:
                 times.append(now)
-            if self.queue.one_shots:
-                times.append(self._part_at)
+            times.append(max(self._part_at, self.queue.part_at))
             if held is not None:
                 times.append(self._resend_at)
             if self._model.at_rest and not self._model.trust.shown:
@@ -552,7 +547,7 @@ class PlainDriver(Driver):
             case _:
                 return None
 
-    def frames(self, what: Action) -> tuple[bytes, ...]:
+    def frames(self, what: Action) -> tuple[bytes | Later, ...]:
         """Return the frames of an action on a part of the car. One that is not a frame still takes its turn."""
         if isinstance(what, ChangeSpeed):
             return (self.motion_frame(Motion.STOP),)  # its place; what is written is the motion of that moment

@@ -23,6 +23,7 @@ from gateway.control.commands import (
     Signal,
 )
 from gateway.control.driver import Desk, Event, Fields
+from gateway.control.events import Later, frame_of
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
@@ -142,7 +143,7 @@ class YahboomDriver(Executor):
                 return None
             case PartAction():
                 frames = self._frames_of(what)
-                words = next((why for frame in frames if (why := profile.refusal(frame))), None)
+                words = next((why for each in frames if (why := profile.refusal(frame_of(each)))), None)
                 if isinstance(what, Signal) and not frames:
                     return f"{car} ({profile.name}) has no {what.verb}."
                 is_unknown = believed.fan is None and not profile.fan_is_level
@@ -164,11 +165,11 @@ class YahboomDriver(Executor):
         car = self.desk.car
         return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
 
-    def frames(self, what: Action) -> tuple[Frame, ...]:
+    def frames(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action on a part of the car, without those that the car does not know."""
-        return tuple(frame for frame in self._frames_of(what) if self.model.profile.refusal(frame) is None)
+        return tuple(each for each in self._frames_of(what) if self.model.profile.refusal(frame_of(each)) is None)
 
-    def _frames_of(self, what: Action) -> tuple[Frame, ...]:
+    def _frames_of(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action. A general frame gets the current motion when it is written."""
         match what:
             case Led(r, g, b):
@@ -195,7 +196,8 @@ class YahboomDriver(Executor):
 
     def _blinks(self) -> tuple[Frame, ...]:
         """Return the frames of `find`. The last one sets the LED color that the queued commands will leave."""
-        waiting = [each for act in self.queue.one_shots for each in act.frames if isinstance(each, ColorLed)]
+        frames = [frame_of(each) for act in self.queue.one_shots for each in act.frames]
+        waiting = [each for each in frames if isinstance(each, ColorLed)]
         led = waiting[-1] if waiting else self.model.believed.led
         other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)
         whistle = General(Motion.STOP, whistle=True)

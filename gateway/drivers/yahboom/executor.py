@@ -105,7 +105,7 @@ class Executor(Driver):
                 return None
             # A new command goes before the repeats of a stop, but never before its first frames. While it waits for the
             # car, no repeat may start: each would block the car again.
-            if not (self._has_new_command and self.accepts_commands(now)):
+            if not (self._has_new_command(now) and self.accepts_commands(now)):
                 return self._next_step(running, now)
         return self._next_command(now)
 
@@ -124,21 +124,26 @@ class Executor(Driver):
         if held is not None and not held.pending.sent and self._is_new(held.pending):
             self.stops.give_way(now)
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
-        change = queue.mode_change
-        # A command that was queued before the mode goes first: in the mode the car would ignore it.
-        stands = model.at_rest or self._full_stop_runs
-        if change is not None and not (queue.one_shots and stands) and self._is_new(change):
+        if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
-        if queue.one_shots and now >= model.pacing.act_at(queue.one_shots[0].frames[0]):
-            pending = queue.one_shots[0]
-            if self._is_new(pending):
-                frame = model.believed.with_motion(pending.frames[0])
-                return self._write(frame, FrameOrigin.COMMAND, pending, pending)
+        pending = queue.next_part(now)
+        if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._is_new(pending):
+            frame = model.believed.with_motion(pending.next_frame)
+            return self._write(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
             return None
         if self._repeats(now) and now >= model.pacing.repeat_at:
             return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
         return self._renew_stop(now)
+
+    @property
+    def _next_mode(self) -> Pending | None:
+        """Return the mode that goes before the actions on parts of the car, if one waits."""
+        change = self.queue.mode_change
+        # A command that was queued before the mode goes first: in the mode the car would ignore it.
+        stands = self.model.at_rest or self._full_stop_runs
+        waits = change is None or (self.queue.has_undelayed and stands) or not self._is_new(change)
+        return None if waits else change
 
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, but stop the car first: opening a mode while driving leaves the motors on."""
@@ -171,11 +176,10 @@ class Executor(Driver):
             return False
         return running.sent_all or not running.repeats
 
-    @property
-    def _has_new_command(self) -> bool:
+    def _has_new_command(self, now: float) -> bool:
         """Return True if a command waits that may go before the repeats of the running stop."""
-        held, change, one_shots = self.queue.held, self.queue.mode_change, self.queue.one_shots
-        waiting = [change, one_shots[0] if one_shots else None]
+        held, change = self.queue.held, self.queue.mode_change
+        waiting = [change, self.queue.next_part(now)]
         waiting += [held.pending] if held is not None and not held.pending.sent else []
         return any(pending is not None and self._is_new(pending) for pending in waiting)
 
@@ -248,14 +252,11 @@ class Executor(Driver):
                 self.queue.mode_change = None
                 self.mode_sent = (source, now)
                 self._log.record_sent(source, now)
+                self.queue.end_lasting(f"a mode by {source.command.sender.text_name}", now)
             case Pending():
-                source.frames.popleft()
                 if self.stops.running is not None:
                     self.stops.running.on_other_written(now)
-                if not source.frames:
-                    self._log.record_sent(source, now)
-                    if self.queue.one_shots and self.queue.one_shots[0] is source:
-                        self.queue.one_shots.popleft()
+                self.queue.on_part_written(source, now)
             case None:
                 model.believed.repeat = False
 
@@ -379,7 +380,7 @@ class Executor(Driver):
         times = self.queue.deadlines()
         running = self.stops.running
         if running is not None:
-            waits = self._has_new_command and self.accepts_commands(now)
+            waits = self._has_new_command(now) and self.accepts_commands(now)
             times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
         times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))
@@ -392,8 +393,11 @@ class Executor(Driver):
         if running is not None and self.stops.shutting_down:
             return times
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
-        if queue.one_shots and self._is_new(queue.one_shots[0]):
-            times.append(max(model.pacing.act_at(queue.one_shots[0].frames[0]), model.left_until, free_at))
+        times.extend(
+            max(each.due_at, model.pacing.act_at(each.next_frame), model.left_until, free_at)
+            for each in (queue.turns if self._next_mode is None else ())
+            if self._is_new(each)
+        )
         if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
             times.append(max(model.ready_at, free_at))
         if queue.mode_change is not None and self._is_new(queue.mode_change):

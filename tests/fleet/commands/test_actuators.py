@@ -12,7 +12,7 @@ from fleet.commands import actuators
 from schemas.commands import COMMANDS
 
 PLAIN = [row for row in COMMANDS.values() if row.subcommand]
-HORN = replace(COMMANDS["whistle"], max_duration_s=10.0, subcommand="horn")
+HORN = replace(COMMANDS["whistle"], min_duration_s=0.5, max_duration_s=10.0, subcommand="horn")
 """A row with a duration. No verb of a car has one and needs no rules."""
 
 
@@ -29,7 +29,8 @@ def test_the_row_is_the_subcommand(row: Any) -> None:
 def test_a_row_with_a_maximum_duration_adds_an_option() -> None:
     horn: click.Command = actuators._plain_command(HORN)
     assert "fleet horn red --for 2s\n" in CliRunner().invoke(horn, ["--help"]).output
-    for words, error in ((["red", "--for", "11s"], "10s"), (["red"], "--for"), (["--for", "2s"], "CAR...")):
+    wrong = [(["red", "--for", "11s"], "10s"), (["red", "--for", "400ms"], "500ms")]
+    for words, error in (*wrong, (["red"], "--for"), (["--for", "2s"], "CAR...")):
         result = CliRunner().invoke(horn, words)
         assert (result.exit_code, error in result.output) == (2, True), result.output
 

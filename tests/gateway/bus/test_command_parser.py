@@ -142,6 +142,10 @@ def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -
     for wrong in (86_401, 0, -1, "NaN", "Infinity"):
         assert "duration_s" in refused("lend", {"duration_s": wrong}).words
     assert "duration_s 0: " in refused("lend", {}).words
+    row = replace(COMMANDS["lend"], signal=True, min_duration_s=2.0)
+    monkeypatch.setattr(command_parser, "COMMANDS", {**COMMANDS, "lend": row})
+    assert ask("lend", {"duration_s": 2}).what == Signal(Verb.LEND, 2.0)
+    assert "duration_s 1.9: " in refused("lend", {"duration_s": 1.9}).words
 
 
 @pytest.mark.parametrize(
