@@ -1,7 +1,6 @@
 """`fleet record` and `fleet mark`: runs the recorder as a process, and sends commands to a running recorder."""
 
 import json
-import re
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ from fleet.commands.fleets import the_fleet
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
+from fleet.quota import Quota, parse_size
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from fleet.recording.writing.disk_space import Reserve
 from fleet.recording.writing.recorder_service import AnotherRecorder
@@ -34,7 +34,6 @@ HUB_RESTART_DELAY_S: Final = 0.5
 """Time without a link after which the recorder restarts the hub."""
 
 
-_SIZE_UNITS: Final = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _WEEK_S: Final = 7 * 86_400.0
 
 
@@ -48,9 +47,8 @@ class SizeType(click.ParamType[int]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Return the number of bytes. Fail outside the range."""
-        match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([KMGT]?B|)", str(value).upper())
-        size = int(float(match[1]) * _SIZE_UNITS[match[2]]) if match else -1
-        if not self._least <= size <= 10**15:
+        size = parse_size(str(value))
+        if size is None or not self._least <= size <= 10**15:
             least = f"{self._least / 10**6:g} MB" if self._least else "0"
             self.fail(f"{value!r} is not allowed: {least} to 1000 TB, as 512MB, 1.5GB or a number of bytes", param, ctx)
         return size
@@ -160,7 +158,6 @@ def run(
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
-    from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
     from fleet.recording.writing.recorder import Recorder, RecordingFailed
     from fleet.recording.writing.session_writer import Options, Sync
 
@@ -170,7 +167,7 @@ def run(
         raise click.UsageError(limits.refusal)
     options = Options(
         segment_bytes=segment_size,
-        segment_s=segment_time if segment_time is not None else QUOTA_SEGMENT_S if quota else Options().segment_s,
+        segment_s=segment_time if segment_time is not None else limits.segment_s(Options().segment_s),
         sync=Sync(sync),
         quota=limits,
         reserve=Reserve(keep_free),

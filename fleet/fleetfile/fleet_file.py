@@ -23,6 +23,7 @@ from fleet.fleetfile.models import (
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from fleet.policy.car_condition import parse_condition
+from fleet.quota import Quota
 from gateway import drivers
 from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.colors import Rgb, car_color, hex_color, parse_color
@@ -97,7 +98,7 @@ class PinRule:
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: maximum size of all sessions, empty for no limit.
+    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: how much the recorder keeps.
     console_port: the port of the web page; 0: the default. groups: cars by group. people: the only ones who may drive;
     None: everyone may. unlinked: cars without a link, if they are allowed. pins: what is pinned in recordings.
     """
@@ -107,7 +108,7 @@ class FleetFile:
     cars: Mapping[str, FleetCar]
     plan: Path | None
     recordings: Path | None
-    quota: str
+    quota: Quota
     record: bool
     console: bool
     console_port: int
@@ -180,7 +181,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         console=file.console is not False,
         console_port=file.console.port if isinstance(file.console, ConsoleEntry) else 0,
         recordings=_resolve_path(path, record.to or None if record else None),
-        quota=record.quota if record else "",
+        quota=record.limits if record else Quota(),
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
         people=_resolve_people(file) if "people" in tree else None,
         pins=tuple(map(_resolve_pin, file.pin)),

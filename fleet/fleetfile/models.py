@@ -10,6 +10,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from fleet.links import parse_fleet_link
+from fleet.quota import Quota, parse_size
 from gateway import drivers
 from schemas import bus, keys
 from schemas.battery_levels import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
@@ -189,6 +190,11 @@ class RecordEntry(Entry):
     quota: _Size = Field(
         default_factory=str, description="maximum size of all sessions there: 20GB; the oldest ones are removed"
     )
+
+    @property
+    def limits(self) -> Quota:
+        """Return what the recorder keeps."""
+        return Quota(total=parse_size(self.quota) or 0)
 
 
 class PinEntry(Entry):

@@ -13,6 +13,7 @@ from typing import Final
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule, default_color, profile_capabilities
 from fleet.fleetfile.models import PersonRank
+from fleet.quota import Quota
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
 from schemas.platform_name import AUTO
@@ -80,8 +81,8 @@ class FleetSpec:
     """The checked text of the plan. Later changes of the file take effect at a reload."""
     record: bool = True
     recordings: Path = RECORDINGS
-    quota: str = ""
-    """Maximum size of all sessions, such as 20GB. Empty for no limit."""
+    quota: Quota = field(default_factory=Quota)
+    """How much the recorder keeps."""
     pins: tuple[PinRule, ...] = ()
     """What is pinned in recordings. The recorder reads it from the file."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -152,7 +153,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         plan=options.plan or (file.plan if file else None),
         record=(file.record if file else True) if options.record is None else options.record,
         recordings=options.out or (file.recordings if file else None) or RECORDINGS,
-        quota=file.quota if file else "",
+        quota=file.quota if file else Quota(),
         pins=file.pins if file else (),
         groups=file.groups if file else {},
         people=people,
@@ -280,8 +281,8 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     where = ("--fleet", spec.fleet, "--connect", endpoint, *parent_option())
     files = {"--fleet-file": spec.file, "--plan": spec.plan}
     copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
-    quota = ("--quota", spec.quota) if spec.quota else ()
-    return module("fleet.cli", "record", "run", "--sessions", str(spec.recordings), "--json", *quota, *copies, *where)
+    words = ("--sessions", str(spec.recordings), "--json", *spec.quota.arguments)
+    return module("fleet.cli", "record", "run", *words, *copies, *where)
 
 
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:

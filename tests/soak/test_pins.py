@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fleet.quota import QUOTA_SEGMENT_S, Quota
 from fleet.recording.pins import PIN_AFTER_NS, PIN_BEFORE_NS, minute_of
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SessionInfo, gone_of
-from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.words import PinCause
 

@@ -1,4 +1,4 @@
-"""The quota of a recorder: how large all sessions may be together, and the removal of what is too much.
+"""Removes what is too much for the quota of a recorder (fleet/quota.py).
 
 quota_choice.py decides what goes. What is gone is listed: the segments of a session in its session.json, whole sessions
 in `removed.json` beside them.
@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.pins import Pin, pins_of
 from fleet.recording.reading.mcap_reader import McapReader, NotMcap
@@ -21,10 +22,6 @@ from fleet.recording.time_spec import iso, iso_ns
 from fleet.recording.writing.disk_space import MB
 from fleet.recording.writing.quota_choice import Spans, StoredSegment, StoredSession, Taking, choose
 
-SESSIONS_PER_QUOTA: Final = 10
-"""Minimum sessions in a quota. The quota spares the session that is being written, so each is at most a tenth of it."""
-QUOTA_SEGMENT_S: Final = 60.0
-"""Length of a segment, s, if there is a quota: it takes whole segments, and a pin is of a minute."""
 MAX_REMOVED: Final = 1000
 """Maximum removed sessions that `removed.json` lists, the newest: 200 bytes each."""
 _UNCLOSED_IN_USE_S: Final = 60.0
@@ -43,58 +40,32 @@ class Enforced:
     """Why the sessions are still too large together."""
 
 
-@dataclass(frozen=True, slots=True)
-class Quota:
-    """Maximum size of all sessions together, and of one, in bytes. 0 means no limit."""
+def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> Enforced:
+    """Remove segments below `root` until all sessions fit.
 
-    total: int = 0
-    """The oldest unpinned segments of unmarked sessions are removed first."""
-    session: int = 0
-    """Size at which a session is closed and the next one begins; 0: a tenth of `total`."""
-
-    @property
-    def session_limit(self) -> int:
-        """Return the maximum size of one session in bytes. 0 means no limit."""
-        return self.session or self.total // SESSIONS_PER_QUOTA
-
-    @property
-    def refusal(self) -> str:
-        """Return why the two sizes do not fit each other. Empty if they do."""
-        if not self.session or not self.total or self.session <= self.total // 2:
-            return ""
-        return (
-            f"--session-size: {self.session / 10**6:g} MB is more than half of --quota: at most "
-            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota takes nothing of the session that is written"
-        )
-
-    def enforce(self, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> Enforced:
-        """Remove segments below `root` until all sessions fit.
-
-        Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: those of
-        `keep`, whose session.json may not have them yet.
-        """
-        done = Enforced()
-        if not self.total:
-            return done
-        paths = [path.parent for path in root.glob(f"*/{SESSION_FILE}")]
-        over = sum(map(_size, paths)) - self.total
-        if over <= 0:
-            return done
-        infos = {path: info for path in paths if (info := SessionInfo.read(path)) is not None}
-        spans = _spans(infos, keep, pins)
-        stored = [
-            _stored(path, info, spans[info.fleet])
-            for path, info in infos.items()
-            if path != keep and _may_go(path, info)
-        ]
-        taking = choose(stored, over, self.total)
-        for name in dict.fromkeys([*(each.session for each in taking.segments), *taking.tables, *taking.removed]):
-            freed = _take(root / name, infos[root / name], taking, done)
-            over -= freed
-        if over > 0:
-            why = f"by {over / MB:.1f} MB that are marked, pinned, in use or not to be removed"
-            done.warning = f"{root} has more than its quota, {why}"
+    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: those of
+    `keep`, whose session.json may not have them yet.
+    """
+    done = Enforced()
+    if not quota.total:  # without a look at the disk
         return done
+    paths = [path.parent for path in root.glob(f"*/{SESSION_FILE}")]
+    over = quota.excess(sum(map(_size, paths)))
+    if not over:
+        return done
+    infos = {path: info for path in paths if (info := SessionInfo.read(path)) is not None}
+    spans = _spans(infos, keep, pins)
+    stored = [
+        _stored(path, info, spans[info.fleet]) for path, info in infos.items() if path != keep and _may_go(path, info)
+    ]
+    taking = choose(stored, over, quota.total)
+    for name in dict.fromkeys([*(each.session for each in taking.segments), *taking.tables, *taking.removed]):
+        freed = _take(root / name, infos[root / name], taking, done)
+        over -= freed
+    if over > 0:
+        why = f"by {over / MB:.1f} MB that are marked, pinned, in use or not to be removed"
+        done.warning = f"{root} has more than its quota, {why}"
+    return done
 
 
 def _spans(infos: Mapping[Path, SessionInfo], keep: Path, pins: Iterable[Pin]) -> dict[str, Spans]:

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import zenoh
 
+from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.pins import Pin, PinList
 from fleet.recording.sequence_tracker import SequenceTracker
@@ -22,7 +23,7 @@ from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
 from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, free_bytes, shortage
-from fleet.recording.writing.quota_removal import Quota
+from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
 from schemas.bus import sequence_of
@@ -30,8 +31,6 @@ from schemas.bus import sequence_of
 MAX_BUFFERED_MESSAGES: Final = 100_000
 MAX_BUFFERED_BYTES: Final = 64 * MB
 """Maximum size of the buffer while the disk is full. Further messages are dropped and counted."""
-MAX_SEGMENTS: Final = 9990
-"""Maximum segments of a session: their names have four digits."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
 
@@ -234,7 +233,7 @@ class SessionWriter:
     @property
     def over(self) -> bool:
         """True if the session has reached its limit of bytes or segments."""
-        return 0 < self._options.quota.session_limit <= self.bytes or self.segments >= MAX_SEGMENTS
+        return self._options.quota.is_session_over(self.bytes, self.segments)
 
     # ------------------------------------------------------------------ every second, and the end
 
@@ -478,7 +477,7 @@ class SessionWriter:
 
     def _check_disk(self) -> None:
         """Enforce the quota, and pause if the disk is nearly full."""
-        done = self._options.quota.enforce(self._root, self.path, self._pins.pins)
+        done = enforce(self._options.quota, self._root, self.path, self._pins.pins)
         self.quota_news += done.news
         self.warning = done.warning
         reserve, free = self._options.reserve, self.free_bytes

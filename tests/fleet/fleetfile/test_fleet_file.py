@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
 from fleet.fleetfile.models import FileEntry
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
+from fleet.quota import Quota
 from gateway.control import battery
 from gateway.link import BadUrl, parse_url
 from schemas.colors import car_color, hex_color
@@ -53,7 +54,7 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     path.write_text(LAYERS)
     fleet = read_fleet(path)
     assert (fleet.name, fleet.endpoint, fleet.record, fleet.text) == ("lab", "tcp/127.0.0.1:7000", True, LAYERS)
-    assert (fleet.quota, dict(fleet.groups)) == ("20GB", {"a": ("red", "blue")})
+    assert (fleet.quota, dict(fleet.groups)) == (Quota(20 * 10**9), {"a": ("red", "blue")})
     assert (fleet.plan, fleet.recordings) == (tmp_path / "plan.yaml", tmp_path.parent / "kept")
     assert list(fleet.cars) == ["red", "green", "blue"]
     red, green, blue = fleet.cars.values()

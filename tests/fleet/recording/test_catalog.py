@@ -19,13 +19,14 @@ from mcap.writer import Writer
 
 from fleet import Catalog
 from fleet.commands.output import MAX_CELL
+from fleet.quota import Quota
 from fleet.recording.catalog import BadQuery, QueryFailed, view_name
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import TABLES_PREFIX, SessionInfo
 from fleet.recording.tools import table_cache
 from fleet.recording.tools.table_cache import STALE_PART_S, tables_of
-from fleet.recording.writing.quota_removal import Quota
+from fleet.recording.writing.quota_removal import enforce
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import name_of
@@ -492,7 +493,7 @@ def test_quota_deletes_session_while_tables_are_made(sessions: Path, monkeypatch
         path.rmdir()
 
     monkeypatch.setattr(shutil, "rmtree", and_a_question)
-    assert Quota(total=1).enforce(sessions, sessions / "one").removed == [sessions / "two"]
+    assert enforce(Quota(total=1), sessions, sessions / "one").removed == [sessions / "two"]
     assert not (sessions / "two").exists()
 
 

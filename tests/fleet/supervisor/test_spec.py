@@ -9,6 +9,7 @@ import pytest
 
 from fleet.commands import record
 from fleet.fleetfile.fleet_file import parse_fleet, people_table
+from fleet.quota import Quota
 from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
     SIMULATED,
@@ -38,7 +39,7 @@ cars:
 def test_a_file_says_it_all(tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
     assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", True)
-    assert (spec.recordings, spec.quota) == (tmp_path / "kept", "20GB")
+    assert (spec.recordings, spec.quota) == (tmp_path / "kept", Quota(20 * 10**9))
     assert [(car.name, car.link, car.platform) for car in spec.cars.values()] == [
         ("ann", "/dev/ttyUSB0", "stm32+imu"),
         ("bob", "tcp://192.168.1.7:8888", "auto"),

@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 import zenoh
 
+from fleet.quota import QUOTA_SEGMENT_S, Quota
 from fleet.recording.pins import minute_of
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import REMOVED_FILE, SESSION_FILE
 from fleet.recording.time_spec import iso
-from fleet.recording.writing.quota_removal import QUOTA_SEGMENT_S, Quota
+from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.words import PinCause
 from tests.support import in_process
@@ -50,7 +51,7 @@ def thinned(tmp_path: Path) -> Path:
     root = tmp_path / "all"
     path, newest = record(root, BEGUN_NS), record(root, BEGUN_NS + 3600 * SECOND_NS)
     over = sum((path / f"{number:04d}.mcap").stat().st_size for number in (1, 2))
-    done = Quota(size(root) - over + LIST_BYTES).enforce(root, newest)
+    done = enforce(Quota(size(root) - over + LIST_BYTES), root, newest)
     assert (done.removed, done.warning) == ([], "")
     assert not (path / "0001.mcap").exists()
     assert not (path / "0002.mcap").exists()
@@ -103,7 +104,7 @@ def test_a_file_that_the_quota_did_not_take_is_damage(thinned: Path) -> None:
 def test_the_list_of_removed_sessions_is_none_itself(thinned: Path) -> None:
     root = thinned.parent
     (newest,) = (each for each in root.iterdir() if each != thinned)
-    done = Quota(LIST_BYTES).enforce(root, newest)  # half of it is less than the pinned minute
+    done = enforce(Quota(LIST_BYTES), root, newest)  # half of it is less than the pinned minute
     assert done.removed == [thinned]
     (removed,) = json.loads((root / REMOVED_FILE).read_text())["sessions"]
     assert (removed["session"], removed["fleet"], removed["messages"]) == (thinned.name, "fleet", MINUTES * 60)

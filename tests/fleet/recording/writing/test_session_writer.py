@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.verify import verify
 from fleet.recording.writing.disk_space import MB
-from fleet.recording.writing.quota_removal import Quota
 from fleet.recording.writing.session_writer import Options, SessionWriter, Sync
 
 BEGUN_NS = 1_790_000_000_000_000_000

@@ -1,0 +1,71 @@
+"""How much a recorder keeps: one value from a fleet file through `fleet up` to `fleet record run`. Pure.
+
+A further limit is a field here, with what it decides, a key in the model of the fleet file, and an option.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+SESSIONS_PER_QUOTA: Final = 10
+"""Minimum sessions in a quota. The quota spares the session that is being written, so each is at most a tenth of it."""
+QUOTA_SEGMENT_S: Final = 60.0
+"""Length of a segment, s, if there is a quota: it takes whole segments, and a pin is of a minute."""
+MAX_SEGMENTS: Final = 9990
+"""Maximum segments of a session: their names have four digits."""
+_SIZE_UNITS: Final = {"TB": 10**12, "GB": 10**9, "MB": 10**6, "KB": 10**3, "B": 1, "": 1}
+
+
+def parse_size(text: str) -> int | None:
+    """Return the number of bytes of `512MB`, `1.5GB`, or a number of bytes. None if the text is no size."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([KMGT]?B|)", text.upper())
+    return int(float(match[1]) * _SIZE_UNITS[match[2]]) if match else None
+
+
+def format_size(size: int) -> str:
+    """Return a number of bytes with its largest whole unit."""
+    unit, factor = next((unit, factor) for unit, factor in _SIZE_UNITS.items() if size % factor == 0)
+    return f"{size // factor}{unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """Maximum size of all sessions together, and of one, in bytes. 0 means no limit."""
+
+    total: int = 0
+    """The oldest unpinned segments of unmarked sessions are removed first."""
+    session: int = 0
+    """Size at which a session is closed and the next one begins; 0: a tenth of `total`."""
+
+    @property
+    def session_limit(self) -> int:
+        """Return the maximum size of one session in bytes. 0 means no limit."""
+        return self.session or self.total // SESSIONS_PER_QUOTA
+
+    @property
+    def refusal(self) -> str:
+        """Return why the two sizes do not fit each other. Empty if they do."""
+        if not self.session or not self.total or self.session <= self.total // 2:
+            return ""
+        return (
+            f"--session-size: {self.session / 10**6:g} MB is more than half of --quota: at most "
+            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota takes nothing of the session that is written"
+        )
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Return the options of `fleet record run` that say this."""
+        options = {"--quota": self.total, "--session-size": self.session}
+        return tuple(word for option, size in options.items() if size for word in (option, format_size(size)))
+
+    def segment_s(self, otherwise_s: float) -> float:
+        """Return the length of a segment for these limits, s. otherwise_s: without any."""
+        return QUOTA_SEGMENT_S if self.total else otherwise_s
+
+    def is_session_over(self, size: int, segments: int) -> bool:
+        """Return True if a session of this size has enough: the next one begins."""
+        return 0 < self.session_limit <= size or segments >= MAX_SEGMENTS
+
+    def excess(self, size: int) -> int:
+        """Return by how many bytes all sessions are too large together; 0 if they are not."""
+        return max(0, size - self.total) if self.total else 0
