@@ -62,7 +62,7 @@ async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Pa
     try:
         while not driver.finished:
             await _write(link, driver)
-            if reads.done():
+            if reads.done() and isinstance(reads.exception(), LinkLost):
                 reads.result()
             await asyncio.sleep(_STOP_POLL_S)
             control.tick(loop.time())
@@ -70,7 +70,7 @@ async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Pa
         driver.link_down(str(error), loop.time())
     finally:
         reads.cancel()
-        with contextlib.suppress(asyncio.CancelledError, LinkLost):
+        with contextlib.suppress(asyncio.CancelledError, Exception):  # a driver that cannot read still writes its stop
             await reads
         await link.close()
     return driver.not_stopped

@@ -12,6 +12,7 @@ from typing import Final
 import click
 import segno
 
+from fleet.client.client import Fleet
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import show_table
@@ -23,11 +24,15 @@ from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import LOOPBACK, Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus import LOOPBACK, Bus, BusError, Credentials, is_loopback, is_secure, resolve_endpoint, router_settings
 from schemas.bus.hub import LINKS_FILE
-from schemas.identity import Service
+from schemas.identity import IdentityRole, Service
 from schemas.printable import printable
+from schemas.running_cars import running_cars
+from schemas.words import Rank
 
+SITE_RULES_S: Final = 5.0
+"""The same at another site, whose hub asks for the rules every two seconds."""
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
 MAX_JOIN_LINE: Final = 500
 """Maximum characters of the line that `fleet join -` reads."""
@@ -141,11 +146,14 @@ def invite(
         if here != LOOPBACK and all(map(is_loopback, store.credentials.listens or [endpoint])):
             raise click.ClickException("This hub listens on loopback only: `fleet hub init` opens it to the network.")
         store = local_hub.ensure_hub_here(endpoint)  # the addresses of this computer may have changed
-        store.reserve(invited)
         text = DEFAULT_FLEET_FILE.read_text(encoding="utf-8") if DEFAULT_FLEET_FILE.is_file() else ""
         hub_port = int(endpoint.rpartition(":")[2])
         invitation = Invitation(store, invited, hub_port=hub_port, port=port, fleet_file=text)
     try:
+        if car and invited in store.known:
+            _stop_first(endpoint, car)
+        with cli_errors(), _disk_errors():
+            store.reserve(invited)  # an earlier certificate ends, so not before this computer listens
         if port != JOIN_PORT:
             here = f"{here}:{port}"
         if as_json:
@@ -200,10 +208,14 @@ def revoke(who: str) -> None:
         store = _own_store(resolve_endpoint())
         if who == store.credentials.me:
             raise click.UsageError(f"{who} is you, on the hub's own computer: nobody could undo it")
+        role, _, own = who.partition(".")
+        if role == IdentityRole.CAR and who in store.known:
+            _stop_first(store.credentials.endpoint, own)
         if not store.revoke(who):
             there = ", ".join(name for name, each in sorted(store.known.items()) if not each.revoked)
             raise click.UsageError(f"{printable(who)} has no certificate. There are: {there}")
-    click.echo(f"{who} is revoked. Its cars may still move: stop them with `fleet stop`.")
+    words = " What that person drove may still move: stop it with `fleet stop`." if role == IdentityRole.PERSON else ""
+    click.echo(f"{who} is revoked.{words}")
 
 
 @click.command(
@@ -250,7 +262,7 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
                 "127.0.0.1`."
             )
             return
-        said = _describe_cars_on(endpoint)
+        said = _describe_cars_on(endpoint, SITE_RULES_S if site else HUB_RESTART_S)
     click.echo(f"You are {joined.identity} at {endpoint} now. {said}")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
         DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
@@ -261,6 +273,11 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
 def leave() -> None:
     """Leave the hub that this computer has joined. The certificate on this computer is deleted."""
     with cli_errors(), _disk_errors():
+        if cars := running_cars(resolve_endpoint()):
+            raise click.ClickException(
+                f"gateways run here ({', '.join(cars)}), which would lose their certificate while their cars may move: "
+                "end them first (`fleet down`, Ctrl-C, or `systemctl stop`)"
+            )
         endpoint, kept = local_hub.leave()
     if not endpoint:
         raise click.ClickException("this computer has joined no hub")
@@ -286,9 +303,9 @@ def _address(written: str, default: int) -> tuple[str, int]:
     return found[1], int(found[2] or default)
 
 
-def _describe_cars_on(endpoint: str) -> str:
+def _describe_cars_on(endpoint: str, within_s: float) -> str:
     """Return which cars are on, in a sentence. The hub may be restarting with its new rules just now, or be off."""
-    deadline = time.monotonic() + HUB_RESTART_S
+    deadline = time.monotonic() + within_s
     while True:
         is_last = time.monotonic() > deadline
         try:
@@ -303,8 +320,28 @@ def _describe_cars_on(endpoint: str) -> str:
         time.sleep(0.1)
 
 
+def _stop_first(endpoint: str, car: str) -> None:
+    """Stop a car whose gateway is about to lose its certificate: nobody reaches it over the bus after that."""
+    try:
+        with Fleet(endpoint, kind=Rank.PERSON) as client:
+            if car not in client.cars():
+                return
+            outcome = client.car(car).stop()
+    except BusError as error:
+        click.echo(f"{car} was not stopped before: {error}", err=True)
+        return
+    if outcome.ok:
+        click.echo(f"{car} is stopped first: its gateway loses the bus.", err=True)
+    else:
+        click.echo(f"NOT STOPPED: {car}: {outcome.words} Its gateway loses the bus now: go to the car.", err=True)
+
+
 def _own_store(endpoint: str) -> HubStore:
     if not is_secure(endpoint) or not (store := HubStore.of(endpoint)).is_hub:
+        if is_secure(endpoint) and (first := Credentials.of(endpoint).first_hubs):
+            raise click.ClickException(
+                f"This computer is the hub of another site: these commands are for the computer of {first[0]}."
+            )
         raise click.ClickException(
             f"This computer is not a hub ({endpoint}). `fleet hub init` makes it a hub. Only a hub has these commands."
         )
@@ -315,9 +352,9 @@ def _links(store: HubStore) -> dict[str, list[str]]:
     """Return the addresses from which each common name is connected."""
     try:
         found = json.loads((store.directory / LINKS_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return {str(name): [str(each) for each in addresses] for name, addresses in found.items()}
+    except (OSError, ValueError, AttributeError, TypeError):  # it only informs
         return {}
-    return {str(name): [str(each) for each in addresses] for name, addresses in found.items()}
 
 
 def _row(name: str, known: KnownIdentity, links: Mapping[str, Sequence[str]]) -> dict[str, str]:

@@ -336,7 +336,9 @@ def no_cars(client: Fleet) -> click.ClickException:
     """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
     if others := describe_other_fleets(client):
         return click.ClickException(others)
-    words = why_refused(client) or "No car is connected."
+    if refused := why_refused(client):
+        return click.ClickException(refused)
+    words = "No car is connected."
     if running := describe_running(client.bus.endpoint):  # on their way back to a hub that was restarted
         words = f"No car is connected, but {running}. Repeat this in a few seconds. Otherwise go to the cars."
     return click.ClickException(words)

@@ -325,14 +325,17 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Show what is recorded now and where to, at all sites, how much was lost, and whether there is room."""
-    _show_status(_query(RecorderVerb.STATUS, connect, fleet), as_json=as_json)
+    first = _query(RecorderVerb.STATUS, connect, fleet)
+    _show_status(first, as_json=as_json)
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
         for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
             if isinstance(answer, Failure):
                 continue
-            site = keys.recorder_site(fleet, answer.key.removesuffix("/status"))
-            _show_status(answer.message(), as_json=as_json, site=site or "")
+            found: Any = answer.message()
+            if found.session != first.session:  # else it answers for the fleet, while it is alone
+                site = keys.recorder_site(fleet, answer.key.removesuffix("/status"))
+                _show_status(found, as_json=as_json, site=site or "")
 
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")

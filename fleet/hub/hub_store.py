@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from fleet.hub import certificate_authority
 from fleet.hub.access_rules import access_control
@@ -48,6 +48,13 @@ class KnownIdentity:
     local: bool = False
     """True if its key is on this computer."""
 
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Self:
+        """Return a stored one. Raises TypeError, ValueError if a field has another type."""
+        if type(stored.get("until")) is not str or type(stored.get("generation", 1)) is not int:
+            raise ValueError(f"it has {stored}")
+        return cls(**stored)
+
     def common_name(self, identity: str) -> str:
         """Return the common name of its certificate."""
         return identity if self.generation == 1 else f"{identity}.{self.generation}"
@@ -76,7 +83,7 @@ class HubStore:
         path = self.directory / IDENTITIES_FILE
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
-            self.known = {name: KnownIdentity(**each) for name, each in found.items()}
+            self.known = {name: KnownIdentity.of(each) for name, each in found.items()}
         except FileNotFoundError:
             pass
         except (OSError, ValueError, TypeError, AttributeError) as error:
@@ -206,12 +213,12 @@ class HubStore:
         return True
 
     def revoke(self, identity: str) -> bool:
-        """Deny everything to an identity. Return False if it has no certificate. Raises OSError."""
+        """Deny everything to an identity, also once more. Return False if it is not known. Raises OSError."""
         with self._changing():
             entry = self.known.get(identity)
-            if entry is None or entry.revoked:
+            if entry is None:
                 return False
-            entry.revoked = True
+            entry.revoked = True  # once more, if the last time failed half way
             self._forget_local(identity)
             self._save()
         return True
@@ -247,7 +254,6 @@ class HubStore:
     def _save(self, listens: Iterable[str] = ()) -> None:
         """Write the identities, and the rules if they changed: the hub restarts then."""
         stored: Mapping[str, object] = {name: asdict(each) for name, each in sorted(self.known.items())}
-        write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)
         path = self.directory / HUB_FILE
         chosen = list(listens)
         if not chosen:
@@ -260,8 +266,10 @@ class HubStore:
             OF_SITES: access_control(sorted(allowed), of_site=True),
         }
         made = json.dumps(settings, indent=1).encode()
+        # First the rules: if the disk is full, nobody is listed as revoked who is not.
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
+        write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)
 
     def _authority(self) -> KeyPair:
         found = KeyPair((self.directory / CA_FILE).read_bytes(), (self.directory / CA_KEY_FILE).read_bytes())

@@ -30,6 +30,8 @@ JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
 _MAX_DISCARDED_BYTES: Final = 4 * MAX_JOIN_REQUEST_BYTES
 """Maximum size of a request that is read although it is too long. With more unread, the answer may be lost."""
+MAX_JOIN_ANSWER_BYTES: Final = 16 << 20
+"""Of an answer: a fleet file, and for the hub of a site the rules, 2.4 kB for each identity."""
 MAX_HUB_NAMES: Final = 32
 SOCKET_TIMEOUT_S: Final = 10.0
 """Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
@@ -239,7 +241,7 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
     try:
         connection.request(method, "/join", body)
         answer = connection.getresponse()
-        found = json.loads(answer.read(4 * MAX_JOIN_REQUEST_BYTES))
+        found = json.loads(answer.read(MAX_JOIN_ANSWER_BYTES))
         if answer.status != 200:
             raise NotJoined(f"{where}: {found['error']}")
         return dict(found)

@@ -80,6 +80,10 @@ class Credentials:
                 f"This computer has no certificate for {wanted or 'you'}. On the computer of {first[0]}, `fleet hub "
                 f"invite {option}{own}` prints a code; here, `fleet join HOST CODE --at 127.0.0.1` takes it"
             )
+        elif (self.directory / f"{HUB}.key").is_file() and "@" in (wanted or ""):
+            words = f"This computer is the first hub, so it has no certificate for {wanted}: leave --site out"
+        elif (self.directory / f"{HUB}.key").is_file() and role == IdentityRole.PERSON:
+            words = f"{self.directory / ME_FILE} does not say who uses this computer: `fleet hub init` writes it anew"
         elif (self.directory / f"{HUB}.key").is_file():
             local = "" if any("127.0.0.1" not in each for each in self.listens) else "--local "
             words = (

@@ -24,6 +24,8 @@ MAX_RENEWAL_BYTES: Final = 16_384
 MAX_QUEUED_RENEWALS: Final = 16
 """Maximum identities that wait for a certificate. The others ask again."""
 OWN_CHECK_INTERVAL_S: Final = 600.0
+FIRST_OWN_CHECK_S: Final = 10.0
+"""Delay of the second check: at the first one, the hub of a site is not linked to the first hub yet."""
 SIGN_TIMEOUT_S: Final = 10.0
 
 
@@ -63,12 +65,14 @@ class HubRenewals:
                 query.reply_err(BUSY)
 
     def _run(self) -> None:
+        interval_s = FIRST_OWN_CHECK_S
         while True:
             with suppress(OSError, subprocess.SubprocessError):
                 self._renew_own()
             try:
-                query = self._queue.get(timeout=OWN_CHECK_INTERVAL_S)
+                query = self._queue.get(timeout=interval_s)
             except queue.Empty:
+                interval_s = OWN_CHECK_INTERVAL_S
                 continue
             if query is None:
                 return

@@ -28,8 +28,8 @@ CARS = int(os.environ.get("BAD_NETWORK_CARS", "10"))
 BUSY_S = 1.0
 """How late 40 processes on two processors may be."""
 STOPS_S = LEASE_S + LOST_S + BLOCK_S + BUSY_S
-ESTOP_S = 1.5 + BLOCK_S + BUSY_S
-"""Start of the command, two ways over the bad network, and the block of a frame."""
+ESTOP_S = 3.0 + BLOCK_S + BUSY_S
+"""Start of the command, its TLS handshake over the bad network, which may lose a packet of it, and a frame's block."""
 QUIET_S = 4.0
 """Time for which the cars are looked at after healing."""
 DRIVER = """

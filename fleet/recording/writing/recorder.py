@@ -126,7 +126,7 @@ class Recorder:
         self._writing: Iterator[_Item] = iter(())
         self._queued_messages = 0
         self._queued_bytes = 0
-        self._queries: list[zenoh.Query] = []
+        self._queries: list[tuple[zenoh.Query, str]] = []
         self._closing = threading.Event()
         self._reader_done = threading.Event()
         self._reader_error: Exception | None = None
@@ -194,14 +194,14 @@ class Recorder:
             if began - before < SHUTDOWN_DRAIN_S + MAX_DRAIN_DELAY_S:
                 return
 
-    def _on_query(self, query: zenoh.Query) -> bool:
+    def _on_query(self, query: zenoh.Query, key: str) -> bool:
         """Queue a query, on a Zenoh thread. Return False if too many are pending."""
         with self._lock:
             if self.ended.is_set():
                 return True  # no thread is left to answer
             if len(self._queries) >= MAX_PENDING_QUERIES:
                 return False
-            self._queries.append(query)
+            self._queries.append((query, key))
         return True
 
     # ------------------------------------------------------------------ the reader's thread
@@ -423,9 +423,8 @@ class Recorder:
     def _answer(self) -> None:
         with self._lock:
             queries, self._queries = self._queries, []
-        for query in queries:
+        for query, key in queries:
             with query:
-                key = str(query.key_expr)
                 verb = key.rpartition("/")[2] if "/@cmd/" in key else RecorderVerb.STATUS
                 try:
                     self._handle(verb, query)

@@ -71,19 +71,25 @@ class RecorderService:
         self._status = [self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER) for key in status]
         self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
 
-    def open(self, on_query: Callable[[zenoh.Query], object]) -> None:
-        """Answer from now on. on_query: as of `Bus.queryable`; it gets what this recorder carries out."""
+    def open(self, on_query: Callable[[zenoh.Query, str], object]) -> None:
+        """Answer from now on. on_query: as of `Bus.queryable`; it gets what this recorder carries out.
+
+        Its text is the key of the answer: a question may have wildcards.
+        """
+        fleets = f"{keys.recorder_token(self.fleet)}/status"
 
         def for_fleet(query: zenoh.Query) -> object:
             if self.speaks_for_fleet:
-                return on_query(query)
+                asked = str(query.key_expr)
+                return on_query(query, asked if "/@cmd/" in asked else fleets)
             with query:  # another one answers
                 return True
 
         if self._site:
             self._bus.watch_tokens(f"{keys.recorder_token(self.fleet)}/**", self._on_token)
-            self._bus.queryable(f"{self._token}/status", on_query)
-        self._bus.queryable(f"{keys.recorder_token(self.fleet)}/status", for_fleet)
+            own = f"{self._token}/status"
+            self._bus.queryable(own, lambda query: on_query(query, own))
+        self._bus.queryable(fleets, for_fleet)
         for expression in keys.command_keys(self.fleet, keys.RECORDER):
             self._bus.queryable(expression, for_fleet)
         self._bus.token(self._token)

@@ -60,11 +60,22 @@ def test_revoked_identity_is_in_no_rule_and_returns_under_new_name(tmp_path: Pat
     store.reserve(person("mia"), NOW)
     assert "person.mia" in common_names(store)
     assert store.revoke(person("mia"))
-    assert not store.revoke(person("mia"))
+    rules = store.directory / "hub.json"
+    before = rules.read_bytes()
+    rules.write_text("{}")  # as if writing it had failed
+    assert store.revoke(person("mia")), "once more, and the rules are in force"
+    assert json.loads(rules.read_bytes())["access_control"] == json.loads(before)["access_control"]
     assert not store.revoke(person("tom"))
     assert common_names(store) == {"car.red", ME}
     store.reserve(person("mia"), NOW)
     assert common_names(store) == {"car.red", ME, "person.mia.2"}
+
+
+@pytest.mark.parametrize("entry", [{"until": 5}, {"until": "2027", "generation": "x"}, {"nonsense": 1}, 3])
+def test_damaged_identities_are_named(entry: object, tmp_path: Path) -> None:
+    store_in(tmp_path).directory.joinpath("identities.json").write_text(json.dumps({"person.root": entry}))
+    with pytest.raises(BrokenHub, match=r"identities\.json"):
+        store_in(tmp_path)
 
 
 def test_a_second_invitation_makes_the_first_certificate_worthless(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
 from schemas.bus import Credentials
-from schemas.identity import car, person
+from schemas.identity import car, person, site
 from tests.support.ports import free_port
 
 ME = person("ann")
@@ -60,6 +60,19 @@ def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> N
     assert not (store.directory / "person.mia.key").exists(), "its key is on the other computer only"
     with pytest.raises(NotJoined, match="used or over"):
         join("127.0.0.1", invitation.code, invitation.port)
+
+
+def test_site_joins_a_hub_of_a_hundred_cars(store: HubStore) -> None:
+    for number in range(100):
+        store.reserve(car(f"car{number}"))
+    store.reserve(site("north"))
+    large = Invitation(store, site("north"), hub_port=7447, port=0, fleet_file="# " + "x" * 100_000)
+    try:
+        joined = join("127.0.0.1", large.code, large.port, addresses=["127.0.0.1"])
+        assert len(json.dumps(joined.rules)) > 200_000
+        assert len(joined.fleet_file) > 100_000
+    finally:
+        large.close()
 
 
 def test_five_wrong_codes_end_it(invitation: Invitation) -> None:

@@ -11,7 +11,7 @@ from fleet.recording.reading.session import Session
 from fleet.recording.writing.recorder import Recorder
 from fleet.recording.writing.recorder_service import AnotherRecorder, speaks_for_fleet
 from schemas import messages
-from schemas.bus import Bus, messages_of
+from schemas.bus import Bus, Sample, messages_of
 from schemas.words import RecorderState, RecorderVerb
 from tests.fleet.recording.conftest import wait_for
 
@@ -67,8 +67,11 @@ def test_site_recorder_records_too_and_answers_alone(endpoint: str, bus: Bus, tm
         with recording(endpoint, tmp_path / "first") as first:
             wait_for(lambda: session_that_answers(bus) == str(first), "the recorder of the fleet answers")
             ask_recorder(bus, "fleet", RecorderVerb.MARK, text="both", by="mia")
-            (own,) = messages_of(bus.query("fleet/@recorder/*/status", timeout_s=10.0))
+            (answer,) = bus.query("fleet/@recorder/*/status", timeout_s=10.0)
+            (own,) = messages_of([answer])
             assert (own.session, own.state) == (str(north), RecorderState.RECORDING)
+            assert isinstance(answer, Sample)
+            assert answer.key == "fleet/@recorder/north/status"
             with pytest.raises(AnotherRecorder, match=str(north)):
                 Recorder(bus, "fleet", tmp_path / "again", site="north").start()
         wait_for(lambda: session_that_answers(bus) == str(north), "that of the site answers again")
