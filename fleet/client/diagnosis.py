@@ -200,8 +200,9 @@ def _silent_car(e: CarEvidence) -> str:
     last_rx_s = e.state.last_rx_s
     since = "since its link opened" if last_rx_s is None else f"for {last_rx_s:.0f} s"
     words = f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
-    if e.state.link.rx_frames:
-        return words
+    platform = e.state.health.platform.partition("+")[0]
+    if e.state.link.rx_frames or (platform and platform not in tuple(Platform)):
+        return words  # it sends readings, or is of another family
     return f"{words} If it drives and never sends readings: `platform: raspberry_pi+no_readings` in the fleet file."
 
 

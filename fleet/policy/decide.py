@@ -1,6 +1,27 @@
 """One step of the coordinator: what each car should do now, why, and the commands for it. Pure and deterministic.
 
-The coordinator leaves a car alone that is on hold, driven by someone else or unreachable, whatever the plan says.
+A plan says which roles there are and when rules give them to cars. Turning that into commands looks like a lookup, and
+would be one if cars were always there, readings always fresh, and nobody else drove. They are not, so most of what is
+here is about *not* acting.
+
+First: whose car is it? The coordinator has the lowest rank. A car that a person holds, drives, has paused or borrowed,
+or that cannot be reached, is left alone, whatever the plan says; it is a *barrier*, in the words of this module, and
+each barrier has a sentence for the person who asks why nothing happens. Its role is kept for it for a while, because
+links come back within seconds, and a fleet that reshuffles at every hiccup of a radio is worse than one role that is
+vacant for a moment.
+
+Second: what is true? Rules are asked in every step, but their conditions must hold for a time before they count, and
+stop holding for a time before they end (`debounce`, `rules`). A comparison with a value that was not measured is
+unknown, which is not true: nothing is done on the strength of what nobody has seen.
+
+Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
+most, then the cars that have their role already, then few changes of mode. A car that has failed to take its mode twice
+may be replaced.
+
+Only then are there commands, and only those that change something. A mode that the car has is not asked for again; one
+that it does not take is retried ever more slowly. Everything that lasts from one step to the next is in `memory`, and
+time is an argument: the same plan, snapshot and memory give the same step, in a test, in a dry run, and in a replay of
+yesterday's recording that asks what another plan would have done.
 """
 
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,25 @@
 """Tracks as one state machine whether the car is known to stand or to move. Pure.
 
-`TRANSITIONS` has a next state for every state and event. Written frames and the car's own readings change the state,
-never time alone.
+A car acknowledges nothing, so everything that a gateway believes about it is inferred: from the frames that it has
+written, and from what the car reports of its own accord. It is tempting to keep a flag, "is driving", and set it where
+frames are written. But then a lost frame, a reset, or a second program at the port makes the flag a lie, and somebody
+reaches for a car that "stands". This module is the one place where the belief may change, so that the question "why did
+you say that it stands?" always has an answer: a state, since when, and the evidence.
+
+Two events say that a stop is over, and the difference between them is the point of the whole machine. `STOP_SHOWN`:
+readings of the car prove that it obeyed. `STOP_SENT`: the frames are written, and this car has no way to show more.
+Both lead to `STOPPED`, but with another `basis`, and whoever shows the claim must show the basis, too. A car that could
+have shown its stop and did not is in neither: it is `UNPROVEN`, its motors are unknown, and the stop goes on.
+
+Three states are kinds of not knowing, and each ends in its own way. `RECOVERING` follows an opened link or a
+contradiction: only a completed stop ends it, since the car may be in any mode with half a frame in its buffer.
+`UNHEARD` is silence: a stop that is merely sent cannot end it, because nothing says that anybody is there; a reading
+does, and then the car is stopped first. `UNKNOWN` is the time without a link, in which neither frames nor readings
+count.
+
+Time alone never changes the state. A timeout is an event that somebody else decides on (`SILENT`, `NOT_SHOWN`), with
+what is known about the rhythm of this car; here it is one row more in a table. `TRANSITIONS` has a next state for every
+state and event, so there is no combination that nobody has thought of, and a test walks through all of them.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,22 @@
 """Requests messages that a recorder missed from the caches of their publishers. session_writer.py drops duplicates.
 
-Publishers cache ten seconds at the rate of their topic, at least a hundred publications (`Topic.cache_size`): minutes
-of a state, hours of an event. The recorder queries them after a reconnect to the hub, after a gap in their sequence
-numbers, and when it continues an interrupted session.
+A recording with holes is worst exactly where it matters: the moment when the network broke is the moment that somebody
+will want to look at. A subscriber alone cannot help that, since what was published while it was away is gone. So each
+publisher keeps what it said last: ten seconds at the rate of its topic, at least a hundred publications
+(`Topic.cache_size`), which is minutes of a state and hours of an event.
+
+When to ask? After the recorder's own link to the hub is back; after a gap in the numbers of a publisher, which is how
+one notices that it was the *car* that was cut off; and at the start, when an interrupted session goes on. One question
+is not enough. Others reconnect half a second later than we do, and on a loaded machine later still, so each cause plans
+several questions (`QUERY_AFTER_...`). The answers overlap, and that is fine: every message has a number, and the writer
+knows which ones it has.
+
+From when on? The window of a question is relative ("the last 13 s") and is counted by the publisher when the question
+arrives, with its own clock. That survives a clock that is wrong by an hour, which an absolute time would not. But it
+means that every delay of the question moves the window on, at the end where the oldest missing message is. So the
+length is counted anew for each key, right before it is asked, and has a margin for the way.
+
+What cannot be had again is said: the writer counts it, the status shows it, and `sessions verify` names it.
 """
 
 import threading

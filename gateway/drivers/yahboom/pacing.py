@@ -1,6 +1,23 @@
 """Decides when the next frame may be written, from the blocks of the last frames and the car's buffer.
 
-It knows frames and times, no commands. `Executor` decides which frame is written.
+The program on the car is one loop. It reads its serial buffer, acts, measures, reports, and begins again, and while it
+acts it reads nothing: a whistle or a servo blocks it for a good part of a second, a ranging without an echo for a whole
+one. What arrives meanwhile lies in a buffer of 64 bytes. When the loop comes back, it takes what is there as ONE
+string, so two frames that waited together are not two commands: one is lost, or, worse, they make a third one that
+nobody sent. Most of the hazards in docs/reference/protocol.md come from that.
+
+So a frame should be alone in the buffer when the car looks, and the difficulty is that the car does not say when it
+looks. This class keeps two times for the last frame. The *flight* is the time in which it is certainly under way: 60
+ms, or its own block if that is longer. The time by which it is *read* is a worst case: at once if the car is awake, as
+its last report shows; otherwise after the longest ranging; and later by the block of any frame that waited before it. A
+report that was sent after the write shows that the loop came round, and moves that time forward.
+
+Callers say how careful they must be (`Gate`). A stop waits only for the flight, because a stop that waits for certainty
+is late; its repetitions make up for what is lost. What opens a mode, or must not be read behind another frame, waits
+until it is alone. Blocks that are merely possible never delay a stop, and always delay what can wait.
+
+How long frames block is learned from the car at hand (`Learned`), since programs and boards differ; what is expected is
+only the beginning. The class knows frames and times, no commands: `Executor` decides which frame is written.
 """
 
 from enum import IntEnum
@@ -43,9 +60,8 @@ class Gate(IntEnum):
 class Pacing:
     """Tracks the last written frame. Times: s, monotonic."""
 
-    # A ranging without an echo blocks the car for 1.0 s, less than `REPEAT_INTERVAL_S`. A frame then waits unread in
-    # the buffer. The car reads it earlier if it was awake at the write, or has sent a report since. Frames that waited
-    # before it may then block the car again. An echo in the last ranging does not predict the next one.
+    # A ranging without an echo takes 1.0 s, less than `REPEAT_INTERVAL_S`. An echo in the last ranging does not predict
+    # the next one.
 
     def __init__(self, profile: Profile, learned: Learned) -> None:
         self.profile = profile

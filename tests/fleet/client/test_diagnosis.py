@@ -197,3 +197,9 @@ def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
     assert facts["platform"] == "arduino, battery 7.90 V (ok): a sonar with fractions"
     assert facts["refused"].startswith("drive of mia 3 s ago: ")
     assert facts["refused"].endswith(" [held] (1 more before)")
+
+
+@pytest.mark.parametrize(("platform", "advised"), [("arduino", True), ("", True), ("ugv_rover", False)])
+def test_silent_car_of_another_family_is_not_advised_as_the_first(platform: str, advised: bool) -> None:
+    found = diagnose(with_states(link=STALE, health=pb.Health(platform=platform)))
+    assert any("raspberry_pi+no_readings" in each.words for each in found) is advised
