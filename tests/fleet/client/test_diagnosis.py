@@ -202,4 +202,4 @@ def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
 @pytest.mark.parametrize(("platform", "advised"), [("arduino", True), ("", True), ("ugv_rover", False)])
 def test_silent_car_of_another_family_is_not_advised_as_the_first(platform: str, advised: bool) -> None:
     found = diagnose(with_states(link=STALE, health=pb.Health(platform=platform)))
-    assert any("raspberry_pi+no_readings" in each.words for each in found) is advised
+    assert any("raspberry_pi+no_readings" in each.cause for each in found) is advised
