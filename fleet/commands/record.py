@@ -269,16 +269,20 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
     """Send a command to the recorder and return its status. Raises click's errors."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        fleet = the_fleet(bus, fleet)
-        fields["sender"] = certified_sender(bus.identity, person=chosen_person())
-        answer = ask_recorder(bus, fleet, verb, **fields)
-        if isinstance(answer, Failure):
-            raise click.ClickException(f"the recorder says: {answer.words}")
-        if answer is not None:
-            return answer
-        raise click.ClickException(
-            f"No recorder of {keys.describe_fleet(fleet)} is on the bus at {bus.endpoint}. `fleet record` starts one."
-        )
+        return _ask(bus, the_fleet(bus, fleet), verb, **fields)
+
+
+def _ask(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
+    """Send a command to the recorder of this fleet and return its status. Raises click's errors."""
+    fields["sender"] = certified_sender(bus.identity, person=chosen_person())
+    answer = ask_recorder(bus, fleet, verb, **fields)
+    if isinstance(answer, Failure):
+        raise click.ClickException(f"the recorder says: {answer.words}")
+    if answer is not None:
+        return answer
+    raise click.ClickException(
+        f"No recorder of {keys.describe_fleet(fleet)} is on the bus at {bus.endpoint}. `fleet record` starts one."
+    )
 
 
 def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
@@ -325,10 +329,11 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Show what is recorded now and where to, at all sites, how much was lost, and whether there is room."""
-    first = _query(RecorderVerb.STATUS, connect, fleet)
-    _show_status(first, as_json=as_json)
+    keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
+        first = _ask(bus, fleet, RecorderVerb.STATUS)
+        _show_status(first, as_json=as_json)
         for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
             if isinstance(answer, Failure):
                 continue

@@ -1,4 +1,4 @@
-"""What others see of a recorder: its status, its answers, its marks, its token.
+"""Publishes the status and the marks of a recorder, answers questions, and declares its token.
 
 A fleet has one recorder, and one more at each other site (`fleet record --site north`). All of them record all that
 they can see. Commands of people go to one of them: that of the fleet where it can be reached, else the site with the
@@ -41,10 +41,12 @@ class RecorderService:
 
     def __init__(self, bus: Bus, fleet: str, site: str = "") -> None:
         self._bus = bus
-        self.fleet = fleet
+        self._fleet = fleet
         self._site = site if not site else keys.check_name(site, "site")
         self._token = keys.recorder_token(fleet, site)
-        self.mark_key = f"{keys.recorder_token(fleet)}/mark"
+        self._own_status = f"{self._token}/status"
+        self._fleet_status = f"{fleet}/{STATUS_TOPIC.name}"
+        self.mark_key = f"{fleet}/{MARK_TOPIC.name}"
         self._others: set[str] = set()
         """Sites of the other recorders that are there."""
         self._lock = threading.Lock()
@@ -54,20 +56,18 @@ class RecorderService:
         if not self._bus.tokens(self._token):
             return
         where = "to an unknown place"
-        for message in messages_of(self._bus.query(f"{self._token}/status", timeout_s=STATUS_TIMEOUT_S)):
+        for message in messages_of(self._bus.query(self._own_status, timeout_s=STATUS_TIMEOUT_S)):
             where = f"to {message.session}"
         if self._site:
             raise AnotherRecorder(f"site {self._site} is recorded already, {where}. One recorder at a site is enough.")
         raise AnotherRecorder(
-            f"{keys.describe_fleet(self.fleet).capitalize()} is recorded already, {where}. One recorder is enough; at "
+            f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, {where}. One recorder is enough; at "
             "another site, `fleet record --site NAME` records, too."
         )
 
     def declare_publishers(self) -> None:
         """Declare the publishers."""
-        status = [f"{keys.recorder_token(self.fleet)}/status"]
-        if self._site:
-            status.append(f"{self._token}/status")
+        status = dict.fromkeys((self._fleet_status, self._own_status))  # the same but at another site
         self._status = [self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER) for key in status]
         self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
 
@@ -76,21 +76,19 @@ class RecorderService:
 
         Its text is the key of the answer: a question may have wildcards.
         """
-        fleets = f"{keys.recorder_token(self.fleet)}/status"
 
         def for_fleet(query: zenoh.Query) -> object:
             if self.speaks_for_fleet:
                 asked = str(query.key_expr)
-                return on_query(query, asked if "/@cmd/" in asked else fleets)
+                return on_query(query, asked if "/@cmd/" in asked else self._fleet_status)
             with query:  # another one answers
                 return True
 
         if self._site:
-            self._bus.watch_tokens(f"{keys.recorder_token(self.fleet)}/**", self._on_token)
-            own = f"{self._token}/status"
-            self._bus.queryable(own, lambda query: on_query(query, own))
-        self._bus.queryable(fleets, for_fleet)
-        for expression in keys.command_keys(self.fleet, keys.RECORDER):
+            self._bus.watch_tokens(keys.recorder_token(self._fleet, "**"), self._on_token)
+            self._bus.queryable(self._own_status, lambda query: on_query(query, self._own_status))
+        self._bus.queryable(self._fleet_status, for_fleet)
+        for expression in keys.command_keys(self._fleet, keys.RECORDER):
             self._bus.queryable(expression, for_fleet)
         self._bus.token(self._token)
         # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
@@ -117,7 +115,7 @@ class RecorderService:
         self._marks.put(mark, now_ns)
 
     def _on_token(self, key: str, came: bool) -> None:  # noqa: FBT001 - the bus calls it so
-        site = keys.recorder_site(self.fleet, key)
+        site = keys.recorder_site(self._fleet, key)
         if site is not None and site != self._site:
             with self._lock:
                 (self._others.add if came else self._others.discard)(site)
