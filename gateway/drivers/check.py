@@ -5,7 +5,6 @@ only from readings, an end. What is particular about a family it cannot know. Ex
 wrong use.
 """
 
-import contextlib
 import random
 import sys
 import traceback
@@ -69,15 +68,15 @@ OPPOSITES: Final = (
     (Motion.LEFT, Motion.RIGHT),
     (Motion.SPIN_LEFT, Motion.SPIN_RIGHT),
 )
-PARTS: Final[Mapping[str, tuple[type[Action], ...]]] = {
-    "led": (Led,),
-    "light": (SetLight,),
-    "servo": (MoveServo,),
-    "servo_deg": (AimServo,),
-    "arm": (MoveArm,),
-    "fan": (Fan,),
+PARTS: Final[Mapping[str, type[Action]]] = {
+    "led": Led,
+    "light": SetLight,
+    "servo": MoveServo,
+    "servo_deg": AimServo,
+    "arm": MoveArm,
+    "fan": Fan,
 }
-"""Actions of a capability, one of which such a car must have frames for."""
+"""The action of a capability, for one of which such a car must have frames."""
 _NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
@@ -131,10 +130,10 @@ class Bench:
             if count == MAX_FRAMES_AT_ONCE:
                 self.faults.append(f"more than {MAX_FRAMES_AT_ONCE} frames at one moment: {write.data!r}")
                 break
-            self.control.driver.sends(write.data, self.now)
-            self.control.driver.on_written(write, self.now)
+            driver.sends(write.data, self.now)
+            driver.on_written(write, self.now)
             self.sent.append((self.now, write.data, write.why))
-        self._due_at = self.control.driver.next_at(self.now)
+        self._due_at = driver.next_at(self.now)
         if self._due_at < self.now:
             self.faults.append("next_at lies before now")
         self.records += [each for each in self.control.take_records() if isinstance(each, CommandRecord)]
@@ -223,28 +222,18 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
     if not hasattr(driver, "STOPS_WITHIN_S"):
         yield "STOPS_WITHIN_S is missing: the time in which a car that got its stop has stopped"
     stops = {driver.stop_frame(index) for index in range(driver.STOP_FRAMES)} | {driver.motion_frame(Motion.STOP)}
-    for speed in (SPEED_STEP, 0.5, 1.0):
-        driver.model.speed = speed
-        for motion in Motion:
-            try:
-                frame = driver.motion_frame(motion)
-            except (KeyError, ValueError, TypeError) as error:
-                yield f"motion_frame({motion}) raises {type(error).__name__}: {error}"
-                continue
-            if not frame or b"" in stops:
-                yield f"the frame of {motion}, or of a stop, is empty"
-            if motion is not Motion.STOP and frame in stops:
-                yield f"the frame of {motion} at {speed:.0%} is one of the stop"
-    yield from _alike(driver)
-
-
-def _alike(driver: PlainDriver) -> Iterator[str]:
-    """Yield motions whose frames are the same, and should not be."""
     frames: dict[tuple[float, Motion], bytes] = {}
-    for speed, motion in product((SPEED_STEP, 1.0), Motion):
+    for speed, motion in product((SPEED_STEP, 0.5, 1.0), Motion):
         driver.model.speed = speed
-        with contextlib.suppress(KeyError, ValueError, TypeError):
-            frames[speed, motion] = driver.motion_frame(motion)
+        try:
+            frame = frames[speed, motion] = driver.motion_frame(motion)
+        except (KeyError, ValueError, TypeError) as error:
+            yield f"motion_frame({motion}) raises {type(error).__name__}: {error}"
+            continue
+        if not frame or b"" in stops:
+            yield f"the frame of {motion}, or of a stop, is empty"
+        if motion is not Motion.STOP and frame in stops:
+            yield f"the frame of {motion} at {speed:.0%} is one of the stop"
     for one, other in OPPOSITES:
         if (1.0, one) in frames and frames[1.0, one] == frames.get((1.0, other)):
             yield f"the frames of {one} and {other} are the same"
@@ -316,12 +305,12 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
     frames = bench.sent[before:]
     driven = (FrameOrigin.COMMAND, FrameOrigin.REPEAT)
     during = [at for at, _, why in frames if at <= began + lasts_s and why in driven]
-    stopped = [at for at in bench.stop_frames() if at > began]
-    ended = min((at for at in stopped if during and at > during[0]), default=began + lasts_s)
+    stopped = [at for at in bench.stop_frames() if during and at > during[0]]
+    ended = min(stopped, default=began + lasts_s)
     gaps = [b - a for a, b in pairwise((*during, min(ended, began + lasts_s)))]
     if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
         yield f"a held motion is not repeated within half of its dead-man of {dead_man_s:g} s"
-    if during and not any(at > during[0] for at in stopped):
+    if during and not stopped:
         yield "the end of a drive sends no stop"
     if bench.control.driver.model.motors is Motors.ON:
         yield "the motors count as on after the drive"
@@ -345,8 +334,8 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
 def check_capabilities(family: Family, platform: str) -> Iterator[str]:
     """Check that what a profile says the car can do has frames."""
     driver = _connected(family, platform).control.driver
-    for word, kinds in PARTS.items():
-        able = [what for what in ACTIONS if isinstance(what, kinds) and driver.refusal(what) is None]
+    for word, kind in PARTS.items():
+        able = [what for what in ACTIONS if isinstance(what, kind) and driver.refusal(what) is None]
         if word in driver.model.profile.capabilities and not any(driver.frames(what) for what in able):
             yield f"it has the capability {word}, and frames for none of its actions"
 
