@@ -194,16 +194,17 @@ class CarGateway:
             self._answer(self._service.histories),
         )
         tasks = [asyncio.ensure_future(each) for each in work]
+        writing = tasks[1]
         stopped = asyncio.ensure_future(self._writer.finished.wait())
         try:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             failed = [task for task in done if task is not stopped and task.exception() is not None]
             if failed:
-                if self._control.was_open and not tasks[1].done():
+                if self._control.was_open and not writing.done():
                     if not self._ending:
                         self.stop()
-                    await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
-                if tasks[1].done():  # it writes nothing any more
+                    await asyncio.wait([stopped, writing], return_when=asyncio.FIRST_COMPLETED)
+                if writing.done():  # it writes nothing any more
                     self._fail_commands()
                 failed[0].result()
         finally:

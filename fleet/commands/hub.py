@@ -31,13 +31,13 @@ from schemas.printable import printable
 from schemas.running_cars import running_cars
 from schemas.words import Rank
 
-SITE_RULES_S: Final = 5.0
-"""The same at another site, whose hub asks for the rules every two seconds."""
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
 MAX_JOIN_LINE: Final = 500
 """Maximum characters of the line that `fleet join -` reads."""
 HUB_RESTART_S: Final = 2.0
 """Time in which gateways are back after a restart of the hub: half a second for it to look, and 0.5 s for a retry."""
+SITE_RULES_S: Final = 5.0
+"""The same at another site, whose hub asks for the rules every two seconds."""
 
 
 @click.group(
@@ -208,13 +208,13 @@ def revoke(who: str) -> None:
         store = _own_store(resolve_endpoint())
         if who == store.credentials.me:
             raise click.UsageError(f"{who} is you, on the hub's own computer: nobody could undo it")
-        role, _, own = who.partition(".")
-        if role == IdentityRole.CAR and who in store.known:
-            _stop_first(store.credentials.endpoint, own)
+        role, name = identity.parse(who) or (None, "")
+        if role is IdentityRole.CAR and who in store.known:
+            _stop_first(store.credentials.endpoint, name)
         if not store.revoke(who):
             there = ", ".join(name for name, each in sorted(store.known.items()) if not each.revoked)
             raise click.UsageError(f"{printable(who)} has no certificate. There are: {there}")
-    words = " What that person drove may still move: stop it with `fleet stop`." if role == IdentityRole.PERSON else ""
+    words = " What that person drove may still move: stop it with `fleet stop`." if role is IdentityRole.PERSON else ""
     click.echo(f"{who} is revoked.{words}")
 
 

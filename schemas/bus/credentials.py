@@ -80,21 +80,23 @@ class Credentials:
                 f"This computer has no certificate for {wanted or 'you'}. On the computer of {first[0]}, `fleet hub "
                 f"invite {option}{own}` prints a code; here, `fleet join HOST CODE --at 127.0.0.1` takes it"
             )
-        elif (self.directory / f"{HUB}.key").is_file() and "@" in (wanted or ""):
-            words = f"This computer is the first hub, so it has no certificate for {wanted}: leave --site out"
-        elif (self.directory / f"{HUB}.key").is_file() and role == IdentityRole.PERSON:
-            words = f"{self.directory / ME_FILE} does not say who uses this computer: `fleet hub init` writes it anew"
         elif (self.directory / f"{HUB}.key").is_file():
-            local = "" if any("127.0.0.1" not in each for each in self.listens) else "--local "
-            words = (
-                f"The hub's computer has no certificate for {wanted}: `fleet hub init {local}{option}{own}` makes it"
-            )
+            words = self._why_not_at_first_hub(wanted, f"{option}{own}")
         else:
             words = (
                 f"This computer has no certificate for {wanted or 'you'} at {self.endpoint}. On the hub's computer, "
                 f"`fleet hub invite {option}{own}` prints a code; here, `fleet join HOST CODE` takes it"
             )
         raise NoCredentials(f"{words}.")
+
+    def _why_not_at_first_hub(self, wanted: str, options: str) -> str:
+        """Return why the first hub's own computer has no certificate of an identity, and what to do."""
+        if not wanted or wanted.startswith(f"{IdentityRole.PERSON}."):
+            return f"{self.directory / ME_FILE} does not say who uses this computer: `fleet hub init` writes it anew"
+        if "@" in wanted:
+            return f"This computer is the first hub, so it has no certificate for {wanted}: leave --site out"
+        local = "" if any("127.0.0.1" not in each for each in self.listens) else "--local "
+        return f"The hub's computer has no certificate for {wanted}: `fleet hub init {local}{options}` makes it"
 
     def dates(self, identity: str) -> CertificateDates | None:
         """Return when the certificate of an identity begins and ends, or None if there is none."""
