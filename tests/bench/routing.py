@@ -37,17 +37,6 @@ class _Everything:
         return count, size
 
 
-def _hub(endpoint: str) -> int:
-    """Return the process id of the hub."""
-    found = [each.pid for each in psutil.process_iter(["cmdline"]) if _is_hub(each.info["cmdline"] or [], endpoint)]
-    (pid,) = found
-    return int(pid)
-
-
-def _is_hub(words: list[str], endpoint: str) -> bool:
-    return "schemas.bus.hub" in words and endpoint in words
-
-
 def _loopback_bytes() -> int:
     return int(psutil.net_io_counters(pernic=True)["lo"].bytes_sent)
 
@@ -58,7 +47,7 @@ def run(scale: Scale) -> list[Measured]:
     for size in sorted({scale.count(size) for size in SIZES}):
         with scratch() as directory, Up(directory, free_endpoint(), "--sim", str(size), "--no-record") as up:
             fleet = SimulatedFleet(up, size, scale)
-            hub = _hub(up.endpoint)
+            hub = up.hub()
             with Bus.open(up.endpoint) as bus, Fleet(up.endpoint) as client:
                 everything = _Everything(bus)
                 for what in ("1 report/s", "tracking"):

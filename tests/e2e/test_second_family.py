@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from schemas.words import Basis, Motors, Phase, Reason
+from tests.support.driver_package import install_driver
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
@@ -100,11 +101,9 @@ class TankServer:
 
 def install_tank(fleet: FleetProcesses, directory: Path, module: str) -> None:
     """Install the package of a driver for the processes of a fleet."""
-    found = directory / "packages" / "tank_driver-1.0.dist-info"
-    found.mkdir(parents=True)
-    (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
-    (found / "entry_points.txt").write_text(f"[zenoh_car_fleet.drivers]\ntank = {module}\n")
-    fleet.environment["PYTHONPATH"] = f"{found.parent}:{Path(__file__).parents[2]}"
+    packages = directory / "packages"
+    install_driver(packages, module)
+    fleet.environment["PYTHONPATH"] = f"{packages}:{Path(__file__).parents[2]}"
 
 
 def test_failing_driver_leaves_no_moving_car(fleet: FleetProcesses, tmp_path: Path) -> None:

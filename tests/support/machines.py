@@ -83,9 +83,19 @@ class Machines:
         options = [word for car in cars for word in ("--car", car)]
         code, _, words = self.run(HUB, "hub", "init", *options, FLEET_AS="ann")
         assert code == 0, words
-        hub = self.start(HUB, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
-        wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the hub is up")
+        hub = self._start_hub(HUB)
+        self._await_hub()
         return hub
+
+    def _start_hub(self, machine: str) -> GatewayProcess:
+        return self.start(machine, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
+
+    def _await_hub(self) -> None:
+        def is_up() -> bool:
+            code, _, words = self.run(HUB, "list")
+            return code == 0 or "No car" in words
+
+        wait_for(is_up, "the hub is up")
 
     def join(self, machine: str, *invited: str, at: str = "") -> None:
         """Let a machine join, by the commands that people type. at: the hub of the site that it uses."""
@@ -101,7 +111,7 @@ class Machines:
     def make_site(self, machine: str) -> GatewayProcess:
         """Make a machine the hub of another site, and start it."""
         self.join(machine, "--site", "north")
-        return self.start(machine, "-m", "schemas.bus.hub", "--endpoint", SECURE_ENDPOINT, "--idle-s", "600")
+        return self._start_hub(machine)
 
     def record(self, machine: str, site: str = "") -> tuple[GatewayProcess, Path]:
         """Start a recorder. Return it and the directory of its sessions. site: of which this machine is the hub."""
@@ -132,7 +142,7 @@ class Machines:
         self._zenohd = [str(zenohd), "--config", str(config)]
         self._kill(*self._hubs())
         self.start_program(HUB, *self._zenohd)
-        wait_for(lambda: self.run(HUB, "list")[0] == 0 or "No car" in self.run(HUB, "list")[2], "the router is up")
+        self._await_hub()
 
     def kill_hub(self) -> None:
         """Kill the hub, whoever has started it. A stock router is started again, as its service manager does."""

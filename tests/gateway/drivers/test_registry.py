@@ -9,6 +9,7 @@ import pytest
 
 from gateway import drivers
 from schemas.words import Mode
+from tests.support.driver_package import install_driver
 
 
 def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
@@ -39,10 +40,7 @@ def test_names_are_read_in_any_case() -> None:
 @contextlib.contextmanager
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str) -> Iterator[None]:
     """Install a package with the driver of a tank."""
-    found = tmp_path / "tank_driver-1.0.dist-info"
-    found.mkdir()
-    (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
-    (found / "entry_points.txt").write_text(f"[zenoh_car_fleet.drivers]\ntank = {module}\n")
+    install_driver(tmp_path, module)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     drivers._installed.cache_clear()
     drivers._find.cache_clear()
