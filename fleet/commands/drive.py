@@ -30,7 +30,7 @@ from fleet.commands.options import (
     with_client,
 )
 from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
-from schemas.bus import BusError, NoFleet
+from schemas.bus import BusError, HubUnreachable, NoFleet
 from schemas.process import signals, startup
 from schemas.words import Mode, Motion, Scope
 
@@ -121,10 +121,10 @@ def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
     """Open the client. A hub that hangs must not read as a stop that was carried out."""
     try:
         return client_in(connect, fleet)
+    except (LostHub, HubUnreachable) as error:
+        raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
     except NoFleet:  # nothing is running, which is not a fault
         raise
-    except LostHub as error:
-        raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
     except BusError as error:
         raise BusError(f"{bus_lost_words('a car')} ({error})") from None
 

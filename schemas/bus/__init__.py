@@ -19,7 +19,7 @@ from schemas.bus.endpoint import (
     router_config,
     router_settings,
 )
-from schemas.bus.errors import BadEndpoint, BusError, NoFleet
+from schemas.bus.errors import BadEndpoint, BusError, HubUnreachable, NoFleet
 from schemas.bus.handover import Backlog, Handover, Latest
 from schemas.bus.hub_keeper import HubKeeper
 from schemas.bus.key_expressions import canon, intersects
@@ -55,6 +55,7 @@ __all__ = [
     "Failure",
     "Handover",
     "HubKeeper",
+    "HubUnreachable",
     "Latest",
     "NoCredentials",
     "NoFleet",

@@ -13,7 +13,7 @@ from typing import Any, Final
 import zenoh
 
 from schemas.bus.credentials import Credentials
-from schemas.bus.errors import BadEndpoint, BusError, NoFleet
+from schemas.bus.errors import BadEndpoint, BusError, HubUnreachable
 from schemas.state_dir import DEFAULT_ENDPOINT, joined_endpoint
 
 ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
@@ -21,6 +21,10 @@ ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
 _RETRY: Final = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 LOOPBACK: Final = "127.0.0.1"
+LOOPBACK_TIMEOUT_S: Final = 1.0
+NETWORK_TIMEOUT_S: Final = 3.5
+"""Time for the answer of a listener. A TCP stack sends the first packet of a connection again after 1 s and after 3 s,
+so two may be lost. Where each way loses 5 %, one second was too short for 19 of 200 connections."""
 _LOOPBACK_HOSTS: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
@@ -111,9 +115,10 @@ def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.
     return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_common(link)}))
 
 
-def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
+def accepts(endpoint: str) -> bool:
     """Return True if something accepts connections at the endpoint. Always True for a datagram endpoint."""
     host, port = _host_and_port(endpoint)
+    timeout_s = LOOPBACK_TIMEOUT_S if is_loopback(endpoint) else NETWORK_TIMEOUT_S
     if endpoint.startswith(("udp/", "quic/")):
         return True
     try:
@@ -130,7 +135,7 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     if accepts(endpoint):
         return
     if not is_loopback(endpoint):
-        raise NoFleet(
+        raise HubUnreachable(
             f"Nothing listens at {endpoint}, and a hub starts by itself on loopback only. Start a Zenoh router there "
             "(or `fleet up --insecure-lan`), or name another place with --connect.",
             endpoint,

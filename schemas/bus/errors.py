@@ -13,5 +13,9 @@ class NoFleet(BusError):
         self.endpoint = endpoint
 
 
+class HubUnreachable(NoFleet):
+    """Nothing answers at an endpoint of another computer. Whether cars move there is not known."""
+
+
 class BadEndpoint(BusError):
     """An endpoint that is invalid for Zenoh, or at which no hub may listen."""

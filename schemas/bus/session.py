@@ -17,8 +17,8 @@ import zenoh
 from schemas.bus.certificate_keeper import RENEWAL_QUERY_TIMEOUT_S, CertificateKeeper
 from schemas.bus.credentials import Credentials
 from schemas.bus.declared import Declare, Declared, SampleChannel
-from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_secure, resolve_endpoint
-from schemas.bus.errors import BusError, NoFleet
+from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_loopback, is_secure, resolve_endpoint
+from schemas.bus.errors import BusError, HubUnreachable, NoFleet
 from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
@@ -83,7 +83,8 @@ class Bus:
     ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
-        With `start_hub`, start a hub if there is none. Otherwise a missing hub raises NoFleet.
+        With `start_hub`, start a hub if there is none. Otherwise a missing hub raises NoFleet, one of another computer
+        HubUnreachable.
         identity: the one to connect as, such as `car.red`; by default that of the user. It matters only to a hub with
         certificates. Raises NoCredentials if this computer has no such certificate.
         """
@@ -99,6 +100,12 @@ class Bus:
         if start_hub:
             ensure_hub(where)
         elif not accepts(where):
+            if not is_loopback(where):
+                raise HubUnreachable(
+                    f"Nothing answers at {where}. Is that computer on and in reach, and does its hub run? --connect "
+                    "names another place.",
+                    where,
+                )
             raise NoFleet(
                 "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
                 f"(Looked at {where}; --connect names another place.)",

@@ -13,6 +13,7 @@ from fleet.client.client import Fleet as Client
 from fleet.client.lost_hub import LostHub
 from schemas.bus import NoFleet, accepts
 from schemas.running_cars import running_cars
+from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, GatewayProcess, driving, wait_for
 from tests.support.up import fleet_command
 
@@ -45,6 +46,15 @@ def sim(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> GatewayProces
     wait_for(lambda: driving(sim), "red drives")
     assert gateway.popen.poll() is None
     return sim
+
+
+def test_stop_at_hub_of_another_computer_that_does_not_answer_says_not_stopped() -> None:
+    where = free_endpoint().replace("127.0.0.1", "0.0.0.0")  # no loopback address by its name
+    for words in (["stop"], ["estop", "red"], ["stop", "--json"]):
+        done = fleet_command(*words, "--connect", where, environment={})
+        assert (done.returncode, done.stdout) == (1, ""), words
+        assert NOT_STOPPED in done.stderr, words
+        assert NOTHING not in done.stderr, words
 
 
 def test_stop_without_hub_says_not_stopped_until_hub_returns(fleet: FleetProcesses, sim: GatewayProcess) -> None:

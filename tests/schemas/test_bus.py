@@ -202,6 +202,12 @@ def test_without_a_hub_whoever_only_asks_is_told_so() -> None:
         bus.Bus.open(where)
 
 
+def test_hub_of_another_computer_that_does_not_answer_is_not_an_idle_fleet() -> None:
+    where = free_endpoint().replace("127.0.0.1", "0.0.0.0")  # no loopback address by its name
+    with pytest.raises(bus.HubUnreachable, match=rf"Nothing answers at {where}"):
+        bus.Bus.open(where)
+
+
 def test_a_listener_that_is_no_zenoh_router_is_named() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
