@@ -7,7 +7,7 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, Final
 
 import zenoh
@@ -17,7 +17,7 @@ from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
 from gateway.control import battery
 from gateway.control.controller import Controller
-from gateway.control.driver import Driver, DriverClaims, Event, Fields
+from gateway.control.driver import Driver, DriverClaims, Event
 from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.link_health import LinkHealth
 from schemas import bus, keys, messages, topics
@@ -91,7 +91,7 @@ class CarPublisher:
         published: list[str] = []
         for name, fields in self._driver.measured(event).items():
             message = _CLASSES[name]()
-            _fill(message, fields)
+            messages.fill(message, fields)
             if name == "sensor/battery":
                 voltage_v = message.voltage_v
                 loaded = model.motors is not Motors.OFF
@@ -310,18 +310,7 @@ def _fill_findings(message: pb.Health, model: DriverClaims) -> None:
     message.platform_contradictions.extend(findings.platform_contradictions)
     message.shows_stops, message.shows_stops_words = model.shows_stops
     message.doubted = model.doubted
-    _fill(message, findings.numbers)
-
-
-def _fill(message: Any, fields: Fields) -> None:
-    """Set fields of a message: a tuple fills a repeated field, a mapping a map."""
-    for name, value in fields.items():
-        if isinstance(value, tuple):
-            getattr(message, name).extend(value)
-        elif isinstance(value, Mapping):
-            getattr(message, name).update(value)
-        else:
-            setattr(message, name, value)
+    messages.fill(message, findings.numbers)
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:

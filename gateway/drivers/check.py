@@ -5,7 +5,10 @@ only from readings, an end. What is particular about a family it cannot know. Ex
 wrong use.
 """
 
+import json
+import math
 import random
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,11 +35,12 @@ from gateway.control.commands import (
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Event
 from gateway.control.events import CommandRecord
-from gateway.drivers import Family
+from gateway.drivers import BUILT_IN, Family, built_in_platforms
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
+from schemas.platform_name import AUTO, normalize_name
 from schemas.rights import Sender
 from schemas.topics import TOPICS
 from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
@@ -77,6 +81,35 @@ PARTS: Final[Mapping[str, type[Action]]] = {
     "fan": Fan,
 }
 """The action of a capability, for one of which such a car must have frames."""
+PROFILE_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
+    "name": (str,),
+    "capabilities": (frozenset,),
+    "modes": (frozenset,),
+    "silent_modes": (frozenset,),
+    "possible_modes": (frozenset,),
+    "lights": (frozenset,),
+    "servos": (frozenset,),
+    "has_readings": (bool,),
+    "cells": (int,),
+    "baud": (int,),
+    "dead_man_s": (int, float, type(None)),
+    "not_observed": (tuple,),
+}
+"""What the fields of a profile are. Others read them without a look at their types."""
+PROFILE_WORDS: Final[Mapping[str, frozenset[str]]] = {
+    "capabilities": frozenset((*CAPABILITIES, "imu")),
+    "modes": frozenset(Mode),
+    "silent_modes": frozenset(Mode),
+    "possible_modes": frozenset(Mode),
+    "lights": frozenset(LightWord),
+    "servos": frozenset(ServoAction),
+}
+HOSTILE: Final = (
+    *(b"NaN", b"-Infinity", b"1e999", b"-1", b"9" * 400, b"9" * 5000),
+    *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
+)
+"""What may stand where a car sends a number: damaged, or from another program."""
+WRONG_OPTION: Final = "+no_such_option"
 _NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
@@ -125,7 +158,9 @@ class Bench:
                 break
             if write.why is FrameOrigin.SETUP and named_at > self.now:
                 self.faults.append("setup_frame has a frame before setup_at: a gateway would write it late or never")
-            if not write.data:
+            if not _is(write.data, bytes):
+                self.faults.append(f"a frame ({write.why}) is {_kind(write.data)}, not bytes: {write.data!r}")
+            elif not write.data:
                 self.faults.append(f"an empty frame ({write.why})")
             if count == MAX_FRAMES_AT_ONCE:
                 self.faults.append(f"more than {MAX_FRAMES_AT_ONCE} frames at one moment: {write.data!r}")
@@ -162,9 +197,40 @@ def _connected(family: Family, platform: str, samples: Sequence[bytes] = ()) -> 
     return bench
 
 
+def check_names(family: Family, platform: str) -> Iterator[str]:
+    """Check that a fleet file can name the platform, and that a wrong name is refused in words."""
+    if platform != normalize_name(platform) or "+" in platform or not platform:
+        yield f"{platform!r} cannot be named in a fleet file: write it in small letters, without +"
+    if platform == AUTO or (
+        platform in built_in_platforms() and getattr(family, "__name__", "") not in BUILT_IN.values()
+    ):
+        yield f"{platform} is a platform of ours: no fleet file would find this one"
+    known = {each.name.partition("+")[0] for each in family.profiles()}
+    if not known or known - set(family.PLATFORMS):
+        yield f"profiles() has {', '.join(sorted(known)) or 'none'}, and PLATFORMS {', '.join(family.PLATFORMS)}"
+    try:
+        family.profile_of(f"{platform}{WRONG_OPTION}")
+    except ValueError:
+        return
+    except Exception as error:  # noqa: BLE001 - whatever else it raises
+        yield f"profile_of('{platform}{WRONG_OPTION}') raises {type(error).__name__}, not ValueError"
+    else:
+        yield f"profile_of('{platform}{WRONG_OPTION}') takes an option that cannot exist"
+
+
 def check_profile(family: Family, platform: str) -> Iterator[str]:
     """Check that a profile is a value, and names only what there is."""
     profile = family.profile_of(platform)
+    for field, types in PROFILE_TYPES.items():
+        value: Any = getattr(profile, field)
+        if not _is(value, *types) or (bool not in types and _is(value, bool)):
+            yield f"{field} is {_kind(value)}, not {' or '.join(each.__name__ for each in types)}: {value!r}"
+            return
+        if field in PROFILE_WORDS and (others := set(value) - PROFILE_WORDS[field]):
+            yield f"{field} has unknown words: {', '.join(sorted(map(str, others)))}"
+    for field in ("cells", "baud", "dead_man_s"):
+        if (number := getattr(profile, field)) is not None and not 0 < number < math.inf:
+            yield f"{field} is {number}"
     if profile != family.profile_of(platform) or hash(profile) != hash(family.profile_of(platform)):
         yield "profile_of returns another value each time"
     if profile.name.partition("+")[0] != platform:
@@ -195,11 +261,41 @@ def check_bytes(family: Family, platform: str) -> Iterator[str]:
         if one != two:
             yield f"{data!r} makes other events if it comes in two pieces"
             return
-        for event in bench.control.driver.feed(data, bench.now):
-            bench.control.driver.measured(event)
-            bench.control.driver.verdict(event)
-            bench.control.driver.on_event(event, bench.now)
+        yield from _take(bench, data)
         bench.run(0.1)
+
+
+def _take(bench: Bench, data: bytes) -> Iterator[str]:
+    """Let the driver take bytes, as a gateway does. Yield what is wrong with the events that it makes of them."""
+    driver = bench.control.driver
+    for event in driver.feed(data, bench.now):
+        if not _is(event.raw, bytes) or not _is(event.at, float):
+            yield f"raw and at of an event are {_kind(event.raw)} and {_kind(event.at)}, not bytes and float"
+        for topic, fields in driver.measured(event).items():
+            yield from _faults_of_values(topic, fields)
+        if not _is(verdict := driver.verdict(event), str):
+            yield f"the verdict of an event is {_kind(verdict)}, not str"
+        driver.on_event(event, bench.now)
+
+
+def _faults_of_values(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what keeps measured values from being published."""
+    if topic not in TOPICS:
+        yield f"{topic} is not a topic"
+        return
+    kind = messages.message_class(TOPICS[topic].message)
+    known = kind.DESCRIPTOR.fields_by_name
+    if unknown := fields.keys() - known.keys():
+        yield f"{topic} has no field {', '.join(sorted(unknown))}: it has {', '.join(sorted(known))}"
+        return
+    for name, value in fields.items():
+        try:
+            messages.fill(kind(), {name: value})
+        except (TypeError, ValueError) as error:
+            yield f"{topic}: {name} is {_kind(value)}: {error}"
+        else:
+            if isinstance(value, float) and not math.isfinite(value):
+                yield f"{topic}: {name} is {value}: it was not measured, so leave it out"
 
 
 def check_connect(family: Family, platform: str) -> Iterator[str]:
@@ -243,7 +339,7 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_samples(family: Family, platform: str) -> Iterator[str]:
-    """Check that what is measured has a topic and a field, by `SAMPLES` of the module: bytes of a real car.
+    """Check what is measured, by `SAMPLES` of the module: bytes of a real car.
 
     Nothing may be measured in its `UNMEASURED`, such as acknowledgements and values that stand for none.
     """
@@ -252,18 +348,48 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
         for event in (*driver.feed(sample, 100.0), *driver.flush(110.0)):
             for topic in driver.measured(event):
                 yield f"{topic} is measured in {sample!r}"
+    profile = family.profile_of(platform)
+    measurable = {topic for mode in profile.modes for topic in profile.measurable(mode)}
     for sample in getattr(family, "SAMPLES", ()):
         events = [*driver.feed(sample, 200.0), *driver.flush(210.0)]
         found = [each for event in events for each in driver.measured(event).items()]
         if not found:
             yield f"nothing is measured in {sample!r}"
         for topic, fields in found:
-            if topic not in TOPICS:
-                yield f"{topic} is not a topic"
-                continue
-            known = messages.message_class(TOPICS[topic].message).DESCRIPTOR.fields_by_name
-            for name in fields.keys() - known.keys():
-                yield f"{topic} has no field {name}: it has {', '.join(sorted(known))}"
+            yield from _faults_of_values(topic, fields)
+            if topic in TOPICS and topic.removeprefix("sensor/") not in measurable:
+                yield f"{topic} is measured, and the profile does not say so"
+
+
+def check_hostile(family: Family, platform: str) -> Iterator[str]:
+    """Check that `SAMPLES` with other values in the place of their numbers are taken, and publish nothing odd."""
+    bench = _connected(family, platform)
+    for sample in getattr(family, "SAMPLES", ()):
+        for number in re.finditer(rb"-?\d+(\.\d+)?", sample):
+            for value in HOSTILE:
+                yield from dict.fromkeys(_take(bench, sample[: number.start()] + value + sample[number.end() :]))
+
+
+def check_rest(family: Family, platform: str) -> Iterator[str]:
+    """Check that a car which moves never counts as one that has shown its stop.
+
+    `MOVING` of the module are bytes of a car that moves. It is asked for where `SAMPLES` show a stop: then perhaps any
+    report does.
+    """
+    standing = _connected(family, platform, getattr(family, "SAMPLES", ()))
+    standing.ask(Stop())
+    standing.run(30.0)
+    moving: Sequence[bytes] = getattr(family, "MOVING", ())
+    if standing.control.driver.model.basis is Basis.SHOWN and not moving:
+        yield "its SAMPLES show a stop: add MOVING, a list of bytes that such a car sends while it moves"
+    for sample in moving:
+        bench = _connected(family, platform, (sample,))
+        bench.ask(Stop())
+        for _ in range(30):
+            bench.run(1.0)
+            if bench.control.driver.model.basis is Basis.SHOWN:
+                yield f"a car that sends {sample!r}, of MOVING, counts as one that has shown its stop"
+                break
 
 
 def check_stop(family: Family, platform: str) -> Iterator[str]:
@@ -343,6 +469,7 @@ def check_capabilities(family: Family, platform: str) -> Iterator[str]:
 def check_loss(family: Family, platform: str) -> Iterator[str]:
     """Check that a lost link ends what waits, and that a stop goes first when it is back."""
     bench = _connected(family, platform)
+    yield from _check_dropped(family, bench)
     stop = bench.ask(Stop())
     bench.run(0.1)
     bench.control.driver.link_down("unplugged", bench.now)
@@ -362,6 +489,35 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
         yield "no stop is written when the link is back"
 
 
+def _check_dropped(family: Family, bench: Bench) -> Iterator[str]:
+    """Check that the bytes of an unfinished frame are forgotten with the link, and do not spoil the next frame."""
+    driver = bench.control.driver
+    samples: Sequence[bytes] = getattr(family, "SAMPLES", ())
+    for sample in (*samples, b"x"):
+        driver.feed(sample[: max(1, len(sample) // 2)], bench.now)
+        dropped = driver.drop_bytes()
+        if not _is(dropped, list):
+            yield f"drop_bytes returns {_kind(dropped)}, not a list of events"
+            return
+        for event in dropped:
+            driver.measured(event)
+            driver.on_event(event, bench.now)
+    for sample in samples:
+        if not any(
+            driver.measured(event) for event in (*driver.feed(sample, bench.now), *driver.flush(bench.now + 10))
+        ):
+            yield f"{sample!r} is not read after drop_bytes: it did not forget the unfinished frame"
+
+
+def check_kept(family: Family, platform: str) -> Iterator[str]:
+    """Check that what is kept of a car is JSON, and that its next gateway takes it."""
+    kept = _connected(family, platform, getattr(family, "SAMPLES", ())).control.driver.kept()
+    again = json.loads(json.dumps(kept))
+    Controller("red", family.driver_of(platform, again))
+    if again != kept:
+        yield f"kept() is not the same when it is read again from JSON: {kept!r}"
+
+
 def check_end(family: Family, platform: str) -> Iterator[str]:
     """Check that a gateway which ends stops its car, and ends in time."""
     bench = _connected(family, platform)
@@ -375,25 +531,43 @@ def check_end(family: Family, platform: str) -> Iterator[str]:
 
 
 CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
+    check_names,
     check_profile,
     check_bytes,
     check_connect,
     check_motions,
     check_samples,
+    check_hostile,
     check_stop,
+    check_rest,
     check_drive,
     check_actions,
     check_capabilities,
     check_loss,
+    check_kept,
     check_end,
 )
 
 
 def check(family: Family) -> Iterator[tuple[str, str, list[str]]]:
     """Yield platform, check and faults, for each check of each platform."""
-    for platform in family.PLATFORMS:
+    names = family.PLATFORMS
+    if not _is(names, tuple, list) or not names or not all(_is(each, str) for each in names):
+        yield "PLATFORMS", "check_names", [f"it is {names!r}, not a tuple of names"]
+        return
+    for platform in names:
         for each in CHECKS:
             yield platform, each.__name__, list(_caught(each(family, platform)))
+
+
+def _is(value: object, *kinds: type) -> bool:
+    """Return True for a value of these types. The driver may return others than it declares."""
+    return isinstance(value, kinds)
+
+
+def _kind(value: object) -> str:
+    """Return the name of a value's type."""
+    return type(value).__name__
 
 
 def _caught(faults: Iterator[str]) -> Iterator[str]:

@@ -62,7 +62,7 @@ class TankDriver(PlainDriver):
         try:
             found = json.loads(line)
             return TankReport(line, now, float(found["v"]), float(found["dist_cm"]))
-        except (ValueError, TypeError, KeyError, RecursionError):
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             return Rejected(line, now, Cause.TRUNCATED)
 
     def drop_bytes(self) -> list[Event]:

@@ -1,5 +1,6 @@
 """Each family passes the checks that a gateway relies on, and a careless driver does not."""
 
+import json
 import re
 import sys
 from dataclasses import replace
@@ -13,7 +14,7 @@ from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check
 from gateway.drivers.waveshare import family as waveshare
 from gateway.drivers.yahboom import family as yahboom
-from schemas.words import Motion
+from schemas.words import Basis, Motion
 from tests.support import tank
 
 FAMILIES = {"yahboom": yahboom, "waveshare": waveshare, "tank": tank}
@@ -164,10 +165,75 @@ class Fails(tank.TankDriver):
         raise ZeroDivisionError
 
 
+class Types(tank.TankDriver):
+    """Writes text, not bytes."""
+
+    def motion_frame(self, motion: Motion) -> Any:
+        return super().motion_frame(motion).decode()
+
+
+class Texts(tank.TankDriver):
+    """Publishes a number as text."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {topic: {name: str(each) for name, each in of.items()} for topic, of in super().measured(event).items()}
+
+
+class AnyNumber(tank.TankDriver):
+    """Publishes whatever float() makes of a report, and raises where it makes nothing."""
+
+    def _event(self, line: bytes, now: float) -> Event:
+        found = json.loads(line) if line.startswith(b'{"v"') else {"v": 0, "dist_cm": 0}
+        return tank.TankReport(line, now, found["v"], found["dist_cm"])
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {"sensor/battery": {"voltage_v": cast("tank.TankReport", event).volts}}
+
+
+class Drops(tank.TankDriver):
+    """Raises when its link is lost."""
+
+    def drop_bytes(self) -> list[Event]:
+        raise KeyError("half")
+
+
+class Keeps(tank.TankDriver):
+    """Keeps the unfinished line when the link is lost."""
+
+    def drop_bytes(self) -> list[Event]:
+        return []
+
+
+class Unsaved(tank.TankDriver):
+    """Would keep what is not JSON."""
+
+    def kept(self) -> dict[str, Any]:
+        return {"speeds": {1: 0.5}}
+
+
+class RestsAlways(tank.TankDriver):
+    """Takes any report for one of a car that stands."""
+
+    @property
+    def can_show(self) -> bool:
+        return True
+
+    def on_reading(self, event: Event, now: float) -> None:
+        super().on_reading(event, now)
+        self.show_rest("it reports", now)
+
+
 @pytest.mark.parametrize(
     ("driver", "fails"),
     [
         (Beats, set()),
+        (Types, {"check_connect", "check_drive", "check_bytes", "check_motions"}),
+        (Texts, {"check_samples", "check_hostile"}),
+        (AnyNumber, {"check_hostile", "check_bytes"}),
+        (Drops, {"check_loss"}),
+        (Keeps, {"check_loss"}),
+        (Unsaved, {"check_kept"}),
+        (RestsAlways, {"check_rest"}),
         (BeatsOnly, {"check_drive"}),
         (BeatsAsleep, {"check_connect", "check_drive"}),
         (Never, {"check_connect", "check_motions", "check_stop", "check_drive", "check_loss", "check_end"}),
@@ -175,13 +241,13 @@ class Fails(tank.TankDriver):
         (Turned, {"check_motions"}),
         (Promises, {"check_capabilities"}),
         (Waits, {"check_drive"}),
-        (Fails, {"check_bytes", "check_samples"}),
-        (Talks, {"check_connect", "check_stop", "check_end"}),
+        (Fails, {"check_bytes", "check_samples", "check_hostile", "check_loss"}),
+        (Talks, {"check_connect", "check_stop", "check_end", "check_rest"}),
         (Mute, {"check_connect", "check_stop", "check_loss", "check_end", "check_bytes", "check_drive"}),
         (Splits, {"check_bytes", "check_samples"}),
         (Empty, {"check_connect", "check_motions", "check_drive"}),
         (Lacks, {"check_motions"}),
-        (Misnames, {"check_samples"}),
+        (Misnames, {"check_samples", "check_hostile"}),
         (OnlySays, {"check_drive"}),
     ],
 )
@@ -198,6 +264,51 @@ def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
     found = {name: faults for _, name, faults in check.check(cast("Family", family)) if faults}
     assert bool(found) is bool(fails)
     assert found.keys() <= fails, found
+
+
+@pytest.mark.parametrize(
+    ("changes", "fails"),
+    [
+        ({"PLATFORMS": "tank"}, {"check_names"}),
+        ({"PLATFORMS": ()}, {"check_names"}),
+        ({"PLATFORMS": ("Tank",)}, {"check_names", "check_profile"}),
+        (
+            {"PLATFORMS": ("arduino",), "profile_of": lambda name: replace(tank.PROFILE, name="arduino")},
+            {"check_names"},
+        ),
+        ({"profiles": tuple}, {"check_names"}),
+        ({"profile_of": {"tank": tank.PROFILE}.__getitem__}, {"check_names"}),
+        ({"profile_of": lambda name: tank.PROFILE}, {"check_names"}),
+        ({"profile_of": lambda name: replace(tank.profile_of(name), baud=cast("int", "115200"))}, {"check_profile"}),
+        ({"profile_of": lambda name: replace(tank.profile_of(name), cells=0)}, {"check_profile"}),
+        ({"profile_of": lambda name: replace(tank.profile_of(name), measures=frozenset({"range"}))}, {"check_samples"}),
+        (
+            {"profile_of": lambda name: replace(tank.profile_of(name), capabilities=frozenset({"drives"}))},
+            {"check_profile", "check_capabilities"},
+        ),
+    ],
+)
+def test_a_careless_family_fails(changes: dict[str, Any], fails: set[str]) -> None:
+    family = SimpleNamespace(**{**vars(tank), **changes})
+    found = {name: faults for _, name, faults in check.check(cast("Family", family)) if faults}
+    assert next(iter(fails)) in found or found.keys() & fails, found
+    assert found.keys() <= fails | ({*dict.fromkeys(found)} if "PLATFORMS" in changes else set()), found
+
+
+STANDS = b'{"T":1001,"L":0,"R":0,"odl":1,"odr":1,"v":1100}\n'
+MOVES = b'{"T":1001,"L":0.2,"R":0.2,"odl":1,"odr":1,"v":1100}\n'
+
+
+@pytest.mark.parametrize("platform", waveshare.PLATFORMS)
+@pytest.mark.parametrize("moving", [(), (MOVES,), (STANDS,)])
+def test_a_rest_is_not_shown_by_any_report(platform: str, moving: tuple[bytes, ...]) -> None:
+    family = SimpleNamespace(**vars(waveshare), SAMPLES=(STANDS,), MOVING=moving)
+    bench = check.Bench(cast("Family", family), platform, (STANDS,))
+    bench.control.link_up(bench.now)
+    bench.run(30.0)
+    can_show = bench.control.driver.model.basis is Basis.SHOWN
+    assert bool(list(check.check_rest(cast("Family", family), platform))) is (can_show and moving != (MOVES,))
+    assert not list(check.check_hostile(cast("Family", family), platform))
 
 
 def test_a_driver_that_floods_is_found() -> None:
