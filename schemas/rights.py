@@ -352,6 +352,8 @@ class Authority:
                 return self._kept_away(sender) or self._held(sender) or self._leased(sender, take=right is Right.TAKE)
             case Right.ACT:
                 return self._kept_away(sender) or self._held(sender)
+            case Right.RESUME if sender.kind is Rank.COORDINATOR:
+                return Denial(Bar.ON_HOLD, self.hold)
             case Right.RESUME:
                 return self._held(sender) or self._may_drive_at_all(sender)
             case Right.END_ESTOPS:
@@ -365,6 +367,22 @@ class Authority:
                 return None
             case _:
                 return people.may_direct(sender)
+
+    def may_resume(self, sender: Sender, ids: tuple[str, ...] = (), *, every: bool = False) -> Denial | None:
+        """Return why the sender may end nothing of what a resume names, or None if it may end some of it.
+
+        It names the e-stops `ids`, or the hold. With `every`, it names the hold and all e-stops.
+        """
+        hold = self.may(sender, Right.RESUME)
+        if sender.kind is Rank.COORDINATOR:
+            return hold
+        named = [estop for estop in self.estops if every or estop.id in ids]
+        stays = [estop for estop in named if not self.may_end_estop(estop, sender)]
+        if len(stays) < len(named) or (ids and not named):
+            return None
+        if stays and (hold is not None or self.hold is None or not every):
+            return self.estop_stays(stays[0], sender)
+        return hold
 
     def may_drive(self, sender: Sender) -> Denial | None:
         """Return why the people of the fleet or a loan keep this sender from the car."""

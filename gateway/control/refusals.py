@@ -102,7 +102,7 @@ TABLE: Final[dict[type[Action], Needs]] = {
     SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is not a `PartAction`. Who may end which e-stop and hold: `_resume`."""
+"""Needs of each action that is not a `PartAction`. Who may end which e-stop and hold: `Authority.may_resume`."""
 
 Refusal = tuple[Reason, str]
 
@@ -164,20 +164,13 @@ def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:
 
 def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal | None:
     car, authority = context.car, context.authority
-    if sender.kind is Rank.COORDINATOR:
-        return Reason.HELD, f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
-    in_force = {estop.id: estop for estop in authority.estops}
-    if resume.ids and not set(resume.ids) & {*in_force, *context.ended}:
+    in_force = [estop.id for estop in authority.estops]
+    unknown = resume.ids and not set(resume.ids) & {*in_force, *context.ended}
+    if unknown and sender.kind is not Rank.COORDINATOR:
         there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
         return Reason.BAD_VALUE, f"{car} has no e-stop {', '.join(resume.ids)}. {there}"
-    named = [estop for estop in authority.estops if resume.all or estop.id in resume.ids]
-    stays = [estop for estop in named if not authority.may_end_estop(estop, sender)]
-    if len(stays) < len(named) or (resume.ids and not named):
-        return None
-    hold = authority.may(sender, Right.RESUME)
-    if stays and (hold is not None or authority.hold is None or not resume.all):
-        hold = authority.estop_stays(stays[0], sender)
-    return None if hold is None else _refusal(hold, sender, context)
+    denial = authority.may_resume(sender, resume.ids, every=resume.all)
+    return None if denial is None else _refusal(denial, sender, context, Right.RESUME)
 
 
 def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal | None:
@@ -257,6 +250,8 @@ def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right
             return f"{car} is paused with the whole fleet ({by}{why}). {who} ends it with `fleet unpause`."
         case Bar.LEADS_PAUSE:
             return f"{car} stays paused: {by} did it, and {_only_leads(context)}"
+        case Bar.ON_HOLD if right is Right.RESUME:
+            return f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
         case Bar.ON_HOLD:
             return f"{car} is on hold ({by} stopped it). End the hold with `fleet resume {car}`."
         case Bar.LEADS_HOLD:
