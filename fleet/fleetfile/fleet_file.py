@@ -335,6 +335,8 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
     if car.get("link") == LINK_SIM and platform.partition("+")[0] in (AUTO, Platform.UNKNOWN):
         kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
         yield ("cars", name, "platform"), f"a simulated car needs a platform. There are {kinds}."
+    if car.get("link") == LINK_SIM and (why := drivers.why_not_simulated(platform)):
+        yield ("cars", name, "link"), f"{why}. Give the link of a real car, or a program that behaves like one."
     if not isinstance(given, list):
         return
     try:

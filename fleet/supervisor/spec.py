@@ -15,6 +15,7 @@ from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule
 from fleet.fleetfile.models import PersonRank
 from fleet.quota import Quota
 from fleet.supervisor.restart_policy import Patience
+from gateway import drivers
 from schemas.keys import DEFAULT_FLEET
 from schemas.platform_name import AUTO
 from schemas.process.parent import parent_option
@@ -131,7 +132,8 @@ class UpOptions:
 def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
     """Return the spec of a fleet file and the options, which take precedence.
 
-    The first `options.simulated` cars of the file are simulated, whatever their link.
+    The first `options.simulated` cars of the file are simulated, whatever their link. Raises ValueError if one of them
+    cannot be.
     """
     specs = {} if file is None else {**file.cars, **file.unlinked}
     cars = {name: _car(spec) for name, spec in specs.items()}
@@ -140,6 +142,8 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
     for index, name in enumerate(names):
         car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car needs a platform. The platform of a real car can be detected.
+        if why := drivers.why_not_simulated(car.platform):
+            raise ValueError(f"{name} cannot be simulated: {why}. Leave it out of the fleet file for --sim.")
         kind, *words = car.platform.split("+")
         platform = "+".join((Platform.ARDUINO if kind in (AUTO, Platform.UNKNOWN) else kind, *words))
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)

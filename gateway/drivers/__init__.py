@@ -95,6 +95,14 @@ def built_in_profiles() -> tuple[CarProfile, ...]:
     return tuple(profile for module in BUILT_IN.values() for profile in _load(module).profiles())
 
 
+def why_not_simulated(platform: str) -> str:
+    """Return why `gateway sim` has no cars of a platform. Empty if it has, or if there is no such platform."""
+    kind = kind_of(normalize_name(platform))
+    if kind in built_in_platforms() or kind not in platforms():
+        return ""
+    return f"{kind} comes with another package, and only our own platforms can be simulated"
+
+
 def family_name(platform: str) -> str:
     """Return the name of the family of a platform, such as `yahboom`. Raises ValueError for a wrong name."""
     kind = kind_of(normalize_name(platform))

@@ -39,9 +39,9 @@ SIMULATED: Final[Mapping[str, tuple[str, ...]]] = {
     "raspberry_pi": _REPORTS,
     "course": (),
 }
+"""For each platform the options that only the simulator knows."""
 UGV_OPTIONS: Final = ("mission", "no_encoder", "quiet", "arm", "gimbal")
 """The options of the second family's cars: see `UgvCar`."""
-"""For each platform the options that only the simulator knows."""
 _PLACEHOLDERS: Final = {"interval": "S", "spread": "S", "close": "S", "gray": "MAX", SILENT: "MODE"}
 
 

@@ -1,6 +1,13 @@
 """Installs a package with a driver, as `pip install` would, for tests."""
 
+import contextlib
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+
+from gateway import drivers
 
 
 def install_driver(directory: Path, module: str) -> None:
@@ -9,3 +16,18 @@ def install_driver(directory: Path, module: str) -> None:
     found.mkdir(parents=True)
     (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")
     (found / "entry_points.txt").write_text(f"[zenoh_car_fleet.drivers]\ntank = {module}\n")
+
+
+@contextlib.contextmanager
+def installed_driver(directory: Path, monkeypatch: pytest.MonkeyPatch, module: str) -> Iterator[None]:
+    """Install a package with the driver of a tank for this process."""
+    install_driver(directory, module)
+    monkeypatch.setattr(sys, "path", [str(directory), *sys.path])
+    drivers._installed.cache_clear()
+    drivers._find.cache_clear()
+    try:
+        yield
+    finally:
+        drivers._installed.cache_clear()
+        drivers._find.cache_clear()
+        drivers.broken.clear()

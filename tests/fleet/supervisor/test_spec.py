@@ -24,6 +24,8 @@ from fleet.supervisor.spec import (
     simulator_command,
 )
 from schemas.rights import NO_PEOPLE, People
+from schemas.yaml_document.document import BadFile
+from tests.support.driver_package import installed_driver
 
 FILE = """
 name: lab
@@ -45,6 +47,19 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         ("bob", "tcp://192.168.1.7:8888", "auto"),
     ]
     assert not spec.simulated
+
+
+def test_cars_of_another_package_are_not_simulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "cars: {max: {link: LINK, platform: tank}, red: {link: sim, platform: stm32}}"
+    with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
+        with pytest.raises(BadFile) as bad:
+            parse_fleet(text.replace("LINK", "sim"), tmp_path / "fleet.yaml")
+        assert len(bad.value.problems) == 1
+        assert "cars.max.link" in str(bad.value)
+        file = parse_fleet(text.replace("LINK", "/dev/ttyUSB0"), tmp_path / "fleet.yaml")
+        assert [each.platform for each in build_spec(file, UpOptions()).cars.values()] == ["tank", "stm32"]
+        with pytest.raises(ValueError, match="max cannot be simulated"):
+            build_spec(file, UpOptions(simulated=2))
 
 
 @pytest.mark.parametrize(("quota", "size"), [("20GB", 20e9), ("1 MB", 1e6), ("999999GB", 999_999e9), ("999TB", 999e12)])

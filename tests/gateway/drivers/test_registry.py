@@ -1,15 +1,12 @@
 """A platform finds its family: ours by a table, others by the entry point of their package."""
 
-import contextlib
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from gateway import drivers
 from schemas.words import Mode
-from tests.support.driver_package import install_driver
+from tests.support.driver_package import installed_driver
 
 
 def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
@@ -37,30 +34,15 @@ def test_names_are_read_in_any_case() -> None:
     assert [each.name for each in drivers.profiles_of("auto+arm")] == ["arduino+arm", "stm32+arm", "raspberry_pi+arm"]
 
 
-@contextlib.contextmanager
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str) -> Iterator[None]:
-    """Install a package with the driver of a tank."""
-    install_driver(tmp_path, module)
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    drivers._installed.cache_clear()
-    drivers._find.cache_clear()
-    try:
-        yield
-    finally:
-        drivers._installed.cache_clear()
-        drivers._find.cache_clear()
-        drivers.broken.clear()
-
-
 def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with installed(tmp_path, monkeypatch, "tests.support.tank"):
+    with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
         assert "tank" in drivers.platforms()
         assert drivers.check_platform("tank") == "tank"
         assert drivers.profile_of("tank").measurable(Mode.MANUAL) == {"battery", "range"}
 
 
 def test_package_that_fails_is_named_and_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with installed(tmp_path, monkeypatch, "no_such_package.driver"):
+    with installed_driver(tmp_path, monkeypatch, "no_such_package.driver"):
         assert drivers.profile_of("ugv02").name == "ugv02"
         with pytest.raises(ValueError, match=r"Unknown platform .*tank.* no_such_package"):
             drivers.profile_of("tank")
