@@ -48,8 +48,6 @@ from schemas.words import Level, Shows
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
-HUB_RESTART_DELAY_S: Final = 0.5
-"""Delay before the restart of a lost hub; jitter doubles it at most."""
 RIVAL_CHECK_DELAY_S: Final = 0.5
 """Delay of the second check for another gateway of the car. Both must have declared by then
 (docs/reference/keys.md#one-gateway-per-car)."""
@@ -383,7 +381,7 @@ class CarGateway:
         """Restart a lost hub. Jitter keeps a hundred gateways from trying at once."""
         while True:
             await self._hub_lost.wait()
-            await asyncio.sleep(HUB_RESTART_DELAY_S * (1 + random.random()))  # noqa: S311 - jitter, no secret
+            await asyncio.sleep(bus.HUB_RESTART_DELAY_S * (1 + random.random()))  # noqa: S311 - jitter, no secret
             self._hub_lost.clear()
             if self._bus.connected:
                 continue

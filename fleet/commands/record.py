@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from schemas.rights import People
 
 POLL_INTERVAL_S: Final = 0.25
-HUB_RESTART_DELAY_S: Final = 0.5
-"""Time without a link after which the recorder restarts the hub."""
 
 
 _WEEK_S: Final = 7 * 86_400.0
@@ -224,7 +222,7 @@ def run(
 
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:
     """Wait until a signal, a failure of the recorder or the end of the parent. Restart a lost hub meanwhile."""
-    hub_keeper = HubKeeper(bus.endpoint, HUB_RESTART_DELAY_S, _warn)
+    hub_keeper = HubKeeper(bus.endpoint, _warn)
     while not stop.wait(POLL_INTERVAL_S) and not ended.is_set() and not has_ended(parent):
         hub_keeper.check(connected=bus.connected)
 

@@ -35,8 +35,6 @@ from schemas.rights import People
 from schemas.words import Level, Phase
 
 STEP_INTERVAL_S: Final = 0.1
-HUB_OUTAGE_S: Final = 0.5
-"""Time without a link to a hub after which the coordinator starts one."""
 SINGLETON_RECHECK_S: Final = 1.0
 """Delay of the second search for other coordinators: two may have started at the same moment."""
 _MAX_STATE_QUERIES: Final = 3
@@ -93,7 +91,7 @@ class Coordinator:
             for expression in keys.command_keys(fleet, keys.COORDINATOR, verb):
                 bus.queryable(expression, self._inbox.on_query)
         recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
-        hubs, hub_keeper = bus.hubs, HubKeeper(bus.endpoint, HUB_OUTAGE_S, self.on_failure)
+        hubs, hub_keeper = bus.hubs, HubKeeper(bus.endpoint, self.on_failure)
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._drain_inbox(observer, pool, wait_s=0.0)

@@ -14,6 +14,7 @@ from gateway.bus.command_parser import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.holds_and_leases import PersistedSafety
 from schemas import bus, keys, messages
+from schemas.backoff import backoff_s
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.rights import estops_of, pauses_of
@@ -108,17 +109,17 @@ class EstopSync:
 
     async def keep_synced(self, merge: MergeSafety) -> None:
         """Merge the fleet-wide e-stops and the pauses of each gateway that starts, until cancelled."""
-        retry_s, retry = FIRST_RETRY_S, None
-        batch_delay_s, first = BATCH_DELAY_S, True
+        retry: asyncio.TimerHandle | None = None
+        batches, silences, first = 0, 0, True
         while True:
             try:
                 async with asyncio.timeout(BATCH_RESET_S):
                     await self._changed.wait()
             except TimeoutError:
-                batch_delay_s = BATCH_DELAY_S
+                batches = 0
                 await self._changed.wait()
-            await asyncio.sleep(batch_delay_s)
-            batch_delay_s = min(2 * batch_delay_s, MAX_BATCH_DELAY_S)
+            batches += 1
+            await asyncio.sleep(backoff_s(batches, BATCH_DELAY_S, MAX_BATCH_DELAY_S))
             if self._queries_all() and not first:
                 await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
             first = False
@@ -135,9 +136,10 @@ class EstopSync:
                 self._due.discard(state.car)
             if retry is not None:
                 retry.cancel()
+            silences = silences + 1 if self._due else 0
             if self._due:
-                retry = asyncio.get_running_loop().call_later(retry_s, self._changed.set)
-            retry_s = min(2 * retry_s, MAX_RETRY_S) if self._due else FIRST_RETRY_S
+                delay_s = backoff_s(silences, FIRST_RETRY_S, MAX_RETRY_S)
+                retry = asyncio.get_running_loop().call_later(delay_s, self._changed.set)
 
     def _queries_all(self) -> bool:
         """Return True if so many gateways are due that one query goes to all."""

@@ -21,7 +21,7 @@ from schemas.bus.endpoint import (
 )
 from schemas.bus.errors import BadEndpoint, BusError, HubUnreachable, NoFleet
 from schemas.bus.handover import Backlog, Handover, Latest
-from schemas.bus.hub_keeper import HubKeeper
+from schemas.bus.hub_keeper import HUB_RESTART_DELAY_S, HubKeeper
 from schemas.bus.key_expressions import canon, intersects
 from schemas.bus.publisher import Publisher
 from schemas.bus.replies import BUSY, is_json_wanted, refuse, reply, reply_message, reply_value
@@ -43,6 +43,7 @@ __all__ = [
     "BUSY",
     "DEFAULT_ENDPOINT",
     "ENDPOINT_VARIABLE",
+    "HUB_RESTART_DELAY_S",
     "LARGEST_PAYLOAD",
     "LONGEST_SELECTOR",
     "LOOPBACK",

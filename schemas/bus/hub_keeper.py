@@ -2,23 +2,26 @@
 
 import time
 from collections.abc import Callable
+from typing import Final
 
 from schemas.bus.endpoint import ensure_hub
 from schemas.bus.errors import BusError
 
+HUB_RESTART_DELAY_S: Final = 0.5
+"""Time without a link after which a hub is started. A gateway adds jitter: a hundred may have lost the same hub."""
+
 
 class HubKeeper:
-    """Starts a hub if there has been no link for `delay_s`. `check` is called regularly."""
+    """Starts a hub if there has been no link for a while. `check` is called regularly."""
 
-    def __init__(self, endpoint: str, delay_s: float, on_error: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, endpoint: str, on_error: Callable[[str], object] = lambda _: None) -> None:
         self._endpoint = endpoint
-        self._delay_s = delay_s
         self._on_error = on_error
         self._linked_at = time.monotonic()
 
     def check(self, *, connected: bool) -> None:
         """Start a hub if it is time to. It blocks until the hub listens."""
-        if not connected and time.monotonic() - self._linked_at < self._delay_s:
+        if not connected and time.monotonic() - self._linked_at < HUB_RESTART_DELAY_S:
             return
         if not connected:
             try:

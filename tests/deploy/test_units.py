@@ -10,9 +10,9 @@ import pytest
 
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from fleet.supervisor.supervisor import RECORDER_EXIT_TIMEOUT_S, SERVICE_EXIT_TIMEOUT_S
-from gateway.car import HUB_RESTART_DELAY_S
 from gateway.link.ble import BLE_WRITE_TIMEOUT_S, DISCONNECT_TIMEOUT_S
 from gateway.link.serial import SERIAL_WRITE_TIMEOUT_S
+from schemas.bus import HUB_RESTART_DELAY_S
 from schemas.process.service_notifier import FEEDS_PER_WATCHDOG
 
 DEPLOY: Final = Path(__file__).parent.parent.parent / "deploy"

@@ -26,7 +26,6 @@ LOOP_PAUSE_NS: Final = 1_000_000_000
 """Pause between two rounds of a loop."""
 MAX_LATENESS_S: Final = 0.25
 _HUB_POLL_INTERVAL_S: Final = 0.1
-_HUB_RESTART_DELAY_S: Final = 0.5
 _MAX_LISTED_TOKENS: Final = 4
 _MAX_PLAYER_QUERIES: Final = 256
 """Maximum queries in the queue."""
@@ -63,7 +62,7 @@ class Player:
     _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_MAX_PLAYER_QUERIES))
 
     def __post_init__(self) -> None:
-        self._hub_keeper = HubKeeper(self.bus.endpoint, _HUB_RESTART_DELAY_S)
+        self._hub_keeper = HubKeeper(self.bus.endpoint)
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
         """Declare the tokens of these cars, and answer queries. Raises NameTaken if there is such a fleet already."""
