@@ -16,8 +16,8 @@ from typing import Any, Final, TypeVar
 import click
 
 from fleet.client.reading import Reading
+from fleet.column_widths import fit_columns
 from fleet.recording.tools.csv_table import iso
-from fleet.supervisor.car_status import fit
 from schemas import topics
 from schemas.colors import parse_color
 from schemas.printable import printable_lines
@@ -69,7 +69,7 @@ def show_table(
     dots = dots or [""] * len(rows)
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
     if sys.stdout.isatty() or "COLUMNS" in os.environ:  # a pipe gets every column
-        widths = fit(widths, shutil.get_terminal_size().columns - 2 * any(dots), optional)
+        widths = fit_columns(widths, shutil.get_terminal_size().columns - 2 * any(dots), optional)
     header = "  ".join(name.upper().ljust(width) for name, width in widths.items()).rstrip()
     click.echo(f"{'  ' * any(dots)}{click.style(header, bold=True)}")
     for row, dot in zip(rows, dots, strict=True):

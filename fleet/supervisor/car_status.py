@@ -12,8 +12,6 @@ from schemas.keys import name_of
 from schemas.local_time import date_and_clock
 from schemas.words import LinkState
 
-MIN_COLUMN_WIDTH: Final = 4
-"""Minimum width of a column that is shortened."""
 MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
@@ -46,7 +44,7 @@ class CarStatus:
         self.state = CarState(self.car, present=False)
 
     @property
-    def rest(self) -> CarClaim:
+    def motors(self) -> CarClaim:
         """The last claim about the motors, also of a gateway that has ended since."""
         return motors_claim(self.state.newest("state/safety"))
 
@@ -114,25 +112,6 @@ class StartProgress:
         if self.fewest is None or missing < self.fewest:
             self.fewest, self.since = missing, now
         return not missing or now - self.since >= (LINK_OPEN_TIMEOUT_S if unreachable else READY_TIMEOUT_S)
-
-
-def fit(widths: Mapping[str, int], width: int, optional: Sequence[str], gap: int = 2) -> dict[str, int]:
-    """Return the columns of a table that fit into `width`, with their widths.
-
-    The optional columns are left out first, in their order. Then the widest column is shortened, again and again.
-    """
-    result = dict(widths)
-
-    def excess() -> int:
-        return sum(result.values()) + gap * (len(result) - 1) - width
-
-    for name in optional:
-        if excess() > 0:
-            result.pop(name, None)
-    while excess() > 0 and max(result.values()) > MIN_COLUMN_WIDTH:
-        widest = max(result, key=lambda name: result[name])
-        result[widest] -= 1
-    return result
 
 
 def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str, console: str = "") -> str:

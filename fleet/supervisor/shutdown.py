@@ -138,8 +138,8 @@ class GatewayShutdown:
     def _finish_claimed(self, process: ManagedProcess) -> None:
         """Finish a gateway that ended in order: its last claim says whether the car has shown its stop."""
         row = self._rows.get(process.name)
-        if row is not None and row.rest.what == Motors.OFF:
-            self._finish(process, rest_words(row.rest, process.name))
+        if row is not None and row.motors.what == Motors.OFF:
+            self._finish(process, rest_words(row.motors, process.name))
         elif self._processes.now >= self._unclaimed[process.name]:
             self._finish(process, STOP_SENT)
 
@@ -150,7 +150,7 @@ class GatewayShutdown:
             reason = row.state.link.reason if row is not None else ""
             reason = why if reason in ("", NOT_TRIED) else reason
             return f"{NEVER_REACHED}, so it got no command ({reason.rstrip('.')})"
-        if row.rest.what == Motors.OFF and row.rest.basis == Basis.SHOWN:
+        if row.motors.what == Motors.OFF and row.motors.basis == Basis.SHOWN:
             return f"{STOPPED}, as it showed before its gateway ended ({why.rstrip('.')})"
         could_not_reach = process.code is None or process.code < 0 or row.state.link.state in ("", LinkState.LOST)
         return f"{NOT_STOPPED if could_not_reach else NOT_CONFIRMED}: {why}"

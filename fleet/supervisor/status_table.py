@@ -10,7 +10,8 @@ from rich.live import Live
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fleet.supervisor.car_status import CarStatus, fit
+from fleet.column_widths import fit_columns
+from fleet.supervisor.car_status import CarStatus
 from schemas.keys import name_of
 from schemas.local_time import clock
 from schemas.words import BatteryLevel, LinkState, RunState, Verdict
@@ -79,7 +80,7 @@ class Table:
             rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state, colors.get(name, "")), strict=True)))
         widths = {each: max([len(each), *(row[each].cell_len for row in rows)]) for each in _TABLE_COLUMNS}
         widths[_EVENT] = _MIN_EVENT_WIDTH
-        widths = fit(widths, self._console.width, _OPTIONAL_COLUMNS)
+        widths = fit_columns(widths, self._console.width, _OPTIONAL_COLUMNS)
         for column, width in widths.items():
             fixed = None if column == _EVENT else width
             ratio = 1 if column == _EVENT else None
@@ -121,7 +122,7 @@ def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(state.mode.asked, " ", (state.mode.verdict, _VERDICT.get(state.mode.verdict, ""))),
         Text(state.motion.motion),
-        Text(row.rest.basic if state.safety.motors else ""),
+        Text(row.motors.basic if state.safety.motors else ""),
         Text(held or name_of(state.safety.lease.holder), "red" if held else ""),
         Text(f"{volts} {battery.level}" if is_low else volts, "red" if is_low else ""),
         Text(rate, justify="right"),

@@ -15,7 +15,6 @@ from fleet.supervisor.car_status import (
     StartProgress,
     describe_old_stops,
     describe_start,
-    fit,
 )
 from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
 from fleet.supervisor.spec import FleetSpec
@@ -76,7 +75,7 @@ def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
     row.take("state/link", pb.Link(state="online", boot_id="a"), 1.0)
     row.take("state/safety", pb.Safety(motors="off", motors_basis="sent", boot_id="a"), 1.0)
     assert (row.state.link.state, row.state.safety.motors) == ("", "")
-    assert (row.rest.what, row.rest.basis) == ("off", "sent"), "its last words tell how it stopped the car"
+    assert (row.motors.what, row.motors.basis) == ("off", "sent"), "its last words tell how it stopped the car"
     row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
     row.reset("b")
     row.take("state/link", pb.Link(state="quiet", boot_id="b"), 2.0)
@@ -227,19 +226,6 @@ def test_status_table_names_holder_driver_and_last_word() -> None:
     row.reset()
     assert "e-stop e1" in line()
     assert "(sent)" not in line(), "nobody claims it now"
-
-
-@pytest.mark.parametrize(
-    ("width", "columns"),
-    [
-        (100, {"car": 5, "platform": 20, "mode": 30, "battery": 15}),
-        (60, {"car": 5, "mode": 30, "battery": 15}),
-        (40, {"car": 5, "mode": 16, "battery": 15}),
-        (5, {"car": 4, "mode": 4, "battery": 4}),
-    ],
-)
-def test_columns_are_dropped_in_order_then_widest_shortened(width: int, columns: dict[str, int]) -> None:
-    assert fit({"car": 5, "platform": 20, "mode": 30, "battery": 15}, width, ("platform",)) == columns
 
 
 def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:

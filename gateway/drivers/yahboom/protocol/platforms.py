@@ -165,11 +165,6 @@ class Profile:
         return "ptz_direct" in self.options
 
     @property
-    def prints_text(self) -> bool:
-        """True if the program prints lines of text between its frames."""
-        return "text" in self.options
-
-    @property
     def has_readings(self) -> bool:
         """False if the car never sends a reading, so that nothing shows what it does."""
         return NO_READINGS not in self.options

@@ -191,6 +191,3 @@ def head_of(raw: bytes) -> str | None:
     """Return the first word of a sensors frame, whatever it is. None if these bytes are not a sensors frame."""
     found = _ANY_HEAD.fullmatch(raw)
     return found[1].decode() if found else None
-
-
-fullmatch_sensors = sensors_matcher("4WD").fullmatch_unended

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gateway.control.commands import Drive, Fan, SetMode, Stop
 from gateway.control.driver import Event
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from gateway.drivers.yahboom.protocol.sensors import Sensors, fullmatch_sensors, read_sensors
+from gateway.drivers.yahboom.protocol.sensors import Sensors, read_sensors, sensors_matcher
 from schemas.words import Mode, Motion
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
@@ -164,7 +164,7 @@ def test_damaged_frame_publishes_no_filler_in_confirmed_mode(mode: Mode, data: s
     text = texts[mode]
     place = data.draw(st.integers(0, len(text) - 1))
     other = data.draw(st.one_of(st.just(b""), st.sampled_from(b"0123456789.,").map(lambda byte: bytes([byte]))))
-    found = fullmatch_sensors(text[:place] + other + text[place + 1 :])
+    found = sensors_matcher("4WD").fullmatch_unended(text[:place] + other + text[place + 1 :])
     if found:
         for terminated in (True, False):
             event = read_sensors(found, 1.0, terminated=terminated)

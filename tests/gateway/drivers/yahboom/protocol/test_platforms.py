@@ -173,8 +173,8 @@ def test_a_platform_in_any_case_is_known() -> None:
 
 def test_options_say_in_what_a_car_differs() -> None:
     plain, other = parse_platform("arduino"), parse_platform("arduino+fan_level+ptz_direct+text+no_readings+3s")
-    assert (plain.fan_is_level, plain.ptz_direct, plain.prints_text) == (False, False, False)
-    assert (other.fan_is_level, other.ptz_direct, other.prints_text) == (True, True, True)
+    assert (plain.fan_is_level, plain.ptz_direct) == (False, False)
+    assert (other.fan_is_level, other.ptz_direct) == (True, True)
     assert (plain.has_readings, other.has_readings) == (True, False)
     assert (plain.cells, other.cells) == (2, 3)
     assert other.capabilities == plain.capabilities, "none is a part of the car"
