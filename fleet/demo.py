@@ -355,7 +355,7 @@ def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
     if find_spec("rerun") is None:
         run.say(f"no check of what Rerun shows: {how_to_install('view')}")
         return None
-    from fleet.replay.rerun.export import rows
+    from fleet.replay.rerun.rrd_export import rows
 
     rrd = session / "session.rrd"
     command = [sys.executable, "-m", "fleet.cli", "replay", str(session), "--save", str(rrd)]

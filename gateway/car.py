@@ -21,17 +21,17 @@ from typing import Final
 import zenoh
 
 from gateway import drivers
+from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
+from gateway.bus.car_service import AlreadyServed, CarService
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
-from gateway.bus.publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
-from gateway.bus.service import AlreadyServed, CarService
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
 from gateway.control.holds_and_leases import PersistedSafety
 from gateway.learned_file import LearnedFile
 from gateway.link import LinkError, LinkUrl
 from gateway.link_loop import LinkLoop, at_rate
-from gateway.state_file import SafetyStateFile
+from gateway.safety_state_file import SafetyStateFile
 from gateway.stop_without_hub import stop_alone
 from gateway.wake import Wake
 from gateway.writer import Writer

@@ -207,7 +207,7 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     parent = watched_pid(arguments.parent)
-    from gateway.bus.service import AlreadyServed, CarService
+    from gateway.bus.car_service import AlreadyServed, CarService
     from gateway.drivers import check_platform
     from gateway.link import BadUrl, LinkError, parse_url
     from schemas.bus import BadEndpoint, BusError

@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Final
 
+from gateway.bus.car_publisher import RAW_PER_S, CarPublisher, shown_state
 from gateway.bus.command_handler import CommandHandler
-from gateway.bus.publisher import RAW_PER_S, CarPublisher, shown_state
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
 from gateway.control.link_health import LinkHealth

@@ -3,9 +3,9 @@
 import asyncio
 from collections.abc import Callable
 
-from gateway.bus.publisher import CarPublisher
+from gateway.bus.car_publisher import CarPublisher
+from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Driver
-from gateway.control.events import OutgoingFrame
 from gateway.link import LinkLost
 from gateway.link_loop import LinkLoop
 from gateway.wake import Wake

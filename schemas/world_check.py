@@ -10,9 +10,9 @@ from math import hypot, radians
 from typing import Final
 
 from schemas.geometry import RADIUS_M, Point, Segment, box, distance, in_turned_box, turned_box
-from schemas.world import LampEntry, LineEntry, ThingEntry, WorldEntry
+from schemas.world_fields import LampEntry, LineEntry, ThingEntry, WorldEntry
 from schemas.yaml_document.document import Document, Entry
-from schemas.yaml_document.messages import Where
+from schemas.yaml_document.fault_words import Where
 
 MIN_SIZE_M: Final = 0.02
 """Minimum length of a wall."""

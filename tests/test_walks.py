@@ -74,5 +74,5 @@ async def test_walks_do_not_grow(tmp_path: Path, state: None) -> None:
     asked, of_report = rooms(stop.called - idle.called), rooms(idle.of_reading)
     assert "gateway/drivers/yahboom/pacing.py" in asked
     assert len(asked) <= ROOMS_OF_STOP, asked
-    assert "gateway/bus/publisher.py" in of_report
+    assert "gateway/bus/car_publisher.py" in of_report
     assert len(of_report) <= ROOMS_OF_REPORT, of_report

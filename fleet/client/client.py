@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Final, Self
 
-from fleet.client import history
+from fleet.client import history_query
 from fleet.client.command_tracker import (
     ANSWER_TIMEOUT_S,
     CLOSED,
@@ -206,13 +206,13 @@ class Fleet:
         """Return the last `last` values of every matching key, or those of the last `since_s` seconds, or both.
 
         They are sorted by key and time. A gateway stores 1500 values of each reading and the latest of each state.
-        `history.describe_shortfalls` tells what is missing. Raises ValueError.
+        `history_query.describe_shortfalls` tells what is missing. Raises ValueError.
         """
-        selector = history.selector(self.expression(expression), last=last, since_s=since_s)
+        selector = history_query.selector(self.expression(expression), last=last, since_s=since_s)
         found: list[Reading] = []
-        for _ in range(history.MAX_HISTORY_QUERIES):
-            found = history.merge(found, self._read(selector, history.HISTORY_TIMEOUT_S), last)
-            if not history.gaps(found):
+        for _ in range(history_query.MAX_HISTORY_QUERIES):
+            found = history_query.merge(found, self._read(selector, history_query.HISTORY_TIMEOUT_S), last)
+            if not history_query.gaps(found):
                 break
         return found
 

@@ -22,11 +22,11 @@ from fleet.commands.fleet_file import (
 )
 from fleet.commands.group import connect_option
 from fleet.commands.options import cli_errors
+from fleet.fleet_links import may_be_same, parse_fleet_link
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile
-from fleet.fleetfile.models import validate_link
-from fleet.fleetfile.scan import FoundLink
-from fleet.links import may_be_same, parse_fleet_link
+from fleet.fleetfile.fleet_model import validate_link
+from fleet.fleetfile.scan_process import FoundLink
 from fleet.supervisor.temporary_gateway import temporary_gateway
 from schemas.links import parse_link
 from schemas.process import signals

@@ -14,20 +14,20 @@ import yaml
 from fleet.commands.fleet_file import DEFAULT_FILE, print_errors
 from fleet.commands.options import cli_errors, json_option
 from fleet.coordinator.observer import listed_cars
+from fleet.fleet_links import LINK_SIM, parse_fleet_link
 from fleet.fleetfile.adapter_check import check_adapters, list_adapters
 from fleet.fleetfile.fleet_file import FleetFile, read_fleet
+from fleet.fleetfile.fleet_model import FileEntry
 from fleet.fleetfile.link_check import check_link
-from fleet.fleetfile.models import FileEntry
-from fleet.links import LINK_SIM, parse_fleet_link
 from fleet.policy.lint.lint import Severity
 from fleet.policy.lint.lint import check as find_findings
-from fleet.policy.plan.models import PlanEntry
-from fleet.policy.plan.parser import parse as parse_plan
+from fleet.policy.plan.plan_model import PlanEntry
+from fleet.policy.plan.plan_parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
 from schemas import bus
 from schemas.words import Rank
-from schemas.world import WorldEntry
 from schemas.world_check import check_world
+from schemas.world_fields import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text
 
 _CHECK_THREADS: Final = 16

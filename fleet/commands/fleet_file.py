@@ -12,18 +12,18 @@ import click
 
 from fleet.commands.options import cli_errors
 from fleet.commands.params import Choice, Duration, Number
+from fleet.fleet_links import LINK_SIM
 from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet
-from fleet.fleetfile.models import FileEntry, validate_car_name, validate_color, validate_link, validate_platform
-from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, ScanFailed, scan
+from fleet.fleetfile.fleet_model import FileEntry, validate_car_name, validate_color, validate_link, validate_platform
+from fleet.fleetfile.scan_process import LIKELY_VERDICTS, FoundLink, ScanFailed, scan
 from fleet.fleetfile.template import NewCar, format_new_file, format_new_plan
-from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.words import Platform
-from schemas.world import WorldEntry
+from schemas.world_fields import WorldEntry
 from schemas.yaml_document.document import BadFile, Entry, schema_of
-from schemas.yaml_document.messages import list_words
+from schemas.yaml_document.fault_words import list_words
 
 SCHEMAS: Final = ("fleet", "plan", "world")
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -74,7 +74,7 @@ def print_schema(kind: str) -> None:
 
 def schema_text(kind: str) -> str:
     """Return the JSON Schema of a kind of file as it is checked in."""
-    from fleet.policy.plan.models import PlanEntry
+    from fleet.policy.plan.plan_model import PlanEntry
 
     models: dict[str, type[Entry]] = {"fleet": FileEntry, "plan": PlanEntry, "world": WorldEntry}
     return json.dumps(schema_of(models[kind], f"{kind} file"), indent=2, ensure_ascii=False) + "\n"

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.client import history
+from fleet.client import history_query
 from fleet.client.car_evidence import clocks_off, newest_states
 from fleet.client.car_state import CarState
 from fleet.client.claims import describe_end_of_doubt
@@ -220,7 +220,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
 @click.option("-n", "--last", type=Number(int, 1), help="Print the last N values of each key, oldest first.")
 @click.option(
     "--since",
-    type=Since(history.MAX_HISTORY_S),
+    type=Since(history_query.MAX_HISTORY_S),
     help="Print the values since TIME: 30s or 5m ago, a local time (14:05, yesterday 14:05), or a date.",
 )
 @click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
@@ -248,7 +248,7 @@ def get(
         meant = ", ".join(topic.name for topic in under) or "no message"
         raise click.UsageError(f"--csv needs one message type, but {written} means {meant}.")
     past = last is not None or since is not None
-    why_not = history.describe_missing_history(under) if past else ""
+    why_not = history_query.describe_missing_history(under) if past else ""
     if why_not:
         raise click.UsageError(why_not)
     with open_observer(connect, fleet, keyexpr) as client:
@@ -258,7 +258,7 @@ def get(
             raise click.ClickException(describe_missing(client, written, f"nothing under {written}{within}"))
     _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json, past=past)
     if past:
-        _print_shortfalls(history.describe_shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
+        _print_shortfalls(history_query.describe_shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
 
 
 def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: bool, past: bool) -> None:

@@ -172,7 +172,7 @@ def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> N
 
     Roles, rules and the phase continue if both plans have them. A stopped plan runs again.
     """
-    from fleet.policy.plan.parser import parse
+    from fleet.policy.plan.plan_parser import parse
     from schemas.yaml_document.document import read_text
 
     text = read_text(file)
@@ -186,7 +186,7 @@ def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> N
 @with_client
 def show(client: Fleet, *, as_json: bool) -> None:
     """Show the plan in force: its roles and the cars that have them, the phase, and the rules in force."""
-    from fleet.policy.plan.parser import parse
+    from fleet.policy.plan.plan_parser import parse
 
     place = f"{client.name}/{keys.COORDINATOR}"
     found = {reading.key.rpartition("/")[2]: reading.value for reading in client.get(f"{place}/*")}

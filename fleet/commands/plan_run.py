@@ -15,7 +15,7 @@ from fleet.coordinator.other_coordinators import SENDER, AnotherCoordinator
 from fleet.fleetfile.fleet_file import people_table, read_fleet
 from fleet.policy.decision import Decision
 from fleet.policy.lint.lint import find_faults
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from schemas.identity import Service, service
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid

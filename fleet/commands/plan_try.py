@@ -60,7 +60,7 @@ def try_plan(session: Path, path: Path | None, fleet_file: Path | None, toleranc
     """
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
-    from fleet.policy.plan.parser import parse
+    from fleet.policy.plan.plan_parser import parse
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.session_dir import FLEET_FILE
     from schemas.yaml_document.document import read_text

@@ -19,7 +19,7 @@ from schemas.process import startup
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
-    from fleet.replay.rerun.export import Part
+    from fleet.replay.rerun.rrd_export import Part
 
 
 @click.command(epilog="\b\nexamples:\n  fleet replay\n  fleet replay latest~1 --car red --from=-60s --save red.rrd")
@@ -86,7 +86,7 @@ def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
 
 
 def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str | None) -> "Part":
-    from fleet.replay.rerun.export import WHOLE_SESSION, Part
+    from fleet.replay.rerun.rrd_export import WHOLE_SESSION, Part
 
     if not cars and start is None and end is None:
         return WHOLE_SESSION
@@ -104,7 +104,7 @@ def quiet_rerun() -> None:
 
 
 def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) -> None:
-    from fleet.replay.rerun.export import ExportFailed, export
+    from fleet.replay.rerun.rrd_export import ExportFailed, export
 
     try:
         with _bar(session) as seen:
@@ -124,7 +124,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
 @contextmanager
 def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
     """Show a progress bar. Yield the function that takes the number of newly read messages."""
-    from fleet.replay.rerun.export import count_of
+    from fleet.replay.rerun.rrd_export import count_of
 
     with progress_bar("replay", count_of(session) if sys.stderr.isatty() else 0) as advance:
         yield advance

@@ -9,7 +9,7 @@ import click
 
 from fleet.commands.output import echo_safely, watched
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.tools import export, one_schema
+from fleet.recording.tools import one_schema, table_export
 from fleet.recording.tools.summary import total
 from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
 from fleet.recording.tools.transform import atomic_directory
@@ -20,7 +20,7 @@ def export_tables(session: Session, out: Path, form: str, *, nanoseconds: bool =
     """Write tables in the format `csv` or `parquet`."""
     sink = ParquetNsSink if nanoseconds else FORMATS[form]
     with atomic_directory(out) as new:
-        done = export.export(watched(f"export {form}", total(session))(session.rows()), new, sink)
+        done = table_export.export(watched(f"export {form}", total(session))(session.rows()), new, sink)
         if not done.rows:
             raise NoSession(f"{session.path} has no intact message: {session.damage_words or 'it is empty'}")
     click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")

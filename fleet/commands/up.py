@@ -23,11 +23,11 @@ from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.lint.lint import find_faults
-from fleet.policy.plan.parser import parse as parse_plan
+from fleet.policy.plan.plan_parser import parse as parse_plan
 from fleet.recording.writing.disk_space import Reserve
-from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
+from fleet.supervisor.supervisor_service import AnotherSupervisor
 from schemas import keys
 from schemas.bus import ENDPOINT_VARIABLE, accepts, check_listening, is_secure, resolve_endpoint
 from schemas.local_time import clock

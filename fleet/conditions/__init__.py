@@ -6,9 +6,9 @@ measured is unknown (Kleene's logic). Read `expression` (the tree) first, then `
 never be true).
 """
 
+from fleet.conditions.condition_parser import BadExpression, parse
 from fleet.conditions.expression import Expression, Lookup
 from fleet.conditions.fields import aliases_of, compared_in, fields_of, topic_aliases_of, value_in
-from fleet.conditions.parser import BadExpression, parse
 from fleet.conditions.satisfiability import is_contradictory
 
 __all__ = [

@@ -16,12 +16,12 @@ from fleet.aio import Fleet
 from fleet.console.page_requests import PageMessage
 from fleet.console.request_filter import PERSON
 from fleet.console.sessions_api import read_body, refuse
+from fleet.fleet_links import may_be_same, parse_fleet_link
 from fleet.fleetfile.editor import set_link
 from fleet.fleetfile.fleet_file import default_color, parse_fleet, read_fleet
-from fleet.fleetfile.models import validate_car_name, validate_link, validate_platform
-from fleet.fleetfile.scan import ScanFailed, scan
+from fleet.fleetfile.fleet_model import validate_car_name, validate_link, validate_platform
+from fleet.fleetfile.scan_process import ScanFailed, scan
 from fleet.fleetfile.template import NewCar, format_new_file
-from fleet.links import may_be_same, parse_fleet_link
 from fleet.supervisor.temporary_gateway import temporary_gateway
 from schemas.atomic_file import write_atomically
 from schemas.platform_name import AUTO

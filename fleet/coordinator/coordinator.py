@@ -17,13 +17,13 @@ from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.open_commands import OpenCommands
 from fleet.coordinator.other_coordinators import declare_alone, yield_to_another
 from fleet.coordinator.plan_commands import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
+from fleet.coordinator.plan_state_file import CoordinatorStateFile
 from fleet.coordinator.publications import Publications, assignment_message, decision_message, in_force
-from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.decide import step
 from fleet.policy.decision import Decision
 from fleet.policy.lint.lint import find_faults
-from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted

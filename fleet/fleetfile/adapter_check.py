@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fleet.links import FleetLink
+from fleet.fleet_links import FleetLink
 from schemas.bluetooth import (
     ADAPTER_CONNECTIONS,
     ADAPTER_NOTIFICATIONS_PER_S,

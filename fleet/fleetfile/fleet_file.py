@@ -11,7 +11,8 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from fleet.conditions import BadExpression, Expression
-from fleet.fleetfile.models import (
+from fleet.fleet_links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
+from fleet.fleetfile.fleet_model import (
     CAPABILITIES,
     ConsoleEntry,
     FileEntry,
@@ -21,7 +22,6 @@ from fleet.fleetfile.models import (
     PinEntry,
     RecordEntry,
 )
-from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from fleet.policy.car_condition import parse_condition
 from fleet.quota import Quota
 from gateway import drivers
@@ -34,7 +34,7 @@ from schemas.platform_name import AUTO, normalize_name
 from schemas.rights import NO_PEOPLE, People, PersonRole
 from schemas.words import BatteryAction, Platform
 from schemas.yaml_document.document import BadFile, Document, read_text
-from schemas.yaml_document.messages import Where, quote_value, suggest
+from schemas.yaml_document.fault_words import Where, quote_value, suggest
 
 PATHS: Final = ("plan", "world")
 

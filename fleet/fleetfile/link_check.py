@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from fleet.fleet_links import SimLink, may_be_same, parse_fleet_link
 from fleet.fleetfile.fleet_file import FleetCar
-from fleet.links import SimLink, may_be_same, parse_fleet_link
 from schemas.links import UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import CH340, explain_missing_port

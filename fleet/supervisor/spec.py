@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule, default_color, profile_capabilities
-from fleet.fleetfile.models import PersonRank
+from fleet.fleetfile.fleet_model import PersonRank
 from fleet.quota import Quota
 from fleet.supervisor.restart_policy import Patience
 from gateway import drivers

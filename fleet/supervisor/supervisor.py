@@ -27,7 +27,6 @@ from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
-from fleet.supervisor.service import ReloadRefused, RestartNeeded, SupervisorService
 from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown, describe_end
 from fleet.supervisor.spec import (
     CONSOLE,
@@ -39,6 +38,7 @@ from fleet.supervisor.spec import (
     CarProcessSpec,
     FleetSpec,
 )
+from fleet.supervisor.supervisor_service import ReloadRefused, RestartNeeded, SupervisorService
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.identity import Service, service

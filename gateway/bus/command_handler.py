@@ -10,13 +10,13 @@ from dataclasses import replace
 from typing import Final
 
 from gateway.bus import command_parser
+from gateway.bus.car_publisher import CarPublisher
+from gateway.bus.car_service import Request
 from gateway.bus.estop_sync import EstopSync
-from gateway.bus.publisher import CarPublisher
-from gateway.bus.service import Request
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
+from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
-from gateway.control.events import CommandRecord, LogRecord
 from gateway.control.holds_and_leases import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb

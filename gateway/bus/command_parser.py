@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
 from typing import Any, Final, TypeVar
 
-from gateway.bus.service import Request
+from gateway.bus.car_service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,

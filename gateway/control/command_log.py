@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gateway.control.commands import Command
-from gateway.control.events import CommandRecord, Later, LogRecord, Record, frame_of
+from gateway.control.control_output import CommandRecord, Later, LogRecord, Record, frame_of
 from schemas.words import Level, Phase, Reason
 
 MAX_COMMAND_IDS: Final = 256

@@ -30,8 +30,8 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
+from gateway.control.control_output import Record
 from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
-from gateway.control.events import Record
 from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
 from gateway.control.sender_presence import Senders
 from schemas.keys import name_of

@@ -21,7 +21,7 @@ from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue
 from gateway.control.commands import Action, Signal
-from gateway.control.events import OutgoingFrame
+from gateway.control.control_output import OutgoingFrame
 from gateway.control.trust import TrustEvent, TrustState
 from schemas.car_profile import CarProfile
 from schemas.words import (

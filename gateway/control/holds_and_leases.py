@@ -1,6 +1,6 @@
 """Holds the hold, e-stops, pauses, loan and lease of one car, which decide who may move it.
 
-`gateway.state_file` writes `PersistedSafety` to disk, so that all but the lease survive a restart.
+`gateway.safety_state_file` writes `PersistedSafety` to disk, so that all but the lease survive a restart.
 """
 
 from collections.abc import Iterable

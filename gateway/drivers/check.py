@@ -32,9 +32,9 @@ from gateway.control.commands import (
     Signal,
     Stop,
 )
+from gateway.control.control_output import CommandRecord
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Event
-from gateway.control.events import CommandRecord
 from gateway.drivers import BUILT_IN, Family, built_in_platforms
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages

@@ -22,6 +22,7 @@ from gateway.control.battery import Battery
 from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import Action, ChangeSpeed, Find, PartAction, SetMode
+from gateway.control.control_output import Later, OutgoingFrame
 from gateway.control.driver import (
     Desk,
     Driver,
@@ -35,7 +36,6 @@ from gateway.control.driver import (
     learn_trust,
     log_unstopped,
 )
-from gateway.control.events import Later, OutgoingFrame
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from schemas.car_profile import CarProfile
 from schemas.limits import SHUTDOWN_S

@@ -13,7 +13,7 @@ from typing import Any
 
 from gateway.link.base import Device, Link, LinkKind
 from gateway.link.baud import BaudWatch
-from gateway.link.errors import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
+from gateway.link.link_errors import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
 from gateway.link.url import parse_url
 from schemas.links import LinkUrl
 

@@ -19,7 +19,7 @@ from typing import Final
 import serial
 
 from gateway.link.base import CLOSE_S, Link, LinkKind
-from gateway.link.errors import Busy, CannotOpen, LinkLost
+from gateway.link.link_errors import Busy, CannotOpen, LinkLost
 from gateway.link.serial_ports import SerialPort, serial_ports
 from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
 from schemas.links import SerialUrl, UsbUrl

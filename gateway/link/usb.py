@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from gateway.link.errors import CannotOpen
+from gateway.link.link_errors import CannotOpen
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process.stdio import printable
 from schemas.process.usb_bus import CH340, explain_missing_port

@@ -1,7 +1,7 @@
 """Builds a world of a world file, which `schemas.world_check` has checked. Pure.
 
-Distances in meters, speeds in m/s, angles in the file in degrees counter-clockwise from x. `schemas.world` has the
-fields.
+Distances in meters, speeds in m/s, angles in the file in degrees counter-clockwise from x. The fields are in
+`schemas.world_fields`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,8 +12,8 @@ from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import World
 from schemas.geometry import Point, Segment, loop
-from schemas.world import LineEntry, ThingEntry
 from schemas.world_check import check_world, walls_of
+from schemas.world_fields import LineEntry, ThingEntry
 
 
 @dataclass(frozen=True, slots=True)

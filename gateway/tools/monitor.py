@@ -16,8 +16,8 @@ from typing import Any, Final
 from gateway import capture
 from gateway.control.driver import Rejected
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics, describe

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.frames import encode
 from gateway.drivers.yahboom.protocol.modes import candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.link.serial_ports import SerialPort

@@ -7,11 +7,11 @@ from typing import Any
 
 from gateway.control.driver import Echo, Rejected, TextLine
 from gateway.drivers.yahboom.estimate.platform import PlatformDetector
-from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
 from gateway.drivers.yahboom.protocol.measurements import measured
 from gateway.drivers.yahboom.protocol.modes import candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
+from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import FrameVerdict, Platform
 
 

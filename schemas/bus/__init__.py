@@ -35,8 +35,8 @@ from schemas.bus.sample import (
     sequence_of,
     unread,
 )
-from schemas.bus.session import Bus
 from schemas.bus.singleton import Singleton
+from schemas.bus.zenoh_session import Bus
 from schemas.state_dir import DEFAULT_ENDPOINT
 
 __all__ = [

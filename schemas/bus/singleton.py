@@ -10,7 +10,7 @@ from typing import Any
 
 from schemas.bus.replies import BUSY
 from schemas.bus.sample import Failure, messages_of
-from schemas.bus.session import Bus
+from schemas.bus.zenoh_session import Bus
 
 
 class Singleton:

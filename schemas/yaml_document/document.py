@@ -1,7 +1,7 @@
 """Reads YAML 1.2 text into a pydantic model and reports all faults at once, each with line and column.
 
-It limits size, depth and aliases. messages.py puts faults into words. What a fleet file or a plan means is checked by
-its own package.
+It limits size, depth and aliases. fault_words.py puts faults into words. Their own packages check what a fleet file or
+a plan means.
 """
 
 import json
@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
 from schemas.suggestion import did_you_mean
-from schemas.yaml_document.messages import Where, describe_error, format_place, quote_value
+from schemas.yaml_document.fault_words import Where, describe_error, format_place, quote_value
 from schemas.yaml_document.partial import PartialTree
 
 MAX_YAML_BYTES: Final = 256 * 1024

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from schemas.yaml_document.messages import Where
+from schemas.yaml_document.fault_words import Where
 
 
 class PartialTree:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from fleet.policy.decide import step
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot
 from fleet.policy.state import PolicyState
 from tests.bench.measured import Measured, Scale, in_turns, percentile

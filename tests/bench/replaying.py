@@ -7,7 +7,7 @@ import rerun.chunk as rrc
 from mcap.writer import Writer
 
 from fleet.recording.reading.session import Session
-from fleet.replay.rerun.export import export
+from fleet.replay.rerun.rrd_export import export
 from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import CARS, Made, drive_about

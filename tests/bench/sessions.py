@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from fleet.recording.reading.session import Session
-from fleet.recording.tools.export import export
+from fleet.recording.tools.table_export import export
 from fleet.recording.tools.table_formats import FORMATS
 from schemas import messages
 from tests.bench.measured import Measured, Scale, in_turns

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from tests.e2e.test_console import serious
 from tests.support.console import ConsoleStage
 from tests.support.processes import PATIENCE_S, wait_for

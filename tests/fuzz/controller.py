@@ -32,7 +32,7 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.events import CommandRecord, OutgoingFrame
+from gateway.control.control_output import CommandRecord, OutgoingFrame
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
 from gateway.drivers.yahboom.protocol.platforms import parse_platform

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Signal, Stop
-from gateway.control.events import CommandRecord
+from gateway.control.control_output import CommandRecord
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform

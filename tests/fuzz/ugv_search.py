@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from gateway import drivers
 from gateway.control.commands import Action, ChangeSpeed, Command, Drive, EmergencyStop, Find, Resume, SetLight, Stop
+from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Fields
-from gateway.control.events import CommandRecord, LogRecord
 from gateway.drivers.waveshare.driver import ALLOWED, DRIVE, PWM
 from gateway.sim.car_options import UGV_OPTIONS
 from gateway.sim.model.factory import build_ugv

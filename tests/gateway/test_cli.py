@@ -98,7 +98,7 @@ def test_run_imports_little_before_it_joins_the_bus() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     imported = set(done.stdout.split())
-    assert {"gateway.bus.service", "gateway.link", "schemas.rights"} <= imported
+    assert {"gateway.bus.car_service", "gateway.link", "schemas.rights"} <= imported
     assert not [name for name in imported if name.startswith(("gateway.sim", "gateway.capture", "gateway.tools"))]
     assert not imported & {"asyncio", "bleak", "serial"}
     assert not imported & {"logging", "gateway.control.commands", "gateway.drivers.yahboom.protocol.platforms"}, (

@@ -171,7 +171,7 @@ def test_without_a_hub_the_first_session_goes_on(
     hub: tuple[str, subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endpoint, process = hub
-    monkeypatch.setattr("schemas.bus.session.REOPEN_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("schemas.bus.zenoh_session.REOPEN_TIMEOUT_S", 0.2)
     with Bus.open(endpoint) as car:
         before = car.id
         process.kill()

@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from gateway.bus.service import CarService
+from gateway.bus.car_service import CarService
 from gateway.car import CarGateway, Settings
 from gateway.link import parse_url
 from schemas import bus

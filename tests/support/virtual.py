@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
-from gateway.control.events import CommandRecord, LogRecord
+from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build

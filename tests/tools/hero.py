@@ -27,7 +27,7 @@ from rich.terminal_theme import MONOKAI
 
 import fleet.examples
 from fleet import Reading, Session
-from fleet.replay.colors import rgb
+from fleet.replay.state_colors import rgb
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.status_table import Table
 from schemas.colors import car_color, hex_color

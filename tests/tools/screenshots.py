@@ -89,7 +89,7 @@ def _look(client: Any, rrd: Path, view: str) -> tuple[bytes, Shown]:
 def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
     """Make the pictures of a session. Return the views by file name. Raise NoPicture, NoSession and ExportFailed."""
     from fleet.recording.reading.session import Session
-    from fleet.replay.rerun.export import export
+    from fleet.replay.rerun.rrd_export import export
 
     found = Session(session)
     made: dict[str, Shown] = {}
@@ -191,7 +191,7 @@ def _connect(viewer: Viewer, port: int) -> Any:
 def main(session: Path, directory: Path) -> None:
     """Draw the lanes of SESSION's last car and the simulated world into PNGs in DIRECTORY."""
     from fleet.recording.reading.session import NoSession
-    from fleet.replay.rerun.export import ExportFailed
+    from fleet.replay.rerun.rrd_export import ExportFailed
 
     try:
         made = pictures(session, directory, -1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fleet.replay import colors, panels
+from fleet.replay import panels, state_colors
 from schemas.colors import car_color
 from tests.fleet.replay.make_session import make
 from tests.tools.screenshots import NoPicture, Shown, pictures, software_driver
@@ -60,7 +60,7 @@ def _is_the_fleet(image: np.ndarray, shown: Shown) -> None:
         assert shown.views.count(panel.name) >= 3, panel.name
     middle = image.shape[1] // 2
     for state in ("tracking", "obstacle_avoidance", "manual", "online"):
-        assert share(image[:, middle:], lane(colors.STATE_COLORS[state])) > 0.002, state
+        assert share(image[:, middle:], lane(state_colors.STATE_COLORS[state])) > 0.002, state
     for car in ("red", "green", "blue"):
         for half in (image[:, :middle], image[:, middle:]):
             assert share(half, car_color(car, 0)) > 0.0001, car
@@ -71,7 +71,7 @@ def _is_a_car(image: np.ndarray, shown: Shown) -> None:
     middle = image.shape[1] // 2
     left, right = image[:, :middle], image[:, middle:]
     for state in ("tracking", "confirmed", "true"):
-        assert share(left, lane(colors.STATE_COLORS[state])) > 0.002, state
+        assert share(left, lane(state_colors.STATE_COLORS[state])) > 0.002, state
     assert share(left, lane(0xFF0010FF)) > 0.002, "the LED's lanes are in its colour"
     # Measured: 0.00065. Smoothing of lines may lower the share.
     assert share(right, car_color("blue", 0)) > 0.0002, "distance and battery"

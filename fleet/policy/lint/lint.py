@@ -1,7 +1,7 @@
 """Finds what can never work in a plan before anything moves: roles that no car can fill, rules that never fire. Pure.
 
-parser.py reports faults of the text itself. The lint checks the plan against the cars in a fleet file or, without one,
-against cars of any platform.
+plan_parser.py reports faults of the text itself. The lint checks the plan against the cars in a fleet file or, without
+one, against cars of any platform.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -18,7 +18,7 @@ from fleet.policy.snapshot import CarSnapshot, topic_of
 from schemas.suggestion import misspelled
 from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Problem
-from schemas.yaml_document.messages import suggest
+from schemas.yaml_document.fault_words import suggest
 
 _WORDS_FOR_CARS: Final = (THIS_CAR, OTHER_CARS, ALL_CARS)
 

@@ -1,6 +1,6 @@
 """A plan as values: roles for cars, rules that change them, phases that follow each other. Pure.
 
-parser.py reads a plan from its text, lint.py finds what can never work in it, decide.py follows it.
+plan_parser.py reads a plan from its text, lint.py finds what can never work in it, decide.py follows it.
 """
 
 import hashlib

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder
-from fleet.recording.tools.export import OTHER_TABLE, STRAY_PREFIX, arrow_tables, is_stray, own_type
 from fleet.recording.tools.mode_spans import ModeSpan, describe_spans
+from fleet.recording.tools.table_export import OTHER_TABLE, STRAY_PREFIX, arrow_tables, is_stray, own_type
 from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
 from fleet.recording.tools.tables import Layout
 from schemas import messages, topics

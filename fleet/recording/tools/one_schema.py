@@ -14,7 +14,7 @@ from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 from fleet.recording.reading.message_decoder import message_of
-from fleet.recording.tools.export import numbered, own_type
+from fleet.recording.tools.table_export import numbered, own_type
 from schemas import keys
 
 _Schema = tuple[str | bytes, ...]

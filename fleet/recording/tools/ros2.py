@@ -22,7 +22,7 @@ from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
 from fleet.recording.tools.car_timeline import message_time_ns
-from fleet.recording.tools.export import numbered
+from fleet.recording.tools.table_export import numbered
 from fleet.recording.tools.table_formats import FormatMissing
 from fleet.recording.tools.tables import plain
 from schemas import keys

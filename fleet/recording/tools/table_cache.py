@@ -38,8 +38,8 @@ from fleet.recording.session_dir import (
     SessionInfo,
     indexed_segments,
 )
-from fleet.recording.tools.export import export
 from fleet.recording.tools.summary import of_session
+from fleet.recording.tools.table_export import export
 from fleet.recording.tools.table_formats import ParquetSink
 from fleet.recording.tools.tables import Column, Layout
 from schemas import messages

@@ -14,10 +14,10 @@ from typing import Any, Final
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway import drivers
 from gateway.drivers.yahboom.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
-from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from schemas.words import FrameVerdict, Mode
 
 MAX_MODE_DELAY_NS: Final = 500_000_000

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.decide import step
-from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import RequestRefused, on_request
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, Refusal, topic_of
 from fleet.policy.state import TAKEN_OVER, HeldRole, PersistedPolicy, PolicyState, carry_over, restore, to_persisted

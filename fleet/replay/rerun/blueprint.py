@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from fleet.replay import colors, panels
+from fleet.replay import panels, state_colors
 from fleet.replay.panels import Curve, Panel, StateTrack
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.lenses import component
@@ -64,7 +64,7 @@ class _RerunLayout:
 
     def __init__(self, drawing: Drawing, axis: rrb.TimeAxis) -> None:
         self._session = drawing.contents()
-        self._leds = colors.leds(drawing.leds)
+        self._leds = state_colors.leds(drawing.leds)
         self._drawn = drawing.tracks
         self._color = drawing.color
         self._axis = axis
@@ -171,9 +171,9 @@ class _RerunLayout:
         tints = (
             self._leds
             if track.name in _LEDS
-            else colors.MARK_COLORS
+            else state_colors.MARK_COLORS
             if track == panels.COMMAND_TRACK
-            else colors.STATE_COLORS
+            else state_colors.STATE_COLORS
         )
         style = rr.StateConfiguration(values=list(tints), colors=np.array(list(tints.values()), dtype=np.uint32))
         source = VisualizerComponentMapping(

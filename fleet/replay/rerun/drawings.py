@@ -20,9 +20,9 @@ import rerun.chunk as rrc
 
 from fleet.recording.tools.summary import MARK_TOPIC_NAME
 from fleet.replay import panels
-from fleet.replay.colors import OFF, rgb
 from fleet.replay.rerun.lenses import component, is_drawn, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
+from fleet.replay.state_colors import OFF, rgb
 from schemas import keys, messages
 from schemas.colors import Rgb, car_color
 from schemas.commands import COMMANDS, Verb

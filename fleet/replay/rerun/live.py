@@ -24,8 +24,8 @@ from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, ma
 from fleet.replay.panels import ON_CHANGE_TOPICS
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
-from fleet.replay.rerun.export import APPLICATION
 from fleet.replay.rerun.lenses import lenses
+from fleet.replay.rerun.rrd_export import APPLICATION
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Sample, sample_of
 

@@ -42,8 +42,8 @@ from typing import Any, ClassVar, Final
 
 from gateway.control.command_log import Pending
 from gateway.control.commands import Action, Drive, Find, SetLight
+from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
-from gateway.control.events import OutgoingFrame
 from gateway.drivers.lines import LineSplitter
 from gateway.drivers.plain import PlainDriver, PlainProfile
 from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, UgvFirmware

@@ -10,10 +10,10 @@ from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.estimate.platform import PlatformDetector
 from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.pacing import FLIGHT_S
-from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.modes import only_candidate
 from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.evidence import Finding
 from schemas.words import (

@@ -22,17 +22,17 @@ from gateway.control.commands import (
     SetMode,
     Signal,
 )
+from gateway.control.control_output import Later, frame_of
 from gateway.control.driver import Desk, Event, Fields
-from gateway.control.events import Later, frame_of
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import Event as WireEvent
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.wire_events import Event as WireEvent
 from schemas.commands import Verb
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 

@@ -8,8 +8,8 @@ from typing import Final
 from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import Fan, SetMode
+from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Desk, Driver
-from gateway.control.events import OutgoingFrame
 from gateway.control.trust import TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.estimate.learned import blocking_kind

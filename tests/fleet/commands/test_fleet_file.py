@@ -20,7 +20,7 @@ from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.fleetfile.template import NewCar, format_new_file
 from fleet.policy.lint.lint import find_faults
-from fleet.policy.plan.parser import parse as parse_plan
+from fleet.policy.plan.plan_parser import parse as parse_plan
 from schemas.yaml_document.document import BadFile
 from tests.support import in_process
 from tests.support.message_length import LINE

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.conditions import BadExpression, fields_of, is_contradictory, parse, value_in
+from fleet.conditions.condition_parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from fleet.conditions.expression import (
     And,
     Compare,
@@ -23,7 +24,6 @@ from fleet.conditions.expression import (
     ValueKind,
     join_nodes,
 )
-from fleet.conditions.parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.text_parts import has_parts

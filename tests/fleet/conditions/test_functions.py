@@ -12,7 +12,7 @@ from fleet.conditions.functions import FUNCTIONS, ConditionFunction, rate
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.lint.reachability import list_unmeasured
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import ALIASES, NAMES
 from gateway import drivers
 from schemas import topics

@@ -13,7 +13,7 @@ from fleet.console.budgets import MAX_OPEN_CHECKS
 from fleet.console.plan_answer import MAX_TOLD_CHARACTERS, PlanQuestion
 from fleet.console.plan_checks import PlanChecks
 from fleet.console.worker import TooManyQuestions
-from fleet.policy.plan.parser import BadPlan, parse
+from fleet.policy.plan.plan_parser import BadPlan, parse
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS

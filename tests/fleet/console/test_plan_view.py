@@ -4,7 +4,7 @@ import pytest
 
 from fleet.console.plan_view import MAX_PLAN_NAME_LENGTH, named, plan_name
 from fleet.console.server import example_plans
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 
 
 @pytest.mark.parametrize(

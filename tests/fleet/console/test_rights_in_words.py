@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from fleet.console.rights_in_words import management_refusal, rights_of
 from fleet.console.rights_in_words import refusals as refusals_shown
-from gateway.bus.publisher import _fill_safety
+from gateway.bus.car_publisher import _fill_safety
 from gateway.control import refusals
 from gateway.control.commands import (
     Action,

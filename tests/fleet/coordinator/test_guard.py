@@ -17,7 +17,7 @@ from fleet.coordinator.coordinator import Coordinator
 from fleet.coordinator.other_coordinators import SENDER
 from fleet.coordinator.publications import INTERNAL_ERROR
 from fleet.policy.decision import Decision
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from schemas import keys, messages
 from schemas.bus import Failure, Sample
 from schemas.topics import TOPICS

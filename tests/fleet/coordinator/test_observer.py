@@ -7,7 +7,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS, REQUIRED_TOPICS, FleetObserver
 from fleet.policy.decide import step
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.state import PolicyState
 from schemas import messages, topics

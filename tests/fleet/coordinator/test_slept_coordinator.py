@@ -7,7 +7,7 @@ import pytest
 from fleet.coordinator import coordinator
 from fleet.coordinator.coordinator import Coordinator
 from fleet.coordinator.observer import FleetObserver
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from schemas.process.suspend import SleepWatch
 from tests.fleet.coordinator.test_observer import come, said
 

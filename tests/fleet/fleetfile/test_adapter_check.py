@@ -7,9 +7,9 @@ import pytest
 from click.testing import CliRunner
 
 from fleet.commands.check import check
+from fleet.fleet_links import FleetLink, parse_fleet_link
 from fleet.fleetfile import adapter_check
 from fleet.fleetfile.adapter_check import AdapterCheck, check_adapters, list_adapters
-from fleet.links import FleetLink, parse_fleet_link
 from tests.support.ports import free_endpoint
 
 

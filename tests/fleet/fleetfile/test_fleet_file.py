@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.fleet_links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.fleetfile.models import FileEntry
-from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
+from fleet.fleetfile.fleet_model import FileEntry
 from fleet.quota import Quota
 from gateway.control import battery
 from gateway.link import BadUrl, parse_url

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fleet.examples import EXAMPLES
 from fleet.policy.decide import step
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import HUB_RETURN_GRACE_S, PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas.colors import format_color

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from fleet.policy.decision import DecisionKind
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import Refusal
 from tests.fleet.policy.cars import HERE, PolicyRun, observed
 from tests.support.vectors import rows

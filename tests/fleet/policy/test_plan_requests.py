@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import FleetSnapshot, Refusal
 from fleet.policy.state import PersistedPolicy, carry_over, restore, to_persisted

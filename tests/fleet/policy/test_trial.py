@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from fleet.policy.difference import plan_changes
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import FleetSnapshot
 from fleet.policy.trial import PlanInForce, try_plan
 from tests.fleet.policy.cars import HERE, PolicyRun

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.bus import command_parser
+from gateway.bus.car_service import Request
 from gateway.bus.command_parser import BadRequest, parse
-from gateway.bus.service import Request
 from gateway.control.commands import (
     PLAIN_ACTIONS,
     Action,

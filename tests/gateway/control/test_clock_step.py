@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.bus.car_service import Request
 from gateway.bus.command_parser import parse
-from gateway.bus.service import Request
 from gateway.control.commands import Answer
 from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
 from schemas import messages

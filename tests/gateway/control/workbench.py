@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
-from gateway.control.events import CommandRecord, LogRecord
+from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.holds_and_leases import PersistedSafety
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen

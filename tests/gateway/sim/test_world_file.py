@@ -19,8 +19,8 @@ from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import World
 from gateway.sim.world_file import WorldSpec, read_world
 from schemas.geometry import RADIUS_M
-from schemas.world import WorldEntry
 from schemas.world_check import MIN_SIZE_M
+from schemas.world_fields import WorldEntry
 from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile
 from tests.support.yaml_text import read_yaml
 

@@ -31,7 +31,7 @@ RUN = ("run", "--car", "red", "--link", "tcp://127.0.0.1:9", "--connect", "tcp/1
     ("package", "imported", "arguments"),
     [
         ("gateway", "gateway.cli", RUN),
-        ("gateway", "gateway.bus.service", RUN),
+        ("gateway", "gateway.bus.car_service", RUN),
         ("gateway", "gateway.sim.cli", ("sim",)),
         ("gateway", "gateway.tools.monitor", ("monitor",)),
         ("fleet", "click", ("list",)),

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from fleet.fleetfile import fleet_file
-from fleet.fleetfile.models import FileEntry
+from fleet.fleetfile.fleet_model import FileEntry
 from fleet.policy.lint import lint
-from fleet.policy.plan import parser
-from fleet.policy.plan.models import PlanEntry
-from schemas.world import WorldEntry
+from fleet.policy.plan import plan_parser
+from fleet.policy.plan.plan_model import PlanEntry
 from schemas.world_check import check_world
+from schemas.world_fields import WorldEntry
 from schemas.yaml_document.document import schema_of
 from tests.tools.pages.command_line import escape
 
@@ -119,7 +119,7 @@ def problems(kind: str, text: str) -> list[str]:
     """Return the faults that the reader and the check of this kind of file find in a text."""
     try:
         if kind == "plan":
-            return [str(each) for each in lint.check(parser.parse(text, "plan.yaml")) if each.severity == "error"]
+            return [str(each) for each in lint.check(plan_parser.parse(text, "plan.yaml")) if each.severity == "error"]
         if kind == "fleet":
             fleet_file.parse_fleet(text, Path("fleet.yaml"))
         else:

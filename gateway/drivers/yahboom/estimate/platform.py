@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.driver import Rejected, TextLine
-from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
 from gateway.drivers.yahboom.protocol.modes import candidate_modes, only_candidate
 from gateway.drivers.yahboom.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
 from gateway.drivers.yahboom.protocol.sensors import Sensors, head_of
+from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.platform_name import HEAD, NO_READINGS
 from schemas.words import Mode, Platform
 

@@ -15,10 +15,10 @@ from math import inf
 from typing import Final
 
 from gateway.control.driver import Echo, Rejected, TextLine
-from gateway.drivers.yahboom.protocol.events import Event
+from gateway.drivers.yahboom.protocol.frame_parser import parse
 from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
-from gateway.drivers.yahboom.protocol.parser import parse
 from gateway.drivers.yahboom.protocol.sensors import read_sensors, sensors_matcher
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from schemas.words import Cause
 
 MAX_FRAME: Final = 256  # docs/reference/protocol.md#bad-input: a frame longer than this is cut off as noise

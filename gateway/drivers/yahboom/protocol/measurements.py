@@ -4,9 +4,9 @@ The level of the battery is an estimate of the gateway and is not set here.
 """
 
 from gateway.control.driver import Echo, Rejected, TextLine
-from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Fields, Sensors
+from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import FrameVerdict, Mode
 
 _PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.published) for each in SENSOR_FIELDS)

@@ -3,7 +3,7 @@
 import pytest
 
 from fleet.policy.lint.lint import Severity, check
-from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from tests.support.text_parts import has_parts

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.conditions.parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
+from fleet.conditions.condition_parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from fleet.policy.decide import step
 from fleet.policy.lint.lint import find_faults
-from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.snapshot import NAMES, CarSnapshot, FleetSnapshot
 from fleet.policy.state import PolicyState
 from gateway.drivers.yahboom.protocol.platforms import parse_platform

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet.coordinator.state_file import CoordinatorStateFile
-from fleet.policy.plan.parser import parse
+from fleet.coordinator.plan_state_file import CoordinatorStateFile
+from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import PlanRequest, on_request
 from fleet.policy.rules import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.snapshot import FleetSnapshot

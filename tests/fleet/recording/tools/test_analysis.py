@@ -15,7 +15,7 @@ from fleet.examples.programs import distance_over_time
 from fleet.recording.reading.session import NoSession
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.analysis import NoTable
-from fleet.recording.tools.export import export
+from fleet.recording.tools.table_export import export
 from fleet.recording.tools.table_formats import FormatMissing, ParquetNsSink
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import PROTOBUF, TOPICS

@@ -11,7 +11,7 @@ from fleet.commands.sessions import sessions
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.tools.export import export
+from fleet.recording.tools.table_export import export
 from fleet.recording.tools.table_formats import FORMATS
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.random_session import LINK, RANGE, START_NS, Mixed, make

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 
 from fleet.cli import cli
 from fleet.recording.reading.session import Session
-from fleet.replay.rerun.export import export
+from fleet.replay.rerun.rrd_export import export
 from schemas import messages
 from schemas.topics import TOPICS
 from tests.fleet.recording.tools import every_type

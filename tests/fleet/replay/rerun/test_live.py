@@ -20,7 +20,7 @@ from click.testing import CliRunner
 
 from fleet.commands.view import view
 from fleet.recording.left_out import LeftOutCause
-from fleet.replay.rerun import export, live
+from fleet.replay.rerun import live, rrd_export
 from fleet.replay.rerun.live import Live
 from fleet.replay.rerun.viewer import Viewer, free_port
 from schemas.bus import Bus, reply_message, router_config
@@ -108,10 +108,10 @@ def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path
             following.step()
     assert following.cars == ("blue", "red")
     assert following.dropped == 0
-    assert export.rows(out) == {"fleet/red/sensor/range": 50, "fleet/blue/sensor/range": 20}
+    assert rrd_export.rows(out) == {"fleet/red/sensor/range": 50, "fleet/blue/sensor/range": 20}
     reader = rrc.RrdReader(out)
     (layout,) = {each.application_id for each in reader.blueprints()}
-    assert layout == export.APPLICATION
+    assert layout == rrd_export.APPLICATION
 
 
 def test_live_view_counts_strays_and_junk(fleet: FleetProcesses, tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_live_view_counts_strays_and_junk(fleet: FleetProcesses, tmp_path: Path)
         (link, LeftOutCause.UNREADABLE): 6,
         (log, LeftOutCause.UNKNOWN_ENUM): 6,
     }
-    assert export.rows(out) == {link: 60}
+    assert rrd_export.rows(out) == {link: 60}
 
 
 def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) 
         wait_for(lambda: list(bus.query("fleet/@coordinator/plan")), "the hub knows who has the plan")
         with following_of(bus, lambda recording: recording.save(out)):
             pass
-    assert export.rows(out) == {"fleet/@coordinator/plan": 1}
+    assert rrd_export.rows(out) == {"fleet/@coordinator/plan": 1}
 
 
 def test_what_finds_no_room_is_counted(fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

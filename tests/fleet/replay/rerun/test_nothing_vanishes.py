@@ -14,12 +14,12 @@ from mcap.writer import IndexType
 from fleet.commands.replay import replay
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
-from fleet.replay.rerun import export
+from fleet.replay.rerun import rrd_export
 from tests.support.random_session import LINK, LOG, RANGE, UNKNOWN_LEVEL, Mixed, make
 
 
-def replayed(path: Path) -> export.Replayed:
-    return export.export(Session(path), path.with_suffix(".rrd"))
+def replayed(path: Path) -> rrd_export.Replayed:
+    return rrd_export.export(Session(path), path.with_suffix(".rrd"))
 
 
 @pytest.mark.parametrize("first", ["fleet.v1.Link", "fleet.v1.Range"])
@@ -36,7 +36,7 @@ def test_stray_message_hides_no_own_message_of_key(tmp_path: Path, first: str) -
         found = replayed(path)
         assert found.shown == {LINK: 50}
         assert found.left_out.counts == {(LINK, LeftOutCause.OTHER_TYPE): made.counts[LINK] - 50}
-        assert export.rows(path.with_suffix(".rrd")) == found.shown
+        assert rrd_export.rows(path.with_suffix(".rrd")) == found.shown
 
 
 def test_junk_is_named_by_its_cause(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_a_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None
     save = ["replay", str(path), "--save", str(path.with_suffix(".rrd"))]
     done = subprocess.run([sys.executable, "-c", program, *save], capture_output=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    assert export.rows(path.with_suffix(".rrd")) == {LOG: 2}
+    assert rrd_export.rows(path.with_suffix(".rrd")) == {LOG: 2}
 
 
 @pytest.mark.parametrize("options", [{"use_chunking": False}, {"index_types": IndexType.NONE}])
@@ -94,8 +94,8 @@ def test_a_part_counts_only_what_is_asked(tmp_path: Path) -> None:
     made.stray(LINK, RANGE)
     made.own("fleet/blue/state/mode", 4)
     made.close()
-    part = export.Part(cars=("red",))
-    found = export.export(Session(path), tmp_path / "x.rrd", part)
+    part = rrd_export.Part(cars=("red",))
+    found = rrd_export.export(Session(path), tmp_path / "x.rrd", part)
     assert (found.shown, found.left_out.by_key()) == ({LINK: 4}, {LINK: 1})
 
 
@@ -105,14 +105,14 @@ def check(directory: Path, seed: int) -> None:
         session = Session(path)
         recorded = Counter(row[0].channel.topic for row in session.rows())
         session.check()
-        found = export.export(session, path.with_suffix(".rrd"))
+        found = rrd_export.export(session, path.with_suffix(".rrd"))
     except NoSession:
         return
     named = found.left_out.by_key()
     assert {key: found.shown[key] + named.get(key, 0) for key in recorded} == recorded, seed
     assert not found.left_out.by_key().keys() - recorded, seed
     assert not found.shown.keys() - recorded, seed
-    assert export.rows(path.with_suffix(".rrd")).total() <= found.shown.total(), seed
+    assert rrd_export.rows(path.with_suffix(".rrd")).total() <= found.shown.total(), seed
     path.unlink()
     path.with_suffix(".rrd").unlink()
 

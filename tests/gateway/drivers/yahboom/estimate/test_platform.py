@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from gateway.drivers.yahboom.estimate.platform import EVIDENCE_FRAMES, OTHER_PROGRAM_FRAMES, PlatformDetector
 from gateway.drivers.yahboom.protocol.decoder import MISSING_END_SILENCE_S, Decoder
-from gateway.drivers.yahboom.protocol.events import Event
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.sim.model.factory import build
 from schemas.words import Mode
 from tests.support.truth import WORLDS, frame_of

@@ -4,9 +4,9 @@ import pytest
 
 from gateway.control.driver import Echo, Rejected, TextLine
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
 from gateway.drivers.yahboom.protocol.measurements import verdict_of
 from gateway.drivers.yahboom.protocol.sensors import Sensors, head_of
+from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import Cause
 from tests.support.vectors import ids, rows, wire
 

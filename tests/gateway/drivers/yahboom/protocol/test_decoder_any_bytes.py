@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import Event, ImuReading
 from gateway.drivers.yahboom.protocol.sensors import Sensors
+from gateway.drivers.yahboom.protocol.wire_events import Event, ImuReading
 
 PIECES = (
     b"$",

@@ -19,7 +19,7 @@ from fleet.commands.replay import replay
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import FLEET_FILE
 from fleet.replay import panels
-from fleet.replay.rerun import export, lenses
+from fleet.replay.rerun import lenses, rrd_export
 from schemas.messages import message_class
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import CARS, START_NS, make
@@ -39,11 +39,11 @@ def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]
 def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     path, counts = made
     out = tmp_path / "out.rrd"
-    assert export.export(Session(path), out).shown == counts
-    assert export.rows(out) == counts
+    assert rrd_export.export(Session(path), out).shown == counts
+    assert rrd_export.rows(out) == counts
     reader = rrc.RrdReader(out)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
-    assert recording.application_id == layout.application_id == export.APPLICATION
+    assert recording.application_id == layout.application_id == rrd_export.APPLICATION
     assert recording.recording_id == Session(path).name
     assert list(tmp_path.iterdir()) == [out]
 
@@ -52,7 +52,7 @@ def test_cars_have_the_colors_of_the_fleet_file(made: tuple[Path, Counter[str]],
     shutil.copy(made[0], tmp_path)
     cars = "cars: {red: {link: COM1, color: '#010203'}, blue: {link: COM2}}\n"
     (tmp_path / FLEET_FILE).write_text(cars, encoding="utf-8")
-    export.export(Session(tmp_path), tmp_path / "out.rrd")
+    rrd_export.export(Session(tmp_path), tmp_path / "out.rrd")
     found = set()
     for chunk in rrc.RrdReader(tmp_path / "out.rrd").store().stream():
         batch = chunk.to_record_batch()
@@ -63,7 +63,7 @@ def test_cars_have_the_colors_of_the_fleet_file(made: tuple[Path, Counter[str]],
 
 def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    export.export(Session(made[0]), out)
+    rrd_export.export(Session(made[0]), out)
     texts: list[str] = []
     lanes: dict[str, list[object]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
@@ -84,7 +84,7 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
 @pytest.mark.parametrize("topic", ["sim/truth", "sensor/pose"])
 def test_a_place_is_an_arrow_with_a_path(topic: str, made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    export.export(Session(made[0]), out)
+    rrd_export.export(Session(made[0]), out)
     key = f"fleet/red/{topic}"
     places, vectors, ways = [], [], []
     for chunk in rrc.RrdReader(out).store().stream():
@@ -105,7 +105,7 @@ def test_a_place_is_an_arrow_with_a_path(topic: str, made: tuple[Path, Counter[s
 
 def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    export.export(Session(made[0]), out)
+    rrd_export.export(Session(made[0]), out)
     lanes: dict[tuple[str, str], list[tuple[float, object]]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
         batch = chunk.to_record_batch()
@@ -176,7 +176,7 @@ def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None
     result = CliRunner().invoke(replay, [str(tmp_path), "--save", str(out)])
     assert result.exit_code == 0
     assert "is cut" in result.stderr
-    assert export.rows(out) == whole
+    assert rrd_export.rows(out) == whole
 
 
 def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +231,7 @@ def test_export_tells_damage_and_shows_whole_part(made: tuple[Path, Counter[str]
         result = CliRunner().invoke(replay, [str(path), "--save", str(out)])
         assert result.exit_code == 0, result.stderr
         assert "damaged" in result.stderr
-        shown = export.rows(out)
+        shown = rrd_export.rows(out)
         assert f"{shown.total()} messages" in result.stdout
         assert all(count <= made[1][key] for key, count in shown.items())
 
@@ -280,7 +280,7 @@ def test_ctrl_c_does_not_blame_the_recording(
     if where == "in a lens":
         monkeypatch.setattr(lenses, "_words", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        export.export(
+        rrd_export.export(
             Session(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
         )
     assert list(tmp_path.iterdir()) == []
@@ -294,7 +294,7 @@ def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
         writer.start()
         writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(NoSession, match="has no message"):
-        export.export(Session(tmp_path), tmp_path / "out.rrd")
+        rrd_export.export(Session(tmp_path), tmp_path / "out.rrd")
 
 
 def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:

@@ -7,18 +7,6 @@ from typing import Final
 from fleet.conditions import BadExpression, Expression
 from fleet.conditions import parse as parse_expression
 from fleet.conditions.functions import FUNCTIONS
-from fleet.policy.plan.models import (
-    BlinkEntry,
-    Condition,
-    ConditionEntry,
-    EffectEntry,
-    GivenBy,
-    PhaseEntry,
-    PlanEntry,
-    RoleEntry,
-    RuleEntry,
-    WithoutRole,
-)
 from fleet.policy.plan.plan import (
     OTHER_CARS,
     RESERVED,
@@ -31,13 +19,25 @@ from fleet.policy.plan.plan import (
     Role,
     Rule,
 )
+from fleet.policy.plan.plan_model import (
+    BlinkEntry,
+    Condition,
+    ConditionEntry,
+    EffectEntry,
+    GivenBy,
+    PhaseEntry,
+    PlanEntry,
+    RoleEntry,
+    RuleEntry,
+    WithoutRole,
+)
 from fleet.policy.snapshot import ALIASES, NAMES
 from gateway import drivers
 from schemas import keys
 from schemas.colors import parse_color
 from schemas.words import Mode
 from schemas.yaml_document.document import BadFile, Document
-from schemas.yaml_document.messages import Where, suggest
+from schemas.yaml_document.fault_words import Where, suggest
 
 BadPlan = BadFile
 """Raised for a plan with faults; the text has one line for each, with file, line and column."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.bus.service import MAX_QUEUED_HISTORY_QUERIES, MAX_QUEUED_QUERIES, CarService, Request
+from gateway.bus.car_service import MAX_QUEUED_HISTORY_QUERIES, MAX_QUEUED_QUERIES, CarService, Request
 from schemas import bus, keys
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.bus.history import BadRange, Bound, HistoryBuffer, Value, parse_range
+from gateway.bus.history_buffer import BadRange, Bound, HistoryBuffer, Value, parse_range
 from schemas.topics import HISTORY
 
 S = 1_000_000_000

@@ -6,8 +6,8 @@ import pytest
 
 from fleet.examples import EXAMPLES
 from fleet.policy.lint.lint import check
-from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Quantifier
+from fleet.policy.plan.plan_parser import parse
 from schemas.words import Mode
 from schemas.yaml_document.document import BadFile
 from tests.support.text_parts import has_parts

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.bus.publisher import ANSWERS_PER_SLICE, CarPublisher
+from gateway.bus.car_publisher import ANSWERS_PER_SLICE, CarPublisher
 from gateway.control.commands import Command, Drive, Find, SetMode, Stop
-from gateway.control.events import CommandRecord
+from gateway.control.control_output import CommandRecord
 from gateway.control.link_health import LinkHealth
 from gateway.drivers.yahboom.estimate.platform import PlatformDetector
 from gateway.drivers.yahboom.protocol.decoder import Decoder
-from gateway.drivers.yahboom.protocol.events import ImuReading
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.wire_events import ImuReading
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
 from schemas.words import Mode, Motion, Phase, Reason

@@ -7,7 +7,6 @@ import re
 from typing import Final
 
 from gateway.control.driver import Rejected
-from gateway.drivers.yahboom.protocol.events import ArmReading, Event, ImuReading
 from gateway.drivers.yahboom.protocol.sensors import (
     SENSOR_FIELDS,
     SENSOR_WORDS,
@@ -16,6 +15,7 @@ from gateway.drivers.yahboom.protocol.sensors import (
     read_sensors,
     sensors_matcher,
 )
+from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import Cause
 
 JOINT_MAX: Final = 180.0  # docs/reference/protocol.md#ranges: "ranges a reading must be in"

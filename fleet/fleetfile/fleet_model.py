@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
-from fleet.links import parse_fleet_link
+from fleet.fleet_links import parse_fleet_link
 from fleet.quota import Quota, parse_size
 from gateway import drivers
 from schemas import bus, keys
@@ -21,7 +21,7 @@ from schemas.links import BadLink
 from schemas.platform_name import AUTO, HEAD, HEAD_PATTERN, OPTIONS, VARIANTS
 from schemas.words import BatteryAction, Mode
 from schemas.yaml_document.document import Entry
-from schemas.yaml_document.messages import quote_value
+from schemas.yaml_document.fault_words import quote_value
 
 MIN_PIN_S: Final = 1.0
 """Minimum time before and after a pinned moment: the recorder writes what is pinned once a second."""

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.holds_and_leases import PersistedSafety
-from gateway.state_file import MAX_OTHER_LINKS, SafetyStateFile
+from gateway.safety_state_file import MAX_OTHER_LINKS, SafetyStateFile
 from schemas.links import car_link, parse_link
 from schemas.rights import Estop, FleetPause, Hold, Loan
 from schemas.state_dir import directory_of

@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.bus.history import BadRange, HistoryBuffer, Value
+from gateway.bus.history_buffer import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
 from gateway.control import battery
+from gateway.control.control_output import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, DriverClaims, Event
-from gateway.control.events import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.link_health import LinkHealth
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb

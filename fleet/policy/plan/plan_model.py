@@ -11,7 +11,7 @@ from schemas.words import Mode
 from schemas.yaml_document.document import Entry
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]
-"""Only parser.py checks names. If pydantic refused a key, faults in its value would stay hidden."""
+"""Only plan_parser.py checks names. If pydantic refused a key, faults in its value would stay hidden."""
 _Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from fleet.client import history
+from fleet.client import history_query
 from fleet.client.client import Fleet as Client
 from fleet.client.reading import Reading
 from fleet.recording.tools.csv_table import table
@@ -201,13 +201,13 @@ def test_whoever_reads_may_have_seen_enough(remembered: Remembered) -> None:
     ],
 )
 def test_how_a_history_is_asked_for(last: int | None, since_s: float | None, selector: str) -> None:
-    assert history.selector("fleet/red/sensor/range", last=last, since_s=since_s) == selector
+    assert history_query.selector("fleet/red/sensor/range", last=last, since_s=since_s) == selector
 
 
 @pytest.mark.parametrize(("last", "since_s"), [(None, None), (0, None), (None, 0.0), (None, float("nan"))])
 def test_a_history_of_nothing_is_refused(last: int | None, since_s: float | None) -> None:
     with pytest.raises(ValueError, match=r"needs last|not allowed"):
-        history.selector("fleet/red/sensor/range", last=last, since_s=since_s)
+        history_query.selector("fleet/red/sensor/range", last=last, since_s=since_s)
 
 
 def readings(count: int, newest_s: float = 0.0, topic: str = "sensor/range") -> list[Reading]:
@@ -225,12 +225,12 @@ def numbered(*seqs: int, key: str = "fleet/red/sensor/range", boot: str = "a") -
 def test_what_one_answer_lost_another_has() -> None:
     blue = numbered(7, key="fleet/blue/sensor/range", boot="b")
     first, second = numbered(1, 2, 5) + blue, numbered(2, 3, 4, 5, 6)
-    assert history.gaps(history.merge(first, [])) == {"fleet/red/sensor/range": 2}
-    assert history.merge(first, second) == blue + numbered(1, 2, 3, 4, 5, 6)
-    assert history.gaps(history.merge(first, second)) == {}
-    assert history.merge(first, second, last=3) == blue + numbered(4, 5, 6)
-    assert history.gaps(numbered(900) + numbered(3, boot="z")) == {}, "a gateway that began anew counts anew"
-    told = history.describe_shortfalls(numbered(1, 2, 5), NOW, last=3)
+    assert history_query.gaps(history_query.merge(first, [])) == {"fleet/red/sensor/range": 2}
+    assert history_query.merge(first, second) == blue + numbered(1, 2, 3, 4, 5, 6)
+    assert history_query.gaps(history_query.merge(first, second)) == {}
+    assert history_query.merge(first, second, last=3) == blue + numbered(4, 5, 6)
+    assert history_query.gaps(numbered(900) + numbered(3, boot="z")) == {}, "a gateway that began anew counts anew"
+    told = history_query.describe_shortfalls(numbered(1, 2, 5), NOW, last=3)
     (line,) = told
     assert line.startswith("fleet/red/sensor/range: 2 ")
 
@@ -249,7 +249,7 @@ def test_what_one_answer_lost_another_has() -> None:
     ],
 )
 def test_what_is_said_of_less(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:
-    found = history.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s)
+    found = history_query.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s)
     assert len(found) == len(told)
     assert all(has_parts(each, parts) for each, parts in zip(found, told, strict=True))
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fleet.links import parse_fleet_link
+from fleet.fleet_links import parse_fleet_link
 from schemas.links import SerialUrl, UsbUrl
 from schemas.platform_name import AUTO
 from schemas.process.stdio import printable
