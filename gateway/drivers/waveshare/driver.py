@@ -163,8 +163,7 @@ class WaveshareDriver(PlainDriver):
 
     def _forget_car(self, listen_until: float) -> None:
         """Forget everything that a reset of the car changes."""
-        self._setup = Setup.LISTEN
-        self._setup_at = listen_until
+        self._setup, self._setup_at = Setup.LISTEN, listen_until
         self._listen_until = listen_until + LISTEN_MAX_S
         self._booting = False
         """True if it prints the text of a boot."""
@@ -180,18 +179,16 @@ class WaveshareDriver(PlainDriver):
         """The settings that the car has not repeated yet."""
         self._tries = 0
         """Number of times that they were sent while feedback came."""
-        self._was_heard = False
+        self._was_heard = self._echoes = False
         self._feedback_at = float("-inf")
         self._in_rhythm = 0
         """Number of feedbacks in a row that came at the interval that we set."""
         self._turned = [False, False]
         """Whether each wheel was seen to turn in a drive of ours since the set-up."""
-        self._echoes = False
         self._wanted: set[bytes] = set()
         """The last lines of the tries of this stop, until one was repeated."""
         self._stands_since: float | None = None
-        self._stands = 0
-        self._unasked = 0
+        self._stands = self._unasked = 0
         self._stuck_since: float | None = None
         self._odometer_m: tuple[float, float] | None = None
         self._voltage: tuple[float, float] = (0.0, float("-inf"))
