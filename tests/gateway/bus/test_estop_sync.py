@@ -4,8 +4,10 @@ import asyncio
 from functools import partial
 from pathlib import Path
 
+import pytest
 import zenoh
 
+from gateway.bus import estop_sync
 from gateway.bus.estop_sync import MAX_SINGLE_QUERIES, EstopSync
 from gateway.control.holds_and_leases import PersistedSafety
 from schemas.bus import Bus, Handover, reply
@@ -50,6 +52,42 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
             asked.clear()
+    finally:
+        fleet.close()
+
+
+async def test_estop_is_merged_although_another_gateway_has_not_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over a full link the last answer of many may come seconds after the first one."""
+    monkeypatch.setattr(estop_sync, "SYNC_QUERY_TIMEOUT_S", 10 * PATIENCE_S)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    held: list[zenoh.Query] = []
+    learned: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            safety = pb.Safety(car="blue", estops=[pb.Estop(id="e1", by="mia", scope="fleet")])
+            reply(query, KEY, safety.SerializeToString(), SAFETY)
+
+    def unite(other: PersistedSafety, _: str) -> None:
+        learned.extend(estop.id for estop in other.estops)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as others, fleet.bus as opened:
+            loop = asyncio.get_running_loop()
+            others.queryable(KEY, Handover(loop, answer))
+            others.queryable("fleet/green/state/safety", Handover(loop, held.append))
+            await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=PATIENCE_S)))
+            neighbours = EstopSync(opened, "fleet", "red")
+            keeping = asyncio.ensure_future(neighbours.keep_synced(unite))
+            neighbours.on_tokens(dict.fromkeys(("blue", "green", *map(str, range(MAX_SINGLE_QUERIES))), True))
+            await asyncio.to_thread(wait_for, lambda: held and learned == ["e1"], "it is known")
+            for query in held:
+                with query:
+                    pass
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
     finally:
         fleet.close()
 
