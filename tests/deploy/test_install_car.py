@@ -29,7 +29,7 @@ def run(*words: str) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.mark.soak  # needs shellcheck
-def test_it_is_clean_for_any_posix_shell() -> None:
+def test_install_script_passes_shellcheck() -> None:
     done = subprocess.run(["shellcheck", "--shell=sh", str(SCRIPT)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "")
 
@@ -53,7 +53,7 @@ def test_wrong_use_makes_nothing(words: tuple[str, ...], tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_it_touches_nothing_that_it_has_not_made(tmp_path: Path) -> None:
+def test_install_and_uninstall_keep_foreign_files(tmp_path: Path) -> None:
     own = tmp_path / "opt" / "car-fleet" / "own"
     own.parent.mkdir(parents=True)
     own.touch()
@@ -62,7 +62,7 @@ def test_it_touches_nothing_that_it_has_not_made(tmp_path: Path) -> None:
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [own]
 
 
-def test_what_a_car_needs_is_as_the_package_says() -> None:
+def test_install_script_requirements_match_pyproject() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     said = by_name([*project["dependencies"], *extras["secure"], *extras["ble"]])

@@ -124,7 +124,7 @@ def test_a_mode_opens_and_stays_and_a_stop_stops(cars: KindsUnderTest) -> None:
 
 
 @pytest.mark.xdist_group("any_car")
-def test_what_a_car_can_show_is_found_out_and_said(cars: KindsUnderTest) -> None:
+def test_shows_stops_is_learned_for_each_kind_of_car(cars: KindsUnderTest) -> None:
     def found(kind: CarKind) -> str:
         return str(cars.fleet.state("health", kind.name).shows_stops)
 

@@ -41,7 +41,7 @@ def stages(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
     stage.close()
 
 
-def test_what_a_map_draws(stage: ConsoleStage) -> None:
+def test_map_shapes_floors_and_box(stage: ConsoleStage) -> None:
     page = stage.page()
     red, blue = [0, 0, 0, "", None, None], [5, 1, 0, "map", 0.1, 4]
     places = {car: call(page, "map-shapes", "placeOf", each) for car, each in {"red": red, "blue": blue}.items()}

@@ -297,7 +297,7 @@ PRESSES = [
 ]
 
 
-def test_who_presses_again_and_again_drives_once(stage: ConsoleStage) -> None:
+def test_time_line_joins_repeated_presses_into_one_drive(stage: ConsoleStage) -> None:
     page = stage.page()
     assert [each[0] for each in call(page, "spans", "around", PRESSES, [], 4000, 30_000)] == [1000]
     late = [*PRESSES, PRESSES[0] | {"begin": 25_000, "end": 26_000}]

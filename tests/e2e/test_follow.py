@@ -18,7 +18,7 @@ def _truth(sim: GatewayProcess) -> dict[str, tuple[str, tuple[float, float]]]:
 
 @pytest.mark.soak
 @pytest.mark.timeout(240)
-def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: FleetProcesses) -> None:
+def test_car_that_sees_lamp_leads_and_others_follow(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(EXAMPLES / "worlds" / "follow.yaml"))
     for car, link in zip(ROW, links, strict=True):
         fleet.gateway(link, car=car)

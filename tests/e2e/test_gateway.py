@@ -623,7 +623,7 @@ def test_a_port_in_use_is_said(fleet: FleetProcesses) -> None:
     assert f"by process {os.getpid()} (" in line
 
 
-def test_what_listens_there_is_no_router(tmp_path: Path, fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+def test_gateway_names_listener_that_is_no_zenoh_router(tmp_path: Path, fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     process = fleet.gateway("/dev/null", "--connect", tcp_car.link.replace("tcp://", "tcp/"))
     assert process.wait() == 1
     (line,) = process.stderr.splitlines()
@@ -646,7 +646,7 @@ def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: FleetProcesses,
     assert words in gateway.stderr, "the one before may have left it driving"
 
 
-def test_it_imports_nothing_that_it_does_not_need(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+def test_gateway_run_imports_no_unneeded_packages(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     code = (
         "import sys\nfrom gateway.cli import main\n"
         "try:\n    main()\nfinally:\n    import json\n"

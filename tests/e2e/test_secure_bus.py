@@ -94,7 +94,7 @@ def may(identity: str, verb: str, target: str) -> bool:
 
 
 @pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED, BLUE, service(Service.RECORDER)])
-def test_what_the_people_table_says_is_what_happens(identity: str, stage: SecureStage) -> None:
+def test_each_verb_is_allowed_or_refused_as_people_table_says(identity: str, stage: SecureStage) -> None:
     """The verbs that stop come last, since they hold and e-stop the cars. `arm` is refused before anybody is asked."""
     stage.free()
     wrong: list[str] = []
@@ -291,7 +291,7 @@ def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
             pass
 
 
-def test_whoever_is_revoked_gets_nothing_and_all_others_are_back(stage: SecureStage) -> None:
+def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) -> None:
     """Last in this file: eve is gone after it."""
 
     def refused() -> str:

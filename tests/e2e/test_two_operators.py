@@ -156,7 +156,9 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses
 @pytest.mark.parametrize(
     ("car", "verb", "more"), [("red", "mode", ("tracking",)), ("green", "servo", ("front", "90")), ("blue", "fan", ())]
 )
-def test_what_moves_a_car_can_be_taken(several: FleetProcesses, car: str, verb: str, more: tuple[str, ...]) -> None:
+def test_moving_car_can_be_taken_over_with_take(
+    several: FleetProcesses, car: str, verb: str, more: tuple[str, ...]
+) -> None:
     several.ready(car)
     ann = operator(several, "ann", "drive", car, "forward", "--for", LONG)
     wait_for(lambda: drives(several, "ann@", car), "ann drives")

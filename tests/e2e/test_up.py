@@ -78,7 +78,7 @@ def job(jobs: Up) -> Up:
 
 # The hub comes last: gateways may start one in its place, and ours then ends again.
 @pytest.mark.parametrize("name", ["@recorder", "@simulator", "@console", "red", "@hub"])
-def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) -> None:
+def test_up_restarts_only_the_killed_process(up: Up, name: str) -> None:
     before = {each.name: each.pid for each in up.processes()}
     os.kill(up.running(name), signal.SIGKILL)
     up.running(name, but=before[name])
@@ -93,7 +93,7 @@ def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) 
 @pytest.mark.parametrize(
     "name", ["@simulator", *(pytest.param(each, marks=pytest.mark.soak) for each in ("green", "@recorder", "@console"))]
 )
-def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
+def test_up_kills_and_restarts_hung_process(up: Up, name: str) -> None:
     pid = up.running(name)
     freeze(pid)
     wait_for(lambda: not _exists(pid), f"{name} is killed")

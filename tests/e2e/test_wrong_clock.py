@@ -25,7 +25,7 @@ def run(fleet: FleetProcesses, *words: str) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize("off_s", [-250, 250])
-def test_it_is_named_and_holds_up_no_stop(fleet: FleetProcesses, off_s: int) -> None:
+def test_wrong_clock_is_reported_and_stop_still_works(fleet: FleetProcesses, off_s: int) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     fleet.start("-c", A_WRONG_CLOCK, str(off_s), "run", "--car", "red", "--link", red, "--platform", "arduino")
     fleet.gateway(blue, car="blue")

@@ -47,6 +47,6 @@ def test_when_a_session_has_enough(quota: Quota, size: int, segments: int, over:
     assert quota.is_session_over(size, segments) is over
 
 
-def test_what_is_too_much_and_how_long_a_segment_is() -> None:
+def test_quota_excess_and_segment_length() -> None:
     assert (Quota(10).excess(9), Quota(10).excess(12), Quota().excess(12)) == (0, 2, 0)
     assert (Quota(10).segment_s(600.0), Quota(session=10).segment_s(600.0)) == (QUOTA_SEGMENT_S, 600.0)

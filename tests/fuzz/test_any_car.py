@@ -9,13 +9,13 @@ EPISODES = 100
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-def test_whatever_a_car_can_show_it_is_usable(part: int) -> None:
+def test_random_cars_are_usable_whatever_they_show(part: int) -> None:
     uses = [play(seed) for seed in range(part * EPISODES, (part + 1) * EPISODES)]
     assert not [use for use in uses if use.violations]
     assert sum(len(use.commands) for use in uses) > 4 * EPISODES
 
 
 @pytest.mark.parametrize("seed", [38195, 40198])
-def test_what_a_longer_search_of_uses_found(seed: int) -> None:
+def test_usability_regression_seeds(seed: int) -> None:
     """Cars that report by a timer, and block. A recovery began in the block of the `MODE00` before it."""
     assert not play(seed).violations

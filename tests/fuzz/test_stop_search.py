@@ -106,5 +106,5 @@ def test_no_stop_is_claimed_and_false(part: int) -> None:
 
 
 @pytest.mark.parametrize("plan", FOUND, ids=lambda plan: str(plan.seed))
-def test_what_a_longer_search_found(plan: EpisodePlan) -> None:
+def test_stop_search_regression_plans(plan: EpisodePlan) -> None:
     assert Episode(plan).play().violations == []

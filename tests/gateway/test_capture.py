@@ -119,7 +119,7 @@ def test_time_does_not_go_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "kind"), [(Path("/dev/zero"), "device"), (Path("/dev/null"), "device"), (Path("/"), "directory")]
 )
-def test_what_is_no_file_is_not_read(path: Path, kind: str) -> None:
+def test_capture_refuses_non_regular_file(path: Path, kind: str) -> None:
     with pytest.raises(BadCapture, match=f"this is a {kind}"):
         list(read(path))
 

@@ -121,7 +121,7 @@ def test_token_watch_sees_all_present_tokens(endpoint: str) -> None:
                 assert all(set(each.result()) == there for each in asked)
 
 
-def test_who_watches_one_fleet_sees_those_of_all(endpoint: str) -> None:
+def test_tokens_of_all_fleets_while_watching_one(endpoint: str) -> None:
     """Zenoh leaves watched tokens out of some answers, so one of two fleets was not there, and a stop missed it."""
     there = {"fleet/red", "two/red"}
     with bus.Bus.open(endpoint) as cars:

@@ -66,7 +66,7 @@ def test_in_whose_name(verb: str) -> None:
 
 
 @given(st.text(max_size=40), st.text(max_size=40), st.sampled_from(list(Rank)), st.sampled_from(list(COMMANDS)))
-def test_what_is_no_identity_speaks_for_nobody(identity: str, sender: str, kind: Rank, verb: str) -> None:
+def test_invalid_identity_speaks_for_nobody(identity: str, sender: str, kind: Rank, verb: str) -> None:
     if parse(identity) is None:
         assert not speaks_for(identity, sender, kind, verb)
 

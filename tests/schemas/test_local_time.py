@@ -36,5 +36,5 @@ def test_a_stored_time_is_told_in_the_local_zone() -> None:
 
 
 @pytest.mark.parametrize("at_ns", [-1, 10**21])
-def test_what_is_no_date_is_a_number(at_ns: int) -> None:
+def test_time_beyond_calendar_is_shown_as_number(at_ns: int) -> None:
     assert local_time.exact(at_ns) == local_time.with_offset(at_ns) == f"{at_ns} ns"

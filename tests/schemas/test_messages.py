@@ -49,7 +49,7 @@ def test_no_enum_is_on_the_wire() -> None:
         assert not [field.name for field in message.fields if field.enum_type]
 
 
-def test_what_was_not_measured_is_not_in_the_json() -> None:
+def test_unmeasured_field_is_left_out_of_json() -> None:
     known = json.loads(messages.to_json(pb.Range(no_echo=True)))
     assert "range_m" not in known
     assert known["no_echo"] is True

@@ -75,7 +75,7 @@ def numbers(samples: list[Sample]) -> list[int]:
     return [message.seq for message in messages_of(samples)]
 
 
-def test_whoever_reads_in_two_sessions_gets_each_message_once(endpoint: str) -> None:
+def test_reopened_reader_gets_each_message_once(endpoint: str) -> None:
     with Bus.open(endpoint) as sender, Bus.open(endpoint) as reader:
         got: list[Sample] = []
         reader.subscribe("fleet/**", got.append)
@@ -95,7 +95,7 @@ def test_whoever_reads_in_two_sessions_gets_each_message_once(endpoint: str) -> 
         assert Counter(numbers(read)) == Counter(seen)
 
 
-def test_whoever_publishes_in_two_sessions_loses_nothing(endpoint: str) -> None:
+def test_reopened_publisher_loses_nothing(endpoint: str) -> None:
     with Bus.open(endpoint) as sender, Bus.open(endpoint) as reader:
         got: list[Sample] = []
         reader.subscribe("fleet/**", got.append)
@@ -150,7 +150,7 @@ def test_a_token_lasts_and_a_watcher_hears_of_no_change(endpoint: str) -> None:
         assert watcher.tokens("fleet/*") == ["fleet/red"]
 
 
-def test_what_is_undeclared_stays_so_and_what_is_new_is_in_the_second_session(endpoint: str) -> None:
+def test_declarations_after_reopening(endpoint: str) -> None:
     with Bus.open(endpoint) as reader, Bus.open(endpoint) as sender:
         got: list[str] = []
         ended = reader.subscribe("fleet/red/**", lambda sample: got.append("ended"))

@@ -28,8 +28,8 @@ def test_a_command_counts_under_ones_own_identity_only(identity: str, stage: Sec
 
 @pytest.mark.soak
 @pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED])
-def test_what_the_people_table_says_is_what_happens(identity: str, stage: SecureStage) -> None:
-    test_secure_bus.test_what_the_people_table_says_is_what_happens(identity, stage)
+def test_each_verb_is_allowed_or_refused_as_people_table_says(identity: str, stage: SecureStage) -> None:
+    test_secure_bus.test_each_verb_is_allowed_or_refused_as_people_table_says(identity, stage)
 
 
 @pytest.mark.soak

@@ -34,7 +34,7 @@ def stopped(process: psutil.Process) -> bool:
     return bool(process.status() == psutil.STATUS_STOPPED)
 
 
-def test_what_is_paused_is_resumed(sleepers: list[psutil.Process]) -> None:
+def test_stress_resumes_paused_processes(sleepers: list[psutil.Process]) -> None:
     pauses = Pauses(random.Random(1), lambda: sleepers[:1])
     pauses.step(0.0)
     wait_for(lambda: stopped(sleepers[0]), "a pause")
@@ -57,7 +57,7 @@ def test_a_gateway_is_paused_for_less_than_a_stall() -> None:
     assert pauses.total_s <= 100 * CONTROL_PAUSE_S[1]
 
 
-def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -> None:
+def test_stress_leaves_stopped_process_stopped(sleepers: list[psutil.Process]) -> None:
     sleepers[0].send_signal(signal.SIGSTOP)
     wait_for(lambda: stopped(sleepers[0]), "it stands")
     pauses = Pauses(random.Random(1), lambda: sleepers[:1])
@@ -68,7 +68,7 @@ def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -
     assert stopped(sleepers[0])
 
 
-def test_who_is_spared_is_not_found(sleepers: list[psutil.Process]) -> None:
+def test_stress_spares_given_processes(sleepers: list[psutil.Process]) -> None:
     assert of_run(ONE_TEST, {sleepers[0].pid}) == sleepers[1:]
 
 

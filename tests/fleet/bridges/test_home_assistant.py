@@ -111,7 +111,7 @@ def test_state_is_repeated_before_expiry_at_most_once_a_second() -> None:
     assert count == 30 + 1 + 2
 
 
-def test_what_a_killed_bridge_left_is_taken_back() -> None:
+def test_availability_left_by_killed_bridge_is_set_offline() -> None:
     plan = HomeAssistant("fleet")
     assert list(plan.adopt(f"{RED}/availability", b"online")) == [Publication(f"{RED}/availability", "offline", True)]
     assert list(plan.adopt(f"{RED}/availability", b"offline")) == []

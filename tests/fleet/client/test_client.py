@@ -147,7 +147,7 @@ def test_person_stop_holds_car_against_coordinator_until_resume(client: Fleet, c
         wait_for(lambda: coordinator.car("green").mode("manual").ok, "the coordinator has it")
 
 
-def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
+def test_client_that_disconnects_while_driving_leaves_no_car_driving(cars: Cars) -> None:
     events: list[Any] = []
     cars.bus.subscribe("fleet/blue/event/command", lambda sample: events.append(sample.message()))
     with Fleet(cars.endpoint, sender="gone", kind="script") as client:

@@ -357,7 +357,7 @@ def test_wait_holds_per_key_and_stale_value_does_not_count() -> None:
     assert close().ends(reading("sensor/range", 1, 2.9, range_m=0.2), NOW)
 
 
-def test_what_is_said_when_the_time_is_over() -> None:
+def test_wait_timeout_error_words() -> None:
     waiting = close(1.5)
     assert str(waiting.timeout_error("fleet/red/sensor/range", 5.0, NOW)) == (
         "range_m < 0.3 did not hold for 1.5 s within 5 s: nothing came under fleet/red/sensor/range"

@@ -160,7 +160,7 @@ def test_doubted_car_is_finding_and_car_that_cannot_show_is_none() -> None:
         assert "RX" not in found.cause
 
 
-def test_what_was_learned_of_the_reports_is_a_fact() -> None:
+def test_doctor_describes_learned_report_interval() -> None:
     health = pb.Health(platform="arduino", shows_stops="yes", shows_stops_words="they show it", interval_s=1.25)
     health.blocks_s["mode_close"] = 1.0
     assert "1.25 s (spread 0.00 s, mode close +1.00 s)" in dict(describe(with_states(health=health)))["reports"]

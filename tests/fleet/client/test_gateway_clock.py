@@ -29,7 +29,7 @@ def test_one_message_tells_nothing_nor_does_the_same_again() -> None:
     assert clock.off_s is None
 
 
-def test_another_process_begins_anew() -> None:
+def test_clock_offset_starts_anew_with_new_gateway_process() -> None:
     clock = clock_of(240.0, [0.0, 0.0])
     clock.take("b", 2_000 * S, 2_000 * S)
     assert clock.off_s is None

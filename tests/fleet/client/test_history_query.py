@@ -111,7 +111,7 @@ def test_csv_has_units_in_header_and_follows_rfc_4180(remembered: Remembered) ->
     assert header[1].endswith(b",214")
 
 
-def test_what_a_gateway_no_longer_has_is_said(remembered: Remembered) -> None:
+def test_get_last_and_since_report_missing_history(remembered: Remembered) -> None:
     done = get(remembered, "red/sensor/range", "--last", "5000", "--json")
     assert (done.returncode, done.stdout.count(b"\n")) == (0, HISTORY)
     assert done.stderr.startswith(b"fleet: fleet/red/sensor/range: 1500 of 5000, ")
@@ -171,14 +171,14 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
         ("purple/sensor/range --since 1m", 1, 'No car "purple". … : red.'),
     ],
 )
-def test_what_cannot_be_had_is_told_in_one_line(remembered: Remembered, arguments: str, code: int, told: str) -> None:
+def test_get_history_errors_are_one_line(remembered: Remembered, arguments: str, code: int, told: str) -> None:
     done = get(remembered, *arguments.split())
     assert (done.returncode, done.stdout) == (code, b"")
     assert has_parts(done.stderr.decode(), told)
     assert done.stderr.count(b"\n") == 1
 
 
-def test_whoever_reads_may_have_seen_enough(remembered: Remembered) -> None:
+def test_get_survives_closed_pipe(remembered: Remembered) -> None:
     command = [sys.executable, "-m", "fleet.cli", "get", "red", "--last", "1500", "--connect", remembered.endpoint]
     with running(command) as process:
         assert process.stdout is not None
@@ -222,7 +222,7 @@ def numbered(*seqs: int, key: str = "fleet/red/sensor/range", boot: str = "a") -
     return [Reading(key, NOW + timedelta(seconds=seq), pb.Range(seq=seq, boot_id=boot)) for seq in seqs]
 
 
-def test_what_one_answer_lost_another_has() -> None:
+def test_merged_history_answers_fill_gaps() -> None:
     blue = numbered(7, key="fleet/blue/sensor/range", boot="b")
     first, second = numbered(1, 2, 5) + blue, numbered(2, 3, 4, 5, 6)
     assert history_query.gaps(history_query.merge(first, [])) == {"fleet/red/sensor/range": 2}
@@ -248,7 +248,7 @@ def test_what_one_answer_lost_another_has() -> None:
         (1500, 1500, 2000.0, []),  # all requested readings are there
     ],
 )
-def test_what_is_said_of_less(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:
+def test_history_shortfalls_in_words(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:
     found = history_query.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s)
     assert len(found) == len(told)
     assert all(has_parts(each, parts) for each, parts in zip(found, told, strict=True))

@@ -50,7 +50,7 @@ def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "
         ([safety("bot"), safety("bot", hold="mia", estop="mia")], "red was e-stopped by mia"),
     ],
 )
-def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None:
+def test_lease_monitor_detects_loss_from_safety_messages(heard: list[pb.Safety], lost: str) -> None:
     ours = LeaseMonitor("red", "bot")
     for message in heard:
         ours.on_safety(message)
@@ -124,7 +124,7 @@ def test_a_leased_car_drives_and_is_given_back(fleet: Fleet, cars: Cars) -> None
     assert holder(cars, "red") == ""
 
 
-def test_it_is_held_as_long_as_the_block_runs(fleet: Fleet, cars: Cars) -> None:
+def test_lease_is_renewed_until_block_ends(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease(), Fleet(cars.endpoint, sender="other") as other:
         for _ in range(4):
             with pytest.raises(TimeoutError):
@@ -158,7 +158,7 @@ def test_a_mode_ends_with_the_block(fleet: Fleet, cars: Cars) -> None:
     assert not driving(cars.sim, "red")
 
 
-def test_what_is_not_carried_out_raises(fleet: Fleet, cars: Cars) -> None:
+def test_refused_command_raises_not_carried_out(fleet: Fleet, cars: Cars) -> None:
     with pytest.raises(NotCarriedOut, match=r"green: refused: .*allowed are white.* \[bad_value\]"):
         fleet.car("green").light("pink").check()
     with fleet.car("green").lease() as car, pytest.raises(NotCarriedOut, match="allowed are white") as error:

@@ -59,12 +59,12 @@ def test_reading_staleness_by_topic_and_never_future() -> None:
     assert not event.stale(reading.time + timedelta(days=1)), "what has happened does not expire"
 
 
-def test_what_was_not_measured_is_not_in_the_value() -> None:
+def test_unmeasured_field_is_left_out_of_reading() -> None:
     assert "range_m" not in reading_of(sample(1)).as_dict()
 
 
 @pytest.mark.parametrize("encoding", ["", "application/json", "application/protobuf;fleet.v1.Nothing"])
-def test_what_is_no_message_of_ours_is_no_reading(encoding: str) -> None:
+def test_foreign_payload_raises_bad_payload(encoding: str) -> None:
     with pytest.raises((messages.BadPayload, KeyError)):
         reading_of(Sample(KEY, b"", encoding, 0, 0))
 

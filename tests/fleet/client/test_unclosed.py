@@ -56,7 +56,9 @@ def endpoint() -> Iterator[str]:
     ],
     ids=["script", "exception", "interactive", "asyncio", "exception in asyncio", "a thread goes on"],
 )
-def test_it_ends(endpoint: str, arguments: list[str], script: str, code: int, words: str) -> None:
+def test_script_with_unclosed_fleet_ends_with_resource_warning(
+    endpoint: str, arguments: list[str], script: str, code: int, words: str
+) -> None:
     with Bus.open(endpoint) as bus:
         done = run(endpoint, "-W", "always::ResourceWarning", *arguments, script=script)
         assert done.returncode == code, done.stderr

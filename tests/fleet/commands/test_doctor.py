@@ -178,5 +178,5 @@ def test_why_did_red_not_stop_at_that_time(session: Path, tmp_path: Path) -> Non
     ],
 )
 @pytest.mark.usefixtures("session")
-def test_what_cannot_be_explained_is_refused(tmp_path: Path, arguments: tuple[str, ...], code: int) -> None:
+def test_doctor_wrong_arguments_exit_codes(tmp_path: Path, arguments: tuple[str, ...], code: int) -> None:
     assert berlin(tmp_path, *arguments).returncode == code

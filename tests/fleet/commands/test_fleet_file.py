@@ -221,7 +221,7 @@ def test_the_schema_is_printed(command: Command) -> None:
     assert json.loads(command("schema").stdout)["title"] == "fleet file"
 
 
-def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, tmp_path: Path, port: Port) -> None:
+def test_init_writes_valid_file_of_found_links(command: Command, simulate: Any, tmp_path: Path, port: Port) -> None:
     simulate("a", "b")
     links = [f"{tmp_path}/{name}.tty" for name in "ab"]
     told = [word for link in [*links, port.path, "tcp://pi:8888"] for word in ("--link", link)]
@@ -352,7 +352,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     assert (rosa.name, rosa.platform, rosa.color) == ("rosa", "stm32+arm", "#ff00aa")
 
 
-def test_who_does_not_want_it_written_over_keeps_it(terminal: Callable[..., Terminal], tmp_path: Path) -> None:
+def test_init_keeps_existing_file_without_consent(terminal: Callable[..., Terminal], tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("mine\n")
     init = terminal("init")
     init.until("Overwrite it? [y/N]: ")

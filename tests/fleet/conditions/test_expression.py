@@ -64,7 +64,7 @@ READING = {"range_m": 0.25, "voltage_v": 7.4, "level": "low", "light.left": True
         ("(verdict == 'x') == light.left", None),
     ],
 )
-def test_what_a_condition_means(text: str, held: bool | None) -> None:
+def test_condition_value_for_reading(text: str, held: bool | None) -> None:
     assert parse(text, NAMES).value(READING.get) is held
 
 
@@ -115,7 +115,7 @@ def test_what_a_condition_means(text: str, held: bool | None) -> None:
         ),
     ],
 )
-def test_what_means_nothing_is_told_with_its_place(text: str, column: int, words: str) -> None:
+def test_invalid_condition_error_has_column(text: str, column: int, words: str) -> None:
     with pytest.raises(BadExpression) as bad:
         parse(text, NAMES)
     assert bad.value.column == column
@@ -189,7 +189,7 @@ def test_unmeasured_number_is_unknown_and_wrong_type_raises() -> None:
         (" and ".join(["(range_m < 1 or range_m > 2)"] * 12 + ["false"]), False),  # more alternatives than the limit
     ],
 )
-def test_what_can_never_be_true(text: str, never: bool) -> None:
+def test_contradictory_conditions_are_found(text: str, never: bool) -> None:
     assert is_contradictory(parse(text, NAMES)) is never
 
 
@@ -277,20 +277,20 @@ def _reference(node: Node, values: dict[str, Any]) -> Any:
 
 
 @given(_trees)
-def test_what_is_written_is_read_back_the_same(tree: Expression) -> None:
+def test_condition_text_round_trip(tree: Expression) -> None:
     read = parse(str(tree), NAMES)
     assert str(read) == str(tree)
     assert read == tree
 
 
 @given(_trees, _values)
-def test_its_value_is_that_of_a_reference(tree: Expression, values: dict[str, Any]) -> None:
+def test_condition_value_equals_reference_evaluation(tree: Expression, values: dict[str, Any]) -> None:
     held = tree.value(values.get)
     assert {True: 1, None: 0.5, False: 0}[held] == _reference(tree.root, values)
 
 
 @given(_trees, _values)
-def test_what_is_true_once_is_not_contradictory(tree: Expression, values: dict[str, Any]) -> None:
+def test_satisfied_condition_is_not_contradictory(tree: Expression, values: dict[str, Any]) -> None:
     if tree.value(values.get):
         assert not is_contradictory(tree)
 
@@ -313,7 +313,7 @@ def test_every_message_has_fields_with_values() -> None:
             assert value is None or isinstance(value, {float: int | float}.get(kind, kind)), f"{topic.name} {name}"  # type: ignore[arg-type]
 
 
-def test_what_was_not_measured_is_not_known() -> None:
+def test_condition_of_unmeasured_field_is_unknown() -> None:
     close = parse("range_m < 0.3", fields_of(pb.Range))
     assert close.value(value_in(pb.Range(range_m=0.2))) is True
     assert close.value(value_in(pb.Range(no_echo=True))) is None

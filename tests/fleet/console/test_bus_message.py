@@ -21,7 +21,7 @@ def test_message_with_unreadable_number_is_left_out(number: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "Red", "red\u200b", "\u202eder", "<b>red</b>", "r\u0435d", "red ", "r" * 33])
-def test_what_looks_like_the_name_of_a_car_is_none(name: str) -> None:
+def test_console_ignores_messages_under_invalid_car_names(name: str) -> None:
     assert is_shown("red")
     assert is_shown("@coordinator")
     assert not is_shown(name)

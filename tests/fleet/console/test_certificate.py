@@ -44,7 +44,7 @@ def test_world_readable_key_is_closed_and_damaged_key_named(tmp_path: Path) -> N
         ensure_certificate(["10.0.0.7"], NOW, tmp_path)
 
 
-def test_another_key_makes_another_certificate(tmp_path: Path) -> None:
+def test_new_key_makes_new_console_certificate(tmp_path: Path) -> None:
     made = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
     made.key_path.unlink()
     assert ensure_certificate(["10.0.0.7"], NOW, tmp_path).fingerprint != made.fingerprint

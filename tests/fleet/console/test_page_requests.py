@@ -18,7 +18,7 @@ def message(**fields: Any) -> PageMessage:
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "1", '"drive"', "[" * 100_000, '{"t": 1}', '{"t": "' + "x" * 20 + '"}', r'{"t": "\ud800"}']
 )
-def test_what_is_no_message_is_refused(text: str) -> None:
+def test_malformed_page_message_is_refused(text: str) -> None:
     with pytest.raises(BadPageMessage):
         _ = PageMessage.of(text).kind
 

@@ -12,7 +12,7 @@ async def nobody_answers() -> None:
     """Query a coordinator that does not exist."""
 
 
-async def test_what_keeps_a_coordinator_from_starting_is_reported(tmp_path: Path) -> None:
+async def test_console_reports_why_coordinator_does_not_start(tmp_path: Path) -> None:
     hub = FleetProcesses(free_endpoint(), tmp_path)
     file = tmp_path / "fleet.yaml"
     file.write_text("cars: {red: {link: sim, platform: stm32, roles: [Guide]}}")

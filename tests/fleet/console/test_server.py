@@ -537,7 +537,7 @@ def test_a_cookie_at_two_addresses_is_logged(stage: ServerStage) -> None:
 
 
 @pytest.mark.parametrize("where", ["loopback", "network"])
-def test_what_is_too_large_or_elsewhere_is_refused(stage: ServerStage, where: str) -> None:
+def test_server_refuses_too_large_requests_and_unknown_paths(stage: ServerStage, where: str) -> None:
     device = stage.device("large")
     own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
 
@@ -909,7 +909,7 @@ def test_plot_flood_keeps_one_question_and_newest_wins(stage: ServerStage) -> No
     assert asked == ["first", "last", "last"]
 
 
-def test_another_device_of_a_person_who_floods_stays_live(stage: ServerStage) -> None:
+def test_flood_from_one_device_leaves_other_device_of_person_live(stage: ServerStage) -> None:
     flooder, calm = stage.device("twotab"), stage.device("twotab")
     text = '{"t":"echo","n":1,"press":1}'
     with calm.socket() as page:

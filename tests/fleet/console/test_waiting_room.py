@@ -42,7 +42,7 @@ def used_up(waiting: WaitingRoom) -> WaitingRoom:
     return waiting
 
 
-def test_who_sends_nothing_loses_the_place_and_nobody_else_does() -> None:
+def test_full_waiting_room_drops_only_silent_connections() -> None:
     waiting = used_up(room())
     for number in range(5000):
         dropped = waiting.add(("flood", number), CLASS, 0.0)
@@ -94,7 +94,7 @@ def test_handshakes_that_do_not_end_take_so_many_places() -> None:
     assert waiting.take(0.0) is not None
 
 
-def test_who_says_nothing_for_long_is_ended() -> None:
+def test_waiting_room_expires_silent_connection() -> None:
     waiting = room()
     waiting.add("silent", CLASS, 0.0)
     waiting.add("ready", CLASS, 0.0)
@@ -123,7 +123,7 @@ EVENTS = st.lists(
 
 
 @given(EVENTS)
-def test_it_counts_right_whatever_happens(events: list[tuple[str, int, float]]) -> None:
+def test_waiting_room_counts_for_random_events(events: list[tuple[str, int, float]]) -> None:
     waiting, now, here, served = room(), 0.0, dict[Hashable, str](), 0
     for number, (kind, chosen, pause) in enumerate(events):
         now += pause

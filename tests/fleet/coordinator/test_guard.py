@@ -83,7 +83,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started
             processes.close()
 
 
-def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -> None:
+def test_coordinator_survives_and_logs_internal_error(started: Started) -> None:
     logged: list[Sample] = []
     started.processes.bus.subscribe("fleet/@coordinator/log", logged.append)
     started.broken = True
@@ -99,7 +99,7 @@ def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -
     started.goes_on("roles: {further: {mode: manual}}")
 
 
-def test_what_is_no_message_of_its_topic_is_survived(started: Started) -> None:
+def test_coordinator_survives_foreign_payloads(started: Started) -> None:
     bus = started.processes.bus
     bus.token(keys.car_token("fleet", "red"))
     bus.token("fleet/NO-CAR!")

@@ -117,7 +117,7 @@ def test_ten_thousand_names_are_decided_rarely_and_forgotten() -> None:
 
 @pytest.mark.parametrize("topic", REQUIRED_TOPICS)
 @pytest.mark.parametrize("sent", ["fleet.v1.Battery", "fleet.v1.Result", "foxglove.Log", "fleet.v1.Nothing"])
-def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> None:
+def test_observer_ignores_message_of_wrong_type(topic: str, sent: str) -> None:
     observer = FleetObserver()
     observer.on_token("red", 100.0, alive=True)
     observer.on_sample(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 100.0, None)
@@ -170,7 +170,9 @@ def test_late_hold_of_earlier_gateway_blocks_nobody() -> None:
         (pb.Motion(), pb.Safety(pauses=[pb.Pause(by="ann")]), None, "ann"),
     ],
 )
-def test_who_drives_or_keeps_a_car(motion: pb.Motion, safety: pb.Safety, driver: str | None, taken: str | None) -> None:
+def test_observer_knows_who_drives_or_holds_car(
+    motion: pb.Motion, safety: pb.Safety, driver: str | None, taken: str | None
+) -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     observer.on_sample(published("state/motion", motion), 101.0, None)

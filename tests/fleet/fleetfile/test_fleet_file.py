@@ -96,7 +96,7 @@ def test_pins_have_the_conditions_of_plans() -> None:
         ("{when: range_m < 1, during: 3s}", "2:27", " after, before, when."),
     ],
 )
-def test_what_is_wrong_about_a_pin(pin: str, place: str, fault: str) -> None:
+def test_pin_faults_in_fleet_file(pin: str, place: str, fault: str) -> None:
     (words,) = _faults(f"{ONE}pin: [{pin}]\n")
     assert f"f.yaml:{place}: error" in words
     assert has_parts(words, fault)
@@ -131,12 +131,12 @@ def test_people_have_a_rank_and_cars() -> None:
         ("{lee: {drive: [red]}}", "3:16: error: people.lee.drive: … mean drives?"),
     ],
 )
-def test_what_is_wrong_about_a_person(people: str, fault: str) -> None:
+def test_people_faults_in_fleet_file(people: str, fault: str) -> None:
     (found,) = _faults(f"{TWO}people: {people}\n")
     assert has_parts(found, fault)
 
 
-def test_what_is_not_said() -> None:
+def test_fleet_file_defaults() -> None:
     fleet = _fleet("cars: {red: {link: sim, platform: stm32}, b2: {link: COM3}}")
     assert (fleet.name, fleet.endpoint, fleet.plan, fleet.recordings, fleet.record) == ("fleet", None, None, None, True)
     assert (fleet.cars["b2"].platform, fleet.cars["b2"].roles, fleet.cars["b2"].limits) == ("auto", None, Limits())
@@ -144,7 +144,7 @@ def test_what_is_not_said() -> None:
     assert "arm" not in fleet.cars["b2"].capabilities
 
 
-def test_what_is_not_said_is_as_gateways_have_it() -> None:
+def test_battery_defaults_match_gateway_defaults() -> None:
     policy = battery.BatteryPolicy()
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
 

@@ -134,7 +134,7 @@ def test_a_gateway_gets_the_wildcards_of_others() -> None:
     assert allows(car("red"), "egress", "put", keys.command_key("fleet", "red", "drive", person("mia")))
 
 
-def test_what_is_no_identity_may_only_read() -> None:
+def test_unknown_identity_gets_read_rules_only() -> None:
     found: Any = access_control([("nobody", "nobody")])
     (policy,) = found["policies"]
     assert set(policy["rules"]) == {"read", "see drives", "answers"}

@@ -48,7 +48,7 @@ def test_only_the_hub_may_be_a_server(ca: certificate_authority.KeyPair) -> None
     ]
 
 
-def test_who_asks_does_not_choose_its_name(ca: certificate_authority.KeyPair, tmp_path: Path) -> None:
+def test_signed_certificate_ignores_name_in_request(ca: certificate_authority.KeyPair, tmp_path: Path) -> None:
     key, request = certificate_authority.new_request("service.supervisor")
     made = certificate_authority.sign_request(ca, request, "person.mia", NOW)
     (name,) = x509.load_pem_x509_certificate(made).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
@@ -59,7 +59,7 @@ def test_who_asks_does_not_choose_its_name(ca: certificate_authority.KeyPair, tm
 
 
 @pytest.mark.parametrize("request_bytes", [b"", b"junk", b"-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n"])
-def test_what_is_no_request_is_refused(ca: certificate_authority.KeyPair, request_bytes: bytes) -> None:
+def test_malformed_certificate_request_is_refused(ca: certificate_authority.KeyPair, request_bytes: bytes) -> None:
     with pytest.raises(BadRequestForCertificate):
         certificate_authority.sign_request(ca, request_bytes, "person.mia", NOW)
 

@@ -133,7 +133,7 @@ def test_damaged_rules_are_said(tmp_path: Path) -> None:
         _ = credentials.access_control
 
 
-def test_who_was_revoked_stays_so_if_another_one_joins_meanwhile(tmp_path: Path) -> None:
+def test_revocation_survives_concurrent_join(tmp_path: Path) -> None:
     """One program waits for eve to join. Another one revokes bob."""
     one = store_in(tmp_path)
     one.reserve(person("bob"), NOW)
@@ -146,7 +146,7 @@ def test_who_was_revoked_stays_so_if_another_one_joins_meanwhile(tmp_path: Path)
 
 
 @pytest.mark.parametrize("change", [HubStore.revoke, HubStore.reserve])
-def test_who_was_revoked_or_invited_again_meanwhile_gets_no_certificate(
+def test_no_certificate_after_concurrent_revoke_or_new_invitation(
     change: Callable[[HubStore, str], object], tmp_path: Path
 ) -> None:
     one = store_in(tmp_path)
@@ -157,14 +157,14 @@ def test_who_was_revoked_or_invited_again_meanwhile_gets_no_certificate(
         one.sign(request, person("eve"), NOW)
 
 
-def test_whoever_uses_the_hubs_computer_is_not_invited_away(tmp_path: Path) -> None:
+def test_user_of_hub_computer_cannot_be_invited(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     with pytest.raises(BrokenHub, match="another name"):
         store.reserve(ME, NOW)
     assert store.credentials.identity() == ME
 
 
-def test_what_another_computer_has_is_left_to_it_unless_taken(tmp_path: Path) -> None:
+def test_ensure_keeps_remote_identity_unless_taken(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     store.reserve(car("red"), NOW)
     assert not (tmp_path / "car.red.key").exists()

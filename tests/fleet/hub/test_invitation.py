@@ -128,7 +128,7 @@ def test_an_identity_that_is_none_is_refused(invitation: Invitation) -> None:
 @pytest.mark.parametrize(
     "body", [b"", b"junk", b"[]", b"{}", b'{"secret": 1}', b'{"secret": "x", "request": "?"}', b"x" * 20_000]
 )
-def test_what_is_no_request_is_refused_and_costs_no_guess(body: bytes, invitation: Invitation) -> None:
+def test_malformed_join_request_is_refused_and_costs_no_guess(body: bytes, invitation: Invitation) -> None:
     status, found = post(invitation, body)
     assert status in (400, 413)
     assert found["error"]

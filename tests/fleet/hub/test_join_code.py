@@ -19,7 +19,7 @@ def test_a_code_is_read_as_a_person_types_it(fingerprint: bytes, around: str, lo
 
 
 @given(SHA256, SHA256)
-def test_it_fits_only_its_own_authority(one: bytes, other: bytes) -> None:
+def test_join_code_fits_only_its_own_authority(one: bytes, other: bytes) -> None:
     assert JoinCode.new(one).fits(other) == (pin_of(one) == pin_of(other))
 
 

@@ -26,7 +26,7 @@ def _followed(for_s: float, course: list[tuple[float, bool | None]]) -> list[boo
         (0, [(0, None), (1, False)], [False, False]),
     ],
 )
-def test_what_is_so_for_long_enough_counts(
+def test_debounced_condition_counts_after_for_s(
     for_s: float, course: list[tuple[float, bool | None]], counts: list[bool]
 ) -> None:
     assert _followed(for_s, course) == counts

@@ -176,7 +176,7 @@ def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
     assert run.roles == {"red": "scout"}
 
 
-def test_what_a_car_refuses_another_does() -> None:
+def test_role_goes_to_another_car_after_refusal() -> None:
     run = PolicyRun(ONE, "green", "red", obey=False)
     run.at(0.0)
     run.change("green", refused=Refusal("tracking", "battery_low", "battery critical: 6.4 V", 0.2))
@@ -540,7 +540,7 @@ def _run(plan: Any, course: list[Any]) -> tuple[list[Any], PolicyRun]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from(PLANS), st.lists(changes, max_size=30))
-def test_whatever_happens(plan: Any, course: list[Any]) -> None:
+def test_decisions_are_deterministic_for_random_courses(plan: Any, course: list[Any]) -> None:
     told, _ = _run(plan, course)
     again, _ = _run(plan, course)
     assert told == again, "the same input gives the same decisions"

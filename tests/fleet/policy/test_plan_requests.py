@@ -102,7 +102,7 @@ def test_command_on_its_way_does_not_count_as_rest() -> None:
     "fields",
     [{"held_by": "bob"}, {"estopped_by": "bob"}, {"paused_by": "bob"}, {"lent_to": "bob"}, {"driven_by": "bob"}],
 )
-def test_what_a_person_has_taken_is_left_to_that_person(fields: dict[str, str]) -> None:
+def test_stopped_plan_leaves_car_taken_by_person_alone(fields: dict[str, str]) -> None:
     run = started(FLAT, "red")
     ask(run, "stop")
     run.asked.clear()

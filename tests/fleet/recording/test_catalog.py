@@ -90,7 +90,7 @@ def test_context_is_of_that_moment_and_stale_states_do_not_count(sessions: Path)
     assert rows[3] == {"range_m": 9.0, "mode": None, **dict.fromkeys(driven)}, "57 s later nothing is known"
 
 
-def test_who_drove_is_a_person_and_not_a_process(sessions: Path) -> None:
+def test_driver_column_names_person_without_process(sessions: Path) -> None:
     for column in ("driver", "owner"):
         rows = asked(
             sessions, f"SELECT {column}, count(*) n FROM sensor_range_context WHERE mode = 'manual' GROUP BY ALL"
@@ -498,7 +498,7 @@ def test_quota_deletes_session_while_tables_are_made(sessions: Path, monkeypatch
 
 
 @pytest.mark.parametrize("age_s", [0.0, STALE_PART_S + 60])
-def test_what_a_killed_question_left_goes_when_it_is_old(sessions: Path, age_s: float) -> None:
+def test_old_partial_tables_of_killed_query_are_removed(sessions: Path, age_s: float) -> None:
     part = sessions / "one" / f"{TABLES_PREFIX}0123-abc.part"
     part.mkdir()
     (part / "fleet.v1.Range.parquet").write_bytes(b"half")

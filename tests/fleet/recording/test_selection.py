@@ -73,7 +73,7 @@ def test_a_part_is_what_a_filter_of_the_whole_gives(
     assert list(session.messages(keys=keys, start_ns=start_ns, end_ns=end_ns)) == expected
 
 
-def test_what_is_not_needed_is_not_read(tmp_path: Path) -> None:
+def test_selection_reads_only_needed_chunks(tmp_path: Path) -> None:
     """All other chunks are damaged, so a reader that reads one reports it."""
     path = tmp_path / "0001.mcap"
     write(path)

@@ -43,7 +43,7 @@ def test_first_message_starts_stream_and_gap_before_is_missing() -> None:
     assert numbers.missing == 0
 
 
-def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
+def test_backfilled_message_is_not_written_again_when_it_arrives() -> None:
     numbers = SequenceTracker()
     live(numbers, 1)
     assert all(numbers.add_backfilled("a", number, number * 10) for number in (2, 3, 4))
@@ -92,7 +92,7 @@ def test_oldest_senders_are_forgotten_but_not_their_gaps() -> None:
 
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
-def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: int) -> None:
+def test_each_message_is_taken_once_for_random_loss_and_backfill(lost: set[int], seed: int) -> None:
     chance, numbers, taken = random.Random(seed), SequenceTracker(), []
     for number in range(1, 61):
         if number not in lost and (numbers.last.get("a") == number - 1 or numbers.add_live("a", number, number)):

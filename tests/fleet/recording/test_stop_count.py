@@ -108,7 +108,7 @@ def test_an_unreadable_session_has_no_number(recorded: Path) -> None:
     assert " -  " in in_process.fleet("sessions", recorded.parent).stdout
 
 
-def test_another_writers_schema_fails_nothing() -> None:
+def test_stop_count_survives_foreign_schema() -> None:
     file = FileDescriptorProto(name="other.proto", package="fleet.v1", syntax="proto3")
     field = file.message_type.add(name="CommandEvent").field.add(name="verb", number=1)
     field.type, field.label = FieldDescriptorProto.TYPE_INT32, FieldDescriptorProto.LABEL_OPTIONAL

@@ -59,7 +59,7 @@ def test_a_time_in_the_past_is_the_last_one(text: str, ago_s: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["noon", "today 12:30", "tomorrow 12:00", "2027-01-01", "25:00", "0001-01-01"])
-def test_what_is_not_over_is_refused(text: str) -> None:
+def test_time_ago_in_future_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not over|is not a time"):
         time_spec.ago_s(text, NOON)
 
@@ -90,7 +90,7 @@ def test_a_time_of_day_on_two_days_names_both() -> None:
 
 
 @pytest.mark.parametrize("text", ["11:58", "25:00", "12:60", "yesterday", "tomorrow 12:00", "noon", "12"])
-def test_what_is_no_time_of_the_session_is_refused(text: str) -> None:
+def test_span_outside_session_is_refused(text: str) -> None:
     try:
         begin_ns, _ = time_spec.span_ns(text, NOON * S, (NOON + 60) * S, NOON)
     except ValueError:

@@ -51,7 +51,7 @@ def test_gateway_is_not_killed_before_its_evidence_timeout() -> None:
     assert state.turn(200.0 + GATEWAY_GRACE_S, None) is RestartAction.KILL
 
 
-def test_what_dies_is_started_again_after_the_delay() -> None:
+def test_dead_process_is_restarted_after_delay() -> None:
     state = running()
     state.on_exit(-9, "", 101.0, 0.5)
     assert state.state is RunState.WAITING
@@ -113,7 +113,7 @@ def test_ending_process_has_its_time_however_silent() -> None:
         (200.0, 195.9, RestartAction.KILL),
     ],
 )
-def test_who_is_silent_hangs_if_it_could_have_been_heard(
+def test_silent_process_counts_as_hung_only_while_listening(
     now: float, listening_since: float | None, act: RestartAction
 ) -> None:
     state = running(100.0)
@@ -126,7 +126,7 @@ def test_who_is_silent_hangs_if_it_could_have_been_heard(
         assert state.words.startswith("hung"), "the reason stays the first"
 
 
-def test_who_starts_has_longer() -> None:
+def test_starting_process_has_longer_patience() -> None:
     state = ProcessState(PATIENCE, 0.0)
     state.on_started(100.0)
     assert state.turn(119.9, 0.0) is RestartAction.NOTHING
@@ -151,7 +151,7 @@ def test_begun_anew_is_no_fall() -> None:
     assert state.turn(111.0, 0.0) is RestartAction.START
 
 
-def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
+def test_process_served_elsewhere_is_not_started() -> None:
     state = ProcessState(PATIENCE, 0.0)
     state.served_elsewhere(1.0, "somebody else's")
     assert state.turn(100.0, 0.0) is RestartAction.NOTHING

@@ -62,7 +62,7 @@ class Shutdown:
         (1, [ONLINE, SHOWN, LOST], STOPPED, False),
     ],
 )
-def test_what_is_said_of_a_car(tmp_path: Path, code: int, states: list[Any], begins: str, bad: bool) -> None:
+def test_shutdown_words_of_each_end(tmp_path: Path, code: int, states: list[Any], begins: str, bad: bool) -> None:
     shutdown = Shutdown(tmp_path, code, states)
     assert shutdown.words.startswith(begins)
     assert shutdown.shutdown.not_stopped == (["red"] if bad else [])

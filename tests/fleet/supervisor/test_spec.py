@@ -210,7 +210,7 @@ def test_a_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
         (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", "/dev/sim")}), "sim (a simulated car)"),
     ],
 )
-def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:
+def test_reload_keeps_fields_that_need_restart(new: FleetSpec, words: str) -> None:
     found = compare(OLD, new)
     assert found.spec == OLD
     assert (found.words, found.needs_restart) == ((), (words,))

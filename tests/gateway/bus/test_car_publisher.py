@@ -108,7 +108,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Published]:
         fleet.close()
 
 
-def test_what_speaks_against_the_platform_is_published(published: Published) -> None:
+def test_platform_contradictions_are_published(published: Published) -> None:
     told = PlatformDetector(parse_platform("raspberry_pi"))
     assert published.told_health(told)["platform_contradictions"] == []
     for _ in range(3):

@@ -193,7 +193,7 @@ def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -
         ("fan", {"state": "fast"}, Reason.BAD_VALUE, " on, off, or none"),
     ],
 )
-def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reason: Reason, words: str) -> None:
+def test_malformed_command_refusals(verb: str, payload: Any, reason: Reason, words: str) -> None:
     error = refused(verb, payload)
     assert error.reason is reason
     assert has_parts(error.words, words)
@@ -258,11 +258,11 @@ def test_a_refused_stream_is_still_a_stream() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "text/plain", "application/json", "application/json;x"])
-def test_whatever_is_not_called_protobuf_is_read_as_json(encoding: str) -> None:
+def test_payload_without_protobuf_encoding_is_read_as_json(encoding: str) -> None:
     assert ask("drive", {"motion": "back"}, encoding).what == Drive(Motion.BACK)
 
 
-def test_another_verbs_message_is_refused() -> None:
+def test_message_of_other_verb_is_refused() -> None:
     words = refused("drive", pb.LedCommand(r=1).SerializeToString(), messages.encoding_of("fleet.v1.LedCommand")).words
     assert words.startswith("drive: ")
     assert "fleet.v1.LedCommand" in words

@@ -392,7 +392,7 @@ def test_a_drive_waits_for_the_recovery_at_the_connect() -> None:
 
 
 @pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING)], ids=str)
-def test_what_waits_too_long_for_a_busy_car_expires(what: Action, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queued_command_expires_for_busy_car(what: Action, monkeypatch: pytest.MonkeyPatch) -> None:
     """No car is busy for so long, so the limit is shortened."""
     monkeypatch.setattr(command_queue, "MAX_QUEUE_TIME_S", SHORT_S)
     desk = Workbench()
@@ -510,7 +510,7 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Workbench, what: Action) 
     ],
     ids=str,
 )
-def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: Action) -> None:
+def test_unsupported_action_is_never_sent(platform: str, what: Action) -> None:
     desk = Workbench(platform).ready()
     assert desk.ask(what, identity="it").reason is Reason.UNSUPPORTED
     desk.run(2.0)

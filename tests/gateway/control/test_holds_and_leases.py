@@ -52,7 +52,7 @@ def test_an_id_that_was_ended_is_latched_under_another_one() -> None:
     assert safety.estops == (again,)
 
 
-def test_what_is_kept_is_restored() -> None:
+def test_persisted_safety_is_restored() -> None:
     safety = Safety()
     safety.latch(estop("a"))
     safety.latch(estop("b"))

@@ -318,7 +318,7 @@ def test_pause_from_another_gateway_stops_and_ended_one_stays_ended(desk: Workbe
     assert desk.control.safety.pauses == ()
 
 
-def test_what_a_lead_stops_only_a_lead_ends(desk: Workbench) -> None:
+def test_only_lead_ends_hold_of_lead(desk: Workbench) -> None:
     desk.ask(Stop(), ANN)
     desk.ask(Stop(), TEACHER)
     desk.ask(Stop(), ANN)
@@ -436,6 +436,6 @@ def test_refusal_for_foreign_car_names_who_decides(desk: Workbench) -> None:
 
 
 @pytest.mark.parametrize("entry", ["", "Ann", "ann:boss", "ann@lab", ":lead", "a" * 33])
-def test_what_is_no_person_is_refused(entry: str) -> None:
+def test_malformed_person_entry_is_refused(entry: str) -> None:
     with pytest.raises(ValueError, match="write NAME, NAME:lead or NAME:other"):
         People.parse([entry])

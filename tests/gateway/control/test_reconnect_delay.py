@@ -21,7 +21,7 @@ def test_backoff_doubles_to_a_second_with_jitter(failures: int, longest_s: float
 
 
 @given(st.integers(1, 10_000), st.floats(0, 1))
-def test_it_is_never_nothing_and_never_long(failures: int, jitter: float) -> None:
+def test_reconnect_delay_bounds(failures: int, jitter: float) -> None:
     assert FIRST_DELAY_S / 2 <= delay_s(failures, jitter) <= MAX_RECONNECT_DELAY_S
 
 

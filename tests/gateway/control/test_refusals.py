@@ -186,7 +186,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
         assert at.queued < MAX_QUEUED_COMMANDS
 
 
-def test_who_moves_a_part_needs_the_lease() -> None:
+def test_actions_that_move_parts_need_lease() -> None:
     parts = [what for what in WHATS if isinstance(what, PartAction)]
     without = {type(what) for what in parts if not what.needs_lease}
     assert without == {Led, SetLight, Signal}

@@ -44,7 +44,7 @@ def test_a_drive_is_over_and_the_car_is_stopped_first(platform: str, *, counted:
 
 
 @pytest.mark.parametrize("counted", [False, True])
-def test_what_was_queued_never_goes_out(desk: Workbench, *, counted: bool) -> None:
+def test_queued_commands_expire_after_sleep(desk: Workbench, *, counted: bool) -> None:
     desk.ask(Led(1, 2, 3), identity="led", pump=False)
     desk.ask(Fan(), identity="fan", pump=False)
     desk.ask(FORWARD, identity="drive", pump=False)

@@ -59,7 +59,7 @@ def test_a_transition(state: CarTrust, event: TrustEvent) -> None:
 
 
 @each_transition
-def test_what_is_taken_from_a_transition(state: CarTrust, event: TrustEvent) -> None:
+def test_trust_transitions_state_motors_and_basis(state: CarTrust, event: TrustEvent) -> None:
     basis = Basis.SENT if state is CarTrust.STOPPED else None
     trust = TrustState(state, 1.0, "before", basis)
     changed = trust.apply(event, 2.0, "words")

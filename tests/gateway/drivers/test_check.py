@@ -318,7 +318,7 @@ def test_a_driver_that_floods_is_found() -> None:
     assert any("frames at one moment" in each for each in bench.faults)
 
 
-def test_what_must_not_be_measured_is_found() -> None:
+def test_check_finds_measurement_in_unmeasured_bytes() -> None:
     family = SimpleNamespace(**vars(tank), UNMEASURED=(b'{"v":0,"dist_cm":999}\n', b'{"v":7.9,"dist_cm":0}\n'))
     found = list(check.check_samples(cast("Family", family), "tank"))
     assert len(found) == 1

@@ -235,7 +235,7 @@ def test_a_mode_does_not_wait_for_what_lasts_and_ends_it() -> None:
     assert len(lamp.lit) == before
 
 
-def test_what_has_begun_expires_only_if_the_car_is_busy_for_too_long() -> None:
+def test_begun_lasting_action_expiry() -> None:
     log = CommandLog()
     queue = CommandQueue(log, Senders(), Safety.restore(PersistedSafety(), 0.0, 0))
     pending = Pending(Command("it", "whistle", Sender(), MINUTE), 0.0)

@@ -53,7 +53,7 @@ def drive(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     wait_for(is_driving, "it drives")
 
 
-def test_it_drives_and_stops(fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess) -> None:
+def test_gateway_over_ble_drives_and_stops(fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess) -> None:
     gateway = fleet.gateway(str(peer.url))
     fleet.ready()
     drive(fleet, sim)

@@ -142,7 +142,7 @@ async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
     assert await lost(link) == words, "closing it does not cover up why it was lost"
 
 
-async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
+async def test_bytes_before_link_end_are_read(peer: Peer) -> None:
     """A PTY is excluded: the system discards unread bytes when the port disappears."""
     link = await open_link(peer.url)
     if not isinstance(peer, PtyPeer):
@@ -193,7 +193,7 @@ async def test_a_read_that_is_cancelled_loses_nothing(link: Link, peer: Peer) ->
     assert await read(link, len(FRAME)) == FRAME
 
 
-async def test_it_opens_again_after_every_kind_of_end(peer: Peer) -> None:
+async def test_link_reopens_after_every_kind_of_end(peer: Peer) -> None:
     for number in range(6):
         link = await open_link(peer.url)
         peer.send(FRAME) if isinstance(peer, TcpPeer) else None
@@ -403,7 +403,7 @@ async def test_second_client_is_told_of_the_first(says: bytes, reset: bool) -> N
         (b'{"v":7.9,"dist_cm":42}\n', None),
     ],
 )
-async def test_what_a_bridge_says_before_it_closes_is_shown(says: bytes, shown: str | None) -> None:
+async def test_bridge_message_before_close_is_shown(says: bytes, shown: str | None) -> None:
     """A bridge such as ser2net tells a second client why it closes. None: no sentence, so no client of another."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = TcpUrl("127.0.0.1", server.getsockname()[1])
@@ -438,7 +438,7 @@ async def test_frames_do_not_wait_for_tcp_acknowledgement() -> None:
 
 
 @pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # over TCP, the car refuses
-async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
+async def test_open_link_is_exclusive(link: Link, peer: Peer) -> None:
     with pytest.raises(Busy, match="in use by "):
         await open_link(peer.url)
     await link.write(STOP)
@@ -463,7 +463,7 @@ async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
     peer.close()
 
 
-async def test_what_a_stuck_port_never_took_is_thrown_away(tmp_path: Path) -> None:
+async def test_close_of_stuck_port_discards_unsent_bytes(tmp_path: Path) -> None:
     """A stuck link discards unsent bytes when it closes. Otherwise the port is still full at its next opening.
 
     Bytes that the other end has taken stay there.

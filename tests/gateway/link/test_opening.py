@@ -114,7 +114,7 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("tcp://ho\nst:80", "cannot be printed"),
     ],
 )
-def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
+def test_bad_url_error_in_one_line(text: str, why: str) -> None:
     with pytest.raises(BadUrl) as caught:
         parse_url(text)
     words = str(caught.value)

@@ -146,7 +146,7 @@ def _raise(error: Exception) -> list[ListPortInfo]:
 
 
 @pytest.mark.parametrize("named", ["serial://?vid=2341&pid=0a0a", "PATH"])
-async def test_another_device_that_comes_in_its_place_is_not_commanded(named: str, tmp_path: Path, plug: Usb) -> None:
+async def test_other_usb_device_in_same_place_is_not_opened(named: str, tmp_path: Path, plug: Usb) -> None:
     peer = PtyPeer(tmp_path)
     url = parse_url(named.replace("PATH", path(peer)))
     device = str((tmp_path / "tty").resolve())
@@ -185,7 +185,7 @@ async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: P
     peer.close()
 
 
-async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> None:
+async def test_usb_error_names_url_and_port(tmp_path: Path, plug: Usb) -> None:
     gone = str(tmp_path / "ttyACM0")
     plug(UsbSerialPort(gone, 1, 2, "3"))
     with pytest.raises(CannotOpen) as caught:

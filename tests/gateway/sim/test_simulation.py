@@ -325,7 +325,7 @@ def started() -> Iterator[list[SimProcess]]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
+def test_simulator_announces_cars_takes_faults_and_ends_clean(
     number: signal.Signals, started: list[SimProcess], tmp_path: Path
 ) -> None:
     path = tmp_path / "red"
@@ -446,7 +446,7 @@ def test_faults_of_the_command_line_come_at_their_time(started: list[SimProcess]
         time.sleep(0.005)
 
 
-def test_it_ends_with_its_parent(started: list[SimProcess], tmp_path: Path) -> None:
+def test_simulator_ends_with_parent(started: list[SimProcess], tmp_path: Path) -> None:
     path = tmp_path / "red"
     child = [sys.executable, "-m", "gateway.sim", "--car", f"red:arduino:pty:{path}", "--no-truth", "--parent"]
     script = f"import os, subprocess, sys; subprocess.Popen([*{child!r}, str(os.getpid())]); sys.stdin.read()"
@@ -467,7 +467,7 @@ def test_it_ends_with_its_parent(started: list[SimProcess], tmp_path: Path) -> N
     parent.stdout.close()
 
 
-def test_it_ends_if_its_parent_ended_before_it_looked() -> None:
+def test_simulator_ends_if_parent_ended_earlier() -> None:
     """A supervisor that was killed while its processes started used to leave them behind."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()

@@ -86,7 +86,7 @@ def test_json_has_every_event_and_the_whole(command: Command, kept: Path) -> Non
     assert done.stderr == ""
 
 
-def test_what_speaks_against_the_platform_is_told_once(command: Command, kept: Path) -> None:
+def test_monitor_reports_platform_contradiction_once(command: Command, kept: Path) -> None:
     done = command("monitor", "--from", kept, "--platform", "raspberry_pi")
     assert "platform" in done.stdout.splitlines()[1]
     assert "2 times " in done.stderr

@@ -78,7 +78,7 @@ def _scan(command: Command, *links: str, more: tuple[str, ...] = ()) -> tuple[di
     return {each["url"]: each for each in found}, done
 
 
-def test_what_each_link_is(
+def test_scan_result_of_each_kind_of_link(
     simulate: Callable[..., Any], start: Started, command: Command, stranger: Callable[[], SpeakingStranger]
 ) -> None:
     _, links = simulate("red:arduino:pty", "blue:raspberry_pi:pty", "green:arduino:pty")

@@ -104,7 +104,7 @@ def test_why_a_text_is_no_frame(text: str, words: str) -> None:
         ([STOP, "--link", "ws://x"], "not a link"),
     ],
 )
-def test_what_is_not_sent_opens_no_link(command: Command, arguments: list[str], words: str) -> None:
+def test_send_refusals_open_no_link(command: Command, arguments: list[str], words: str) -> None:
     done = command("send", "--link", "/dev/nope", *arguments)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

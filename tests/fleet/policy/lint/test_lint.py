@@ -146,7 +146,7 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
     ],
 )
-def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> None:
+def test_lint_errors_of_impossible_plan_parts(text: str, part: str, told: str) -> None:
     errors = [each for each in check(parse(text), FLEET) if each.severity is Severity.ERROR]
     assert [each.part for each in errors if has_parts(each.words, told)] == [part], [str(each) for each in errors]
 
@@ -184,7 +184,7 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
         ),
     ],
 )
-def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
+def test_lint_warnings_of_partly_possible_plan_parts(text: str, told: str) -> None:
     found = check(parse(text), FLEET)
     assert [each.severity for each in found if has_parts(each.words, told)] == [Severity.WARNING], [
         str(each) for each in found

@@ -85,7 +85,7 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
         ),
     ],
 )
-def test_what_the_plan_never_lets_be_measured_is_an_error(
+def test_condition_on_never_measured_reading_is_error(
     text: str, told: str, fleet: dict[str, CarSnapshot] | None
 ) -> None:
     assert any(has_parts(each, told) for each in found(text, fleet, Severity.ERROR)), check(parse(text), fleet)
@@ -117,7 +117,7 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         ),
     ],
 )
-def test_what_may_be_measured_by_chance_is_a_warning(
+def test_condition_on_rarely_measured_reading_is_warning(
     text: str, fleet: dict[str, CarSnapshot] | None, told: str
 ) -> None:
     assert any(has_parts(each, told) for each in found(text, fleet, Severity.WARNING)), check(parse(text), fleet)
@@ -162,7 +162,7 @@ TWO_PATROLS = PATROL.replace("count: all", "count: 2")
         ),
     ],
 )
-def test_what_can_be_measured_is_let_alone(text: str, fleet: dict[str, CarSnapshot] | None) -> None:
+def test_condition_on_measured_reading_has_no_finding(text: str, fleet: dict[str, CarSnapshot] | None) -> None:
     assert [str(each) for each in check(parse(text), fleet) if "measured" in str(each) or "only" in str(each)] == []
 
 

@@ -160,7 +160,7 @@ def test_damaged_magic_is_still_an_mcap_file(original: Original, tmp_path: Path,
     assert list(Session(path).messages()) == original.until(length)
 
 
-def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> None:
+def test_false_chunk_headers_are_scanned_fast(tmp_path: Path) -> None:
     """The file has the head of a chunk every 57 bytes, each with a length almost to the end of the file."""
     path = tmp_path / "x.mcap"
     size = 2_000_000
@@ -174,7 +174,7 @@ def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> Non
     assert time.process_time() - began < 20
 
 
-def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
+def test_reader_reads_largest_recorded_messages(tmp_path: Path) -> None:
     chance = random.Random(1)
     path = tmp_path / "0001.mcap"
     segment = Segment(path, {})
@@ -327,9 +327,7 @@ def test_oversized_chunk_is_read_unless_it_is_a_bomb(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 37, 4096, 100_000])
 @pytest.mark.parametrize("filling", [b"\0", b"\xff", b"\x06"])
-def test_what_follows_the_end_is_said_and_hides_nothing(
-    original: Original, tmp_path: Path, count: int, filling: bytes
-) -> None:
+def test_bytes_after_mcap_end_are_reported(original: Original, tmp_path: Path, count: int, filling: bytes) -> None:
     """After a power failure, a file may end with zeros."""
     data = original.data + filling * count
     assert judge(original, data, len(original.data), tmp_path / "x.mcap") == list(original.messages)
@@ -346,7 +344,7 @@ def test_a_damaged_index_hides_no_chunk(original: Original, tmp_path: Path) -> N
         assert shown == list(original.messages), at
 
 
-def test_what_was_described_in_a_lost_chunk_is_said(original: Original, tmp_path: Path) -> None:
+def test_channels_of_lost_chunk_are_reported(original: Original, tmp_path: Path) -> None:
     """The file is cut, so no index repeats the channels. The first chunk describes two of the three."""
     begin, end = original.chunks[0]
     data = flipped(original.data, end - 2, 0)[: original.chunks[-1][1]]
@@ -420,7 +418,7 @@ def test_any_record_anywhere_gives_no_surprise(
         assert set(before) <= set(shown)
 
 
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_non_regular_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "directory.mcap").mkdir()
     os.mkfifo(tmp_path / "fifo.mcap")
     (tmp_path / "loop.mcap").symlink_to("loop.mcap")
@@ -437,7 +435,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
         Session(tmp_path)
 
 
-def test_what_must_not_be_read_is_said(original: Original, tmp_path: Path) -> None:
+def test_unreadable_file_is_reported(original: Original, tmp_path: Path) -> None:
     locked = tmp_path / "locked"
     locked.mkdir()
     file = tmp_path / "x.mcap"

@@ -81,7 +81,7 @@ def test_a_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> Non
     ("content", "words"),
     [(None, "There is no session at"), (b"", "is empty"), (b"not an mcap file", "is not an MCAP file")],
 )
-def test_what_is_no_session_says_why(content: bytes | None, words: str, tmp_path: Path) -> None:
+def test_no_session_error_names_path_and_reason(content: bytes | None, words: str, tmp_path: Path) -> None:
     path = tmp_path / "0001.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -121,7 +121,7 @@ def test_unknown_session_name_suggests_likely_one(tmp_path: Path) -> None:
     assert list(Session(tmp_path).messages("sensor/rnge")) == [], "without an index it is not known"
 
 
-def test_what_cannot_be_decoded_is_counted_by_cause(tmp_path: Path) -> None:
+def test_undecodable_messages_are_counted_by_cause(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "0001.mcap")
     made.own(RANGE, 3)
     made.put(RANGE, "fleet.v1.Range", b"\xff")

@@ -282,7 +282,7 @@ def test_a_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
     assert "--sessions" in errors
 
 
-def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_recorder_stop_start_and_mark_over_bus(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     process = record(endpoint, tmp_path)
     first = ready(process)
     marked = fleet(endpoint, "mark", "the cat came", "--by", "me")

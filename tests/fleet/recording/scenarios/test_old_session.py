@@ -17,7 +17,7 @@ SESSION = Path(__file__).parents[3] / "vectors" / "session-0.1"
 MESSAGES = 1023
 
 
-def test_it_is_whole_and_has_all_messages() -> None:
+def test_old_session_is_whole() -> None:
     done = fleet("sessions", "verify", SESSION)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"whole, {MESSAGES} messages" in done.stdout
@@ -39,7 +39,7 @@ def test_todays_decoder_and_policy_do_with_it_as_they_did(command: str, words: s
     assert words in done.stdout
 
 
-def test_it_gives_the_same_tables(tmp_path: Path) -> None:
+def test_old_session_exports_same_tables(tmp_path: Path) -> None:
     done = fleet("sessions", "export", SESSION, "--csv", tmp_path / "tables")
     assert done.returncode == 0, done.stderr
     tables = sorted((tmp_path / "tables").iterdir())

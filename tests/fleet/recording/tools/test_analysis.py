@@ -57,7 +57,7 @@ def test_every_type_is_the_table_that_an_export_writes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["sensor/range", "fleet.v1.Range", "Range", "*/sensor/range", "fleet/*/sensor/range"])
-def test_what_was_not_measured_is_null(made: Made, tmp_path: Path, name: str) -> None:
+def test_unmeasured_value_is_null_in_tables(made: Made, tmp_path: Path, name: str) -> None:
     modes_and_distances(made)
     session = Session(tmp_path)
     table = session.to_arrow(name)

@@ -51,7 +51,7 @@ WHOLE = ([("rosbag2", ABOUT)], [("floor.png", "image/png", 5, 6, PICTURE)])
         {"index_types": IndexType.CHUNK},
     ],
 )
-def test_what_is_made_has_the_attachments_and_metadata(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_recover_cut_and_rescue_keep_attachments_and_metadata(tmp_path: Path, options: dict[str, Any]) -> None:
     write(path := tmp_path / "x.mcap", **options)
     assert recover(Session(path), tmp_path / "recovered") == (5, "")
     assert found_in(tmp_path / "recovered" / "0001.mcap") == WHOLE

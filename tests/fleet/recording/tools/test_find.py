@@ -86,7 +86,7 @@ def test_one_known_part_decides_until_it_is_stale() -> None:
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_it_is_true_when_a_wait_ends(seed: int) -> None:
+def test_find_hits_when_wait_would_end(seed: int) -> None:
     """Each prefix of random readings with gaps has a hit exactly if `fleet wait --for` would have ended in it."""
     rng = random.Random(seed)
     for_s = rng.choice([0.0, 0.5, 2.0, 5.0])
@@ -324,7 +324,7 @@ def test_a_condition_that_held_for_too_short_reads_so(sessions: Path) -> None:
     assert "but for 2.0s" in find(NEAR, sessions, "--for", "5s").stderr
 
 
-def test_what_is_selected_is_searched(sessions: Path) -> None:
+def test_find_options_select_cars_and_times(sessions: Path) -> None:
     assert hits(NEAR, sessions, "--car", "blue") == []
     assert len(hits(NEAR, sessions, "--for", "2s")) == 1
     assert len(hits(NEAR, sessions, "--since", "2020-01-01")) == 1

@@ -81,7 +81,7 @@ HOLD = pb.Safety(hold=pb.Hold(by="bob@host-2"))
         (COMMAND, Lane.STOP, [(0, pb.CommandEvent(id="1", verb="mode", phase="sent"))], []),
     ],
 )
-def test_what_a_lane_shows(
+def test_lane_spans_of_each_topic(
     topic: str, lane: Lane, said: list[tuple[int, Any]], spans: list[tuple[int, int, str, bool]]
 ) -> None:
     lanes = Lanes()

@@ -66,7 +66,7 @@ def test_two_halves_with_something_in_common_are_the_whole(seed: int, whole: Ses
     assert made.description.origin["by"] == "merge"
 
 
-def test_what_is_lost_of_one_is_named(whole: Session, tmp_path: Path) -> None:
+def test_merge_names_what_damaged_session_lost(whole: Session, tmp_path: Path) -> None:
     rows = list(whole.rows())
     one, other = (part_of(whole, tmp_path / name, rows[at::2]) for at, name in enumerate(("one", "other")))
     segment = session_dir.segment(one.path, 1)

@@ -101,7 +101,7 @@ def test_ros2_pose_keeps_frame_and_error(tmp_path: Path) -> None:
     assert known == pytest.approx({0: 0.01, 7: 0.01})
 
 
-def test_what_ros_has_no_message_for_keeps_all_its_fields(tmp_path: Path) -> None:
+def test_message_without_ros_type_becomes_diagnostic_status(tmp_path: Path) -> None:
     row = ("fleet/red/state/mode", "fleet.v1.Mode", {"car": "red", "asked": "tracking", "candidates": ["a", "b"]})
     write_bag(Session(write(tmp_path / "one.mcap", row)).rows(), tmp_path / "bag")
     ((topic, _, _, message),) = read(tmp_path / "bag")

@@ -224,7 +224,9 @@ def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -
     ("content", "words"), [(None, "no 0001.mcap in it"), (b"", "is empty"), (b"a picture", "is not an MCAP file")]
 )
 @pytest.mark.parametrize("command", ["info", "verify", "recover", "export", "cut"])
-def test_what_is_no_session_is_one_line(command: str, content: bytes | None, words: str, tmp_path: Path) -> None:
+def test_sessions_commands_refuse_no_session_in_one_line(
+    command: str, content: bytes | None, words: str, tmp_path: Path
+) -> None:
     path = tmp_path / "x"
     path.mkdir()
     if content is not None:
@@ -305,7 +307,7 @@ def test_a_place_that_cannot_be_written_is_one_line(session: Path, tmp_path: Pat
     assert fleet("export", session).returncode == 2
 
 
-def test_who_is_interrupted_leaves_nothing_half_done(session: Path, tmp_path: Path) -> None:
+def test_interrupted_recover_leaves_no_partial_output(session: Path, tmp_path: Path) -> None:
     def interrupted(rows: object) -> object:
         yield from list(rows)[:50]  # type: ignore[call-overload]  # any iterable
         raise KeyboardInterrupt

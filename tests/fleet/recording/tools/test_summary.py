@@ -62,7 +62,7 @@ def test_recovered_session_says_how_much_is_missing(tmp_path: Path) -> None:
         assert "3 messages are missing" in found.words
 
 
-def test_what_lost_nothing_when_it_was_recovered_is_whole(tmp_path: Path) -> None:
+def test_recovered_session_without_loss_is_whole(tmp_path: Path) -> None:
     old, new = tmp_path / "old", tmp_path / "new"
     write(old, [[1, 2], [3]])
     (old / "0001.mcap").write_bytes((old / "0001.mcap").read_bytes()[:-8])
@@ -94,7 +94,7 @@ def test_a_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:
     assert "the recorder's clock went back by 3599.0 s" in run("info", tmp_path / "0True").output
 
 
-def test_what_is_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
+def test_session_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
     path = tmp_path / "s"
     segment = write(path, [[1, 2]], closed=False, cut=False)
     ended = threading.Event()

@@ -69,7 +69,7 @@ def test_stops_pin_their_minute() -> None:
     )
 
 
-def test_what_came_late_pins_its_time_and_its_coming() -> None:
+def test_late_message_pins_from_its_stamp_to_its_arrival() -> None:
     of = watch("range_m < 0.3")
     message = pb.Range(range_m=0.2)
     message.stamp.FromNanoseconds(START_NS)

@@ -130,7 +130,7 @@ def test_the_same_plan_shows_no_difference(recorded: Path) -> None:
     assert summary["begun_before"] == 0
 
 
-def test_another_plan_shows_where_and_why(recorded: Path, tmp_path: Path) -> None:
+def test_plan_try_shows_first_difference_with_readings(recorded: Path, tmp_path: Path) -> None:
     plan = tmp_path / "other.yaml"
     plan.write_text(OTHER, encoding="utf-8")
     result = run("plan", "try", recorded, plan, "--json")
@@ -158,7 +158,7 @@ def test_a_state_is_shown_in_plain_words(kind: str, decided: str, words: str) ->
     assert str(RecordedDecision(0, kind, decided, "")) == words
 
 
-def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:
+def test_redecode_of_replanned_session_has_no_difference(recorded: Path) -> None:
     result = run("sessions", "redecode", recorded)
     assert result.exit_code == 0, result.output
 

@@ -116,9 +116,7 @@ def test_all_of_it_comes_again_as_it_was(fleet: FleetProcesses, session: Path) -
 
 
 @pytest.mark.parametrize(("seed", "for_s"), [(1, 0.0), (2, 2.0), (3, 5.0)])
-def test_who_watches_it_sees_the_hits_that_find_finds(
-    seed: int, for_s: float, fleet: FleetProcesses, tmp_path: Path
-) -> None:
+def test_watch_of_replay_hits_when_find_does(seed: int, for_s: float, fleet: FleetProcesses, tmp_path: Path) -> None:
     chance, at_s = random.Random(seed), 0.0
     made = Made(tmp_path / "made.mcap", InOrder)
     for _ in range(60):
@@ -146,7 +144,7 @@ def test_who_watches_it_sees_the_hits_that_find_finds(
     assert all(any(begin - 1e-3 <= at <= end + 1e-3 for at in ended) for begin, end in spans)
 
 
-def test_it_looks_like_a_fleet_and_takes_no_command(fleet: FleetProcesses, session: Path) -> None:
+def test_player_looks_like_fleet_and_takes_no_command(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--loop", "--rate", "20")
     wait_for(lambda: len(fleet.bus.tokens("fleet-replay/*")) == 3, "the cars are there")
     wait_for(lambda: fleet.get("fleet-replay/*/state/mode"), "something was said")
@@ -193,7 +191,7 @@ def test_a_part_of_it_over_and_over(fleet: FleetProcesses, session: Path) -> Non
     assert first > second  # only the first round begins at --offset
 
 
-def test_what_was_said_before_the_beginning_can_be_asked_for(fleet: FleetProcesses, session: Path) -> None:
+def test_player_answers_with_values_from_before_offset(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--offset", "4500ms", "--rate", "0.1")
     # A battery is measured in mode manual only: until second 2.
     battery = wait_for(lambda: fleet.get("fleet-replay/red/sensor/battery"), "the battery")

@@ -94,7 +94,7 @@ def test_cars_have_the_colors_of_the_running_fleet(tmp_path: Path) -> None:
             assert following._drawing.color("blue", 0) == car_color("blue", 0), "what is no color changes nothing"
 
 
-def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_view_writes_all_bus_messages_to_rrd(fleet: FleetProcesses, tmp_path: Path) -> None:
     out = tmp_path / "now.rrd"
     with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
         publish(fleet.bus, "red", range(50))
@@ -160,7 +160,9 @@ def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) 
     assert rrd_export.rows(out) == {"fleet/@coordinator/plan": 1}
 
 
-def test_what_finds_no_room_is_counted(fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_counts_messages_dropped_from_full_queue(
+    fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live, "MAX_WAITING_MESSAGES", 10)
     out = tmp_path / "now.rrd"
     with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:

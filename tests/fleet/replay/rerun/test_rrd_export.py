@@ -61,7 +61,7 @@ def test_cars_have_the_colors_of_the_fleet_file(made: tuple[Path, Counter[str]],
     assert found >= {"010203ff"}, found
 
 
-def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+def test_rrd_texts_and_lanes_match_messages(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
     rrd_export.export(Session(made[0]), out)
     texts: list[str] = []

@@ -44,7 +44,7 @@ def test_gaps_within_between_and_after_batches_end_lanes() -> None:
     assert drawn(ends, 40) == []
 
 
-def test_what_is_heard_often_enough_does_not_end() -> None:
+def test_lane_of_frequent_messages_does_not_end() -> None:
     ends = StaleStates()
     for start in range(0, 60, 6):
         ends.add(LINE, "sensor/line", batch(start, start + 3))
@@ -69,7 +69,7 @@ def test_live_staleness_is_told_once_and_again_after_news() -> None:
     assert drawn(ends, 12) == [8 + STALE_S]
 
 
-def test_what_is_never_stale_never_ends() -> None:
+def test_lane_of_events_never_ends() -> None:
     ends = StaleStates()
     ends.add("/fleet/red/event/command", "event/command", batch(1))
     assert drawn(ends, 1000) == []

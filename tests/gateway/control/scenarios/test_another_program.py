@@ -265,7 +265,7 @@ def test_a_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
     assert pair.control.driver.model.learned.opened_as == "", "readings have shown mode 0"
 
 
-def test_another_head_is_used_as_soon_as_it_is_known() -> None:
+def test_new_frame_head_is_used_at_once() -> None:
     pair = Pair(told="arduino+head=TANK", start_s=2.0)
     pair.car.feed(b"$4WD,MODE21#", pair.now)
     pair.run(4.0, linked=False)

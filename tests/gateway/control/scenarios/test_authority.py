@@ -125,7 +125,7 @@ def test_an_e_stop_at_rest_is_carried_out_too(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- lease
 
 
-def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
+def test_drive_lease_lasts_two_seconds_longer(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 3.0), SCRIPT)
     other = Sender("other")
     refused = desk.ask(Drive(Motion.LEFT), other)
@@ -248,7 +248,7 @@ def test_held_stick_does_not_resume_after_stop_of_another(desk: Workbench) -> No
     assert desk.ask(stick, SCRIPT, streamed=True).status is QUEUED, "let go, and taken again"
 
 
-def test_what_only_continues_a_drive_begins_none(desk: Workbench) -> None:
+def test_continues_drive_does_not_begin_one(desk: Workbench) -> None:
     held = Drive(Motion.FORWARD, 0.5, continues=True)
     assert desk.ask(held, PERSON, streamed=True).reason is Reason.LAPSED, "nothing to continue"
     desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True)

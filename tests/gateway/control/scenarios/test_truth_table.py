@@ -68,7 +68,7 @@ def test_truth_table_is_complete_and_says_what_is_unknowable() -> None:
 
 @each_world
 @pytest.mark.parametrize("row", TABLE, ids=names)
-def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str) -> None:
+def test_mode_estimate_after_foreign_mode_change(row: Row, world: str) -> None:
     asked, true = modes(row)
     pair = car_in(asked, world, seed=TABLE.index(row))
     assert pair.control.driver.model.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)

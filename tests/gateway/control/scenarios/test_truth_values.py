@@ -134,7 +134,7 @@ def test_filler_is_never_published_whatever_happens(
 
 @pytest.mark.parametrize("mode", MEASURED)
 @pytest.mark.parametrize("world", WORLDS)
-def test_what_is_measured_is_published(mode: Mode, world: str) -> None:
+def test_measured_values_of_each_mode_are_published(mode: Mode, world: str) -> None:
     pair = car_in(mode, world, seed=5)
     source = Source(pair)
     pair.run(10.0)

@@ -126,7 +126,7 @@ def test_open_web_page_of_car_without_encoders_is_named() -> None:
     assert "other_program" in [each.code for each in episode.logs]
 
 
-def test_its_own_questions_and_settings_name_no_other_program() -> None:
+def test_own_setup_frames_are_no_other_program() -> None:
     episode = ready("wave_rover")
     episode.ask(Drive(Motion.FORWARD, 2.0))
     episode.run(30.0)

@@ -50,7 +50,7 @@ def test_capture_waits_for_host_and_does_not_restart() -> None:
     assert played.next_event() == 200.5
 
 
-def test_it_hears_nothing_and_knows_nothing() -> None:
+def test_capture_car_ignores_commands() -> None:
     played = CaptureCar(PIECES, now=0.0)
     played.feed(b"$0,0,0,0,0,0,0,0,0#", 0.1)
     played.drop_link(0.2)

@@ -6,7 +6,7 @@ from tests.gateway.sim.strangers import BACK, MODE00, PTZ90, RUN, STOP, WHISTLE,
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-async def test_it_knows_the_motions_and_sends_nothing(tcp: bool) -> None:
+async def test_course_car_drives_and_sends_nothing(tcp: bool) -> None:
     car = virtual("course", tcp=tcp)
     for frame, motors in [
         (RUN, (128, 128)),
@@ -35,7 +35,7 @@ async def test_other_frame_ends_course_program_with_motors_unchanged(frame: byte
     assert car.truth.driving
 
 
-async def test_it_starts_again_after_a_brown_out() -> None:
+async def test_course_car_restarts_after_brown_out() -> None:
     car = virtual("course")
     await car.write(RUN)
     await car.write(MODE00)

@@ -454,7 +454,7 @@ async def test_same_seed_same_bytes_same_car() -> None:
     assert (await life(3))[0] != (await life(4))[0]
 
 
-async def test_it_does_not_matter_how_often_one_looks() -> None:
+async def test_firmware_is_independent_of_time_step() -> None:
     seen = []
     for step in (0.001, 0.5):
         car = virtual()

@@ -295,7 +295,7 @@ def test_nobody_is_inside_a_wall_or_another(
 
 @settings(max_examples=200, deadline=None)
 @given(lively_worlds(), st.tuples(places, places), st.tuples(places, places), st.floats(0, 20))
-def test_who_sees_is_seen(
+def test_line_of_sight_is_symmetric(
     scene: tuple[World, list[Pose]], a: tuple[float, float], b: tuple[float, float], now: float
 ) -> None:
     world, starts = scene

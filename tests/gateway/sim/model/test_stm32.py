@@ -187,7 +187,7 @@ async def test_a_brown_out_boots_and_the_timer_starts_again() -> None:
     assert len(await report_times(car, 2.0)) == 2
 
 
-async def test_its_options_print_after_the_report() -> None:
+async def test_stm32_options_print_after_report() -> None:
     car = virtual("stm32", options="arm imu")
     await car.write(b"$4WD,ServoJ110,J220,J330,J440,J550,J660#")
     await car.wait(1.4)

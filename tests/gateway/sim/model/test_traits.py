@@ -171,7 +171,7 @@ async def test_three_cells() -> None:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-async def test_another_head_counts_both_ways(platform: str) -> None:
+async def test_other_frame_head_in_both_directions(platform: str) -> None:
     car = virtual(platform, traits=CarTraits(head="BALA"))
     await car.write(b"$BALA,PTZ90#")
     await car.wait(0.2)

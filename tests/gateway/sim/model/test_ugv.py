@@ -80,7 +80,7 @@ def test_too_great_numbers_keep_old_speed_and_feed_dead_man() -> None:
     "line",
     ['{"T":1,"L":0.2}\n', '{"T":1,"L":"a","R":0.2}\n', "{T:1}\n", '{"T":999,"L":1,"R":1}\n', f"{'x' * 300}{FORWARD}"],
 )
-def test_what_is_wrong_is_ignored_without_a_word(line: str) -> None:
+def test_ugv_ignores_malformed_lines_silently(line: str) -> None:
     host = Host("wave_rover").send('{"T":143,"cmd":0}\n')
     host.heard = b""
     host.send(line).run(0.5)

@@ -145,7 +145,7 @@ BAD = [
 ]
 
 
-def test_what_cannot_be_played_is_one_line(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_replay_errors_are_one_line(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = kept.read_text().splitlines(keepends=True)[0]
     for name, text in {
         "empty": "",

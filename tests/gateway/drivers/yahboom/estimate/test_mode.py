@@ -61,7 +61,7 @@ def test_before_anything_is_asked_nothing_is_said() -> None:
 
 
 @pytest.mark.parametrize("mode", SHAPES)
-def test_its_own_shape_confirms_a_mode(mode: Mode) -> None:
+def test_matching_reading_confirms_mode(mode: Mode) -> None:
     truth = asked(mode)
     truth.on_reading(reading(SHAPES[mode], 3.0))
     assert (truth.verdict, truth.inferred, truth.confirmed, truth.candidates) == (CONFIRMED, mode, mode, (mode,))

@@ -32,7 +32,7 @@ def hear(truth: PlatformDetector, *frames: str) -> list[str]:
 
 
 @pytest.mark.parametrize("row", CASES, ids=ids(CASES))
-def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
+def test_platform_detection_vectors(row: dict[str, str]) -> None:
     """Vectors: frames in order with their counts, the contradictions that follow, and the platform of `auto`."""
     auto = PlatformDetector(parse_platform("unknown"), auto=True)
     told = {name: PlatformDetector(parse_platform(name)) for name in ("arduino", "stm32", "raspberry_pi", "unknown")}

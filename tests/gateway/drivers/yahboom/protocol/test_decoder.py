@@ -218,7 +218,7 @@ class TestEcho:
         assert decoder.feed(self.SENT, 3.0) == [Echo(self.SENT, 3.0)]
         assert isinstance(decoder.feed(self.SENT, 3.01)[0], ArmReading)
 
-    def test_it_may_come_in_pieces_and_more_than_once(self) -> None:
+    def test_echo_in_pieces_and_repeated(self) -> None:
         decoder = Decoder()
         decoder.sent(self.SENT, 1.0)
         events = [event for byte in self.SENT * 2 for event in decoder.feed(bytes([byte]), 1.5)]
@@ -237,7 +237,7 @@ class TestEcho:
         echoes = decoder.feed(b"#\r\n$4WD,MODE00#", 1.1)
         assert echoes == [Echo(b"#", 1.1), Echo(b"$4WD,MODE00#", 1.1)]
 
-    def test_what_was_sent_is_forgotten(self) -> None:
+    def test_sent_frames_are_forgotten_after_a_while(self) -> None:
         decoder = Decoder()
         for i in range(10_000):
             decoder.sent(b"$4WD,PTZ%d#" % i, i * 0.001)

@@ -31,7 +31,7 @@ def sensors(raw: bytes, ended: str) -> Sensors:
 
 @pytest.mark.parametrize("platform", Platform)
 @pytest.mark.parametrize("row", PLATFORMS, ids=ids(PLATFORMS))
-def test_what_a_platform_knows(row: dict[str, str], platform: Platform) -> None:
+def test_platform_frame_refusals(row: dict[str, str], platform: Platform) -> None:
     frame = parse_sent(wire(row["bytes"]))
     assert frame is not None
     known, option = row[platform] == "yes", row[platform].startswith("+")
@@ -76,7 +76,7 @@ def test_recovery_waits_longer_than_any_mode_opens() -> None:
 
 @pytest.mark.parametrize("platform", Platform)
 @pytest.mark.parametrize("row", PLACEHOLDERS, ids=ids(PLACEHOLDERS))
-def test_what_is_measured(row: dict[str, str], platform: Platform) -> None:
+def test_platform_measured_values(row: dict[str, str], platform: Platform) -> None:
     event, profile = sensors(wire(row["bytes"]), row["ended"]), parse_platform(platform)
     assert candidate_modes(event) == tuple(map(Mode, row["candidates"].split()))
     assert only_candidate(event) == (candidate_modes(event)[0] if len(candidate_modes(event)) == 1 else None)
@@ -103,7 +103,7 @@ def test_a_confirmed_mode_chooses_among_candidates_and_decides_nothing_else() ->
 
 @pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
 @pytest.mark.parametrize("row", CONTRADICTIONS, ids=ids(CONTRADICTIONS))
-def test_what_speaks_against_a_platform(row: dict[str, str], platform: str) -> None:
+def test_platform_contradictions(row: dict[str, str], platform: str) -> None:
     event = sensors(wire(row["bytes"]), "#")
     expected = [words for words in row[platform].split(", ") if words]
     found = parse_platform(platform).contradictions(event)

@@ -281,7 +281,7 @@ def test_damaged_bytes_begin_anew(when: str) -> None:
     assert watch.reports(12.25)[-1] not in (PAUSE, SHOWN, SETTLING)
 
 
-def test_what_is_written_behind_a_block_of_ours_shows_nothing() -> None:
+def test_stop_frame_behind_own_block_shows_nothing() -> None:
     watch = EvidenceWatch()
     watch.reports(9.5)
     watch.closed(10.0, awake=False)
@@ -379,7 +379,7 @@ def test_a_whistle_that_delays_a_report_is_a_reaction_too() -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.5, 2.0])
-def test_another_rhythm_ends_what_the_car_has_shown(interval_s: float) -> None:
+def test_changed_report_interval_resets_shown_evidence(interval_s: float) -> None:
     watch, at = EvidenceWatch(), 10.0
     for _ in range(5):
         watch.reports(at)
@@ -466,7 +466,7 @@ def test_single_report_on_slow_link_counts_as_pause(mode: Mode, late_s: float, f
 
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
 @pytest.mark.parametrize("first", ["other", "closed"])
-def test_it_shows_nothing_if_mode00_was_not_the_first_frame(mode: Mode, first: str) -> None:
+def test_stop_is_not_shown_if_mode00_was_not_first_frame(mode: Mode, first: str) -> None:
     watch = tracking(10.0) if mode is Mode.TRACKING else silent()
     if first == "other":
         watch.evidence.sent_other()
