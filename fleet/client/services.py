@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, Final
 
 from fleet.client.client import Fleet
 from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from schemas import keys, messages, topics
-from schemas.bus import Bus, Failure
+from schemas.bus import Bus, Failure, Sample
 from schemas.words import RecorderState
 
 RECORDER_TIMEOUT_S: Final = 15.0
@@ -27,7 +28,25 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     """Send a command to the recorder. Return its fleet.v1.Recording or a Failure, None if there is no recorder."""
     key, payload = keys.command_key(fleet, keys.RECORDER, verb, bus.identity), json.dumps(fields).encode()
     for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=RECORDER_TIMEOUT_S):
-        return answer if isinstance(answer, Failure) else answer.message()
+        if isinstance(answer, Failure):
+            return answer
+        if (found := _recording(answer)) is not None:
+            return found
+    return None
+
+
+def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
+    """Yield the site and the fleet.v1.Recording of each recorder that says what it records. Strangers are skipped."""
+    for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
+        if isinstance(answer, Sample) and (found := _recording(answer)) is not None:
+            yield keys.recorder_site(fleet, answer.key.removesuffix("/status")) or "", found
+
+
+def _recording(answer: Sample) -> Any:
+    """Return the fleet.v1.Recording in an answer. None if it is something else: on a plain bus, anybody may answer."""
+    with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
+        found: Any = answer.message()
+        return found if found.DESCRIPTOR.full_name == topics.TOPICS["@recorder/status"].message else None
     return None
 
 

@@ -247,6 +247,7 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         host, code = _host_and_code(words)
         parsed = JoinCode.parse(code)
         at, at_port = _address(site, 0) if site else ("", 0)
+        local_hub.check_storage()
         addresses = own_addresses()
         own = (*addresses, *own_names())
         if host:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.client.client import certified_sender, default_sender
-from fleet.client.services import RECORDER_TIMEOUT_S, ask_recorder, why_unrecorded
+from fleet.client.services import ask_recorder, site_recordings, why_unrecorded
 from fleet.commands.fleets import the_fleet
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
@@ -332,13 +332,9 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
         fleet = the_fleet(bus, fleet)
         first = _ask(bus, fleet, RecorderVerb.STATUS)
         _show_status(first, as_json=as_json)
-        for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
-            if isinstance(answer, Failure):
-                continue
-            found: Any = answer.message()
+        for site, found in site_recordings(bus, fleet):
             if found.session != first.session:  # else it answers for the fleet, while it is alone
-                site = keys.recorder_site(fleet, answer.key.removesuffix("/status"))
-                _show_status(found, as_json=as_json, site=site or "")
+                _show_status(found, as_json=as_json, site=site)
 
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")

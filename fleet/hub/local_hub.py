@@ -4,6 +4,7 @@ import getpass
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -21,6 +22,8 @@ from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
 
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Where the programs of the hub's own computer find it."""
+JOINED_BYTES: Final = 65_536
+"""More than a computer stores when it joins: a key, two certificates, and at a site the rules of twenty identities."""
 SOMEBODY: Final = "operator"
 """The name of a user whose login is not a name of a person."""
 
@@ -69,6 +72,16 @@ def use(endpoint: str) -> None:
     directory = default_directory()
     directory.mkdir(parents=True, exist_ok=True)
     write_atomically(directory / JOINED_FILE, f"{endpoint}\n".encode())
+
+
+def check_storage() -> None:
+    """Raise OSError if this computer cannot store what it gets when it joins: then no code is spent for nothing."""
+    directory = default_directory()
+    directory.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=directory) as probe:
+        probe.write(bytes(JOINED_BYTES))
+        probe.flush()
+        os.fsync(probe.fileno())
 
 
 def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:

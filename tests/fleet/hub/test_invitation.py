@@ -14,6 +14,7 @@ from fleet.hub.invitation import Invitation, NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
 from schemas.bus import Credentials
 from schemas.identity import car, person, site
+from tests.support import in_process
 from tests.support.ports import free_port
 
 ME = person("ann")
@@ -49,6 +50,19 @@ def post(invitation: Invitation, body: bytes, **headers: str) -> tuple[int, dict
     found = answer.status, json.loads(answer.read())
     connection.close()
     return found
+
+
+def test_join_spends_no_code_if_nothing_can_be_stored(
+    invitation: Invitation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "file" / "state"))
+    where = f"127.0.0.1:{invitation.port}"
+    done = in_process.fleet("join", where, invitation.code)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert str(tmp_path / "file") in done.stderr
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "state"))
+    assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
 
 
 def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> None:

@@ -1,12 +1,14 @@
 """The recorder of another site beside that of the fleet: both record, one answers, and a mark is in both."""
 
 import contextlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import zenoh
 
-from fleet.client.services import ask_recorder
+from fleet.client.services import ask_recorder, site_recordings
 from fleet.recording.reading.session import Session
 from fleet.recording.writing.recorder import Recorder
 from fleet.recording.writing.recorder_service import AnotherRecorder, speaks_for_fleet
@@ -14,6 +16,7 @@ from schemas import messages
 from schemas.bus import Bus, Sample, messages_of
 from schemas.words import RecorderState, RecorderVerb
 from tests.fleet.recording.conftest import wait_for
+from tests.support import in_process
 
 
 @pytest.mark.parametrize(
@@ -82,6 +85,30 @@ def test_site_recorder_records_too_and_answers_alone(endpoint: str, bus: Bus, tm
         opened = Session(session)
         opened.check()
         assert not opened.damage
+
+
+def test_status_skips_foreign_answers(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    odd = [
+        (b"\xff", messages.encoding_of("fleet.v1.Recording")),
+        (b"", messages.encoding_of("fleet.v1.Range")),
+        (b"x", ""),
+    ]
+    with Bus.open(endpoint) as stranger, recording(endpoint, tmp_path) as session:
+        for number, (payload, encoding) in enumerate(odd):
+
+            def answer(query: zenoh.Query, payload: bytes = payload, encoding: str = encoding) -> None:
+                with query:
+                    query.reply(query.key_expr, payload, encoding=encoding)
+
+            stranger._session.declare_queryable(f"fleet/@recorder/south{number}/status", answer)
+        wait_for(
+            lambda: len(list(bus.query("fleet/@recorder/*/status", timeout_s=10.0))) == len(odd), "strangers answer"
+        )
+        assert list(site_recordings(bus, "fleet")) == []
+        done = in_process.fleet("record", "status", "--json", "--connect", endpoint)
+    assert (done.returncode, done.stderr) == (0, "")
+    (line,) = done.stdout.splitlines()
+    assert json.loads(line)["session"] == str(session)
 
 
 def test_bad_site_name_is_refused(bus: Bus, tmp_path: Path) -> None:
