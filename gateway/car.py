@@ -25,6 +25,7 @@ from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of,
 from gateway.bus.car_service import AlreadyServed, CarService
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
+from gateway.bus.revocation_watch import RevocationWatch
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
 from gateway.control.holds_and_leases import PersistedSafety
@@ -36,6 +37,7 @@ from gateway.stop_without_hub import stop_alone
 from gateway.wake import Wake
 from gateway.writer import Writer
 from schemas import bus
+from schemas.keys import car_token
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
 from schemas.process import json_log, signals
@@ -120,6 +122,7 @@ class CarGateway:
         self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         url = at_rate(settings.url, self._driver.model.profile.baud)
+        self._revocation = RevocationWatch(opened, car_token(settings.fleet, settings.car))
         self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(url))
         self._wake = Wake(self._control)
         self._commands = CommandHandler(
@@ -188,6 +191,7 @@ class CarGateway:
             self._keep_hub(),
             self._check_rival(),
             self._estop_sync.keep_synced(self._merge),
+            *([self._revocation.run(self._on_revoked)] if self._bus.identity else []),
             self._answer(self._service.values),
             self._answer(self._service.histories),
         )
@@ -240,6 +244,18 @@ class CarGateway:
         """Fail what is under way, and take back every claim. The driver may be what failed."""
         with contextlib.suppress(Exception):
             self._driver.link_down("its gateway failed", self._loop.time())
+
+    def _on_revoked(self) -> None:
+        """Stop the car: nobody can command it any more, and it may be in a mode."""
+        car, who = self._settings.car, self._bus.identity
+        words = (
+            f"the hub passes nothing on for {who}: its certificate was revoked, or {car} was invited elsewhere. Nobody "
+            f"can command {car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's computer and "
+            "`fleet join` here make another certificate; then start this gateway again."
+        )
+        self._commands.log(Level.ERROR, "revoked", words)
+        self._control.cut_off(words, self._loop.time())
+        self._wake.set()
 
     async def _check_rival(self) -> None:
         """Check again for another gateway. If two started together, the gateway with the higher id ends."""

@@ -264,6 +264,10 @@ class Controller(Generic[D_co]):
             self._log.log(Level.WARNING, "paused", words, now)
             self._halt(words, now)
 
+    def cut_off(self, words: str, now: float) -> None:
+        """Stop the car, since nobody can command it any more."""
+        self._halt(words, now)
+
     # ------------------------------------------------------------------ each command
 
     def _stop(self, pending: Pending, now: float) -> Answer:

@@ -291,6 +291,23 @@ def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
             pass
 
 
+def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(stage: SecureStage) -> None:
+    """It keeps its key and its certificate, as on a computer that nobody reaches in this moment."""
+    stage.free()
+    with stage.client(ANN) as ann:
+        for name in ("red", "blue"):
+            assert stage.command(ann, ANN, name, Verb.MODE, mode="tracking")
+            wait_for(lambda name=name: driving(stage.sim, name), f"{name} drives")
+    kept = [(path := stage.store.directory / f"{BLUE}{ending}", path.read_bytes()) for ending in (".key", ".pem")]
+    assert HubStore.load(stage.store.credentials).revoke(BLUE)
+    for path, data in kept:
+        path.write_bytes(data)
+    wait_for(lambda: not driving(stage.sim, "blue"), "blue stands")
+    assert "[revoked]" in stage.gateways["blue"].stderr
+    assert driving(stage.sim, "red")
+    assert "[revoked]" not in stage.gateways["red"].stderr
+
+
 def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) -> None:
     """Last in this file: eve is gone after it."""
 

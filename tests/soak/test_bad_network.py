@@ -147,6 +147,7 @@ def test_ten_minutes_on_a_bad_network(seed: int, stage: BadNetwork) -> None:
     for recorder, _ in stage.recordings:
         recorder.end()
     stage.made.check_whole(*(place for _, place in stage.recordings))
+    assert not [log for log in stage.made.directory.glob("*.log") if "[revoked]" in log.read_text()]
     print({what: f"{len(each)}: {min(each):.2f} to {max(each):.2f} s" for what, each in took.items()})
     assert max(map(max, took.values())) < STOPS_S, took
 
