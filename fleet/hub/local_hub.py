@@ -108,7 +108,8 @@ def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) 
     for name, data in files.items():
         write_atomically(directory / name, data, sync=True, private=True)
     if joined.rules:
-        credentials.store_site([everywhere(endpoint)], [first], joined.rules)
+        name_of_site = joined.identity.partition(".")[2]
+        credentials.store_site(name_of_site, [everywhere(endpoint)], [first], joined.rules)
     use(endpoint)
     return endpoint
 

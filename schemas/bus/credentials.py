@@ -27,11 +27,12 @@ HUB: Final = "hub"
 """Name of the hub's certificate."""
 HUB_FILE: Final = "hub.json"
 """File with the addresses that the hub listens on, and its rules. The hub of another site also has the address of the
-first one, and the first one also has the rules of the others."""
+first one and the name of its site, and the first one also has the rules of the others."""
 LISTEN: Final = "listen"
 ACCESS_CONTROL: Final = "access_control"
 CONNECT: Final = "connect"
 OF_SITES: Final = "access_control_of_sites"
+SITE: Final = "site"
 
 
 class NoCredentials(BusError):
@@ -155,9 +156,17 @@ class Credentials:
         except NoCredentials:
             return []
 
-    def store_site(self, listens: list[str], first_hubs: list[str], rules: Mapping[str, Any]) -> None:
-        """Write the file of the hub of another site: where it listens and links to, and its rules. Raises OSError."""
-        made = {LISTEN: listens, CONNECT: first_hubs, ACCESS_CONTROL: dict(rules)}
+    @property
+    def site(self) -> str:
+        """Return the name of the site whose hub this computer is. Empty for the first hub."""
+        try:
+            return str(self.hub_settings()[SITE])
+        except NoCredentials:
+            return ""
+
+    def store_site(self, site: str, listens: list[str], first_hubs: list[str], rules: Mapping[str, Any]) -> None:
+        """Write the file of the hub of a site: where it listens and links to, and its rules. Raises OSError."""
+        made = {SITE: site, LISTEN: listens, CONNECT: first_hubs, ACCESS_CONTROL: dict(rules)}
         write_atomically(self.directory / HUB_FILE, json.dumps(made, indent=1).encode(), sync=True, private=True)
 
     def hub_settings(self) -> dict[str, Any]:
@@ -170,6 +179,7 @@ class Credentials:
                 ACCESS_CONTROL: dict(found[ACCESS_CONTROL]),
                 CONNECT: list(found.get(CONNECT, ())),
                 OF_SITES: dict(found.get(OF_SITES, {})),
+                SITE: str(found.get(SITE, "")),
             }
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise NoCredentials(f"{path} has no rules of a hub: {error!r}. `fleet hub init` writes them.") from None

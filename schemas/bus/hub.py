@@ -16,9 +16,9 @@ from typing import Final
 import zenoh
 
 from schemas import keys
-from schemas.atomic_file import write_atomically
 from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
 from schemas.bus.credentials import HUB, HUB_FILE, OF_SITES
+from schemas.bus.hub_links import HubLinks, links_of
 from schemas.bus.hub_renewals import HubRenewals
 from schemas.identity import IdentityRole
 from schemas.process import signals
@@ -30,8 +30,6 @@ _POLL_S: Final = 0.5
 RULES_POLL_S: Final = 2.0
 """Interval at which the hub of another site asks for the rules."""
 RULES_TIMEOUT_S: Final = 1.0
-LINKS_FILE: Final = "links.json"
-"""File with the addresses from which each identity is connected."""
 
 
 def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
@@ -40,18 +38,20 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
     A hub with rules opens a new session when they change, as Zenoh reads them only then. Clients are back soon.
     """
     last_link = time.monotonic()
-    links: _Links | None = None
+    links = HubLinks(Credentials.of(endpoint)) if is_secure(endpoint) else None
     while not stop.is_set():
         rules = _rules_changed_at(endpoint)
         with zenoh.open(router_config(endpoint)) as session, contextlib.closing(HubRenewals(endpoint, session)):
             asked = -RULES_POLL_S
-            _answer_sites(endpoint, session)
+            if links is not None:
+                _answer_sites(links, session)
             while not stop.wait(_POLL_S) and _rules_changed_at(endpoint) == rules:
-                links = _tell_links(endpoint, session, links)
                 now = time.monotonic()
-                if now - asked >= RULES_POLL_S:
+                if links is not None:
+                    links.write(links_of(session), now)
+                if links is not None and now - asked >= RULES_POLL_S:
                     asked = now
-                    _take_rules(endpoint, session)
+                    _take_rules(links, session)
                 if _has_clients(session):
                     last_link = now
                 elif now - last_link > idle_s:
@@ -64,31 +64,37 @@ def _has_clients(session: zenoh.Session) -> bool:
     return any(not (link.auth_identifier or "").startswith(hubs) for link in session.info.links())
 
 
-def _answer_sites(endpoint: str, session: zenoh.Session) -> None:
-    """Answer the hubs of other sites with the rules. Ends with the session."""
-    if not is_secure(endpoint) or not (rules := Credentials.of(endpoint).hub_settings()[OF_SITES]):
+def _answer_sites(links: HubLinks, session: zenoh.Session) -> None:
+    """Answer the hubs of other sites with the rules, and take what they tell. Ends with the session."""
+    if not (rules := links.credentials.hub_settings()[OF_SITES]):
         return
     payload = json.dumps(rules)
 
     def answer(query: zenoh.Query) -> None:
         with query:
+            if query.payload is not None:
+                links.take(query.payload.to_bytes(), time.monotonic())
             query.reply(keys.HUB_RULES, payload)
 
     session.declare_queryable(keys.HUB_RULES, answer)
 
 
-def _take_rules(endpoint: str, session: zenoh.Session) -> None:
-    """Ask the first hub for its rules, if this is that of another site, and store them. Cut off, it keeps the last."""
-    if not is_secure(endpoint) or not (credentials := Credentials.of(endpoint)).first_hubs:
+def _take_rules(links: HubLinks, session: zenoh.Session) -> None:
+    """Ask the first hub for its rules, if this is that of another site, and store them. Cut off, it keeps the last.
+
+    The question tells the first hub who is connected here.
+    """
+    credentials = links.credentials
+    if not credentials.first_hubs:
         return
-    for reply in session.get(keys.HUB_RULES, timeout=RULES_TIMEOUT_S):
+    for reply in session.get(keys.HUB_RULES, payload=links.of_this_site(), timeout=RULES_TIMEOUT_S):
         if reply.ok is None:
             continue
         with contextlib.suppress(ValueError):
             rules = json.loads(reply.ok.payload.to_bytes())
             if isinstance(rules, dict) and rules and rules != credentials.access_control:
                 with contextlib.suppress(OSError):  # asked again
-                    credentials.store_site(credentials.listens, credentials.first_hubs, rules)
+                    credentials.store_site(credentials.site, credentials.listens, credentials.first_hubs, rules)
 
 
 def _rules_changed_at(endpoint: str) -> tuple[int, ...]:
@@ -100,26 +106,6 @@ def _rules_changed_at(endpoint: str) -> tuple[int, ...]:
         return tuple((directory / name).stat().st_mtime_ns for name in (HUB_FILE, f"{HUB}.pem"))
     except FileNotFoundError:
         return ()
-
-
-_Links = dict[str, list[str]]
-"""Addresses by common name."""
-
-
-def _tell_links(endpoint: str, session: zenoh.Session, before: _Links | None) -> _Links | None:
-    """Write who is connected, by common name, if that changed. `fleet hub show` reads it."""
-    if not is_secure(endpoint):
-        return None
-    links: _Links = {}
-    for link in session.info.links():
-        if link.auth_identifier:
-            links.setdefault(link.auth_identifier, []).append(link.dst.partition("/")[2])
-    links = {name: sorted(addresses) for name, addresses in sorted(links.items())}
-    if links != before:
-        with contextlib.suppress(OSError):  # it only informs
-            path = Credentials.of(endpoint).directory / LINKS_FILE
-            write_atomically(path, json.dumps(links).encode(), private=True)
-    return links
 
 
 def main() -> int:

@@ -23,6 +23,7 @@ from schemas.bus import Bus, BusError
 from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS, Verb
 from schemas.identity import Service, car, person, service
 from schemas.words import Rank
+from tests.support import in_process
 from tests.support.ports import free_port
 from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
 from tests.support.secure import FIELDS, ask, client_of, secure_fleet, sender_of, shapes, stranger
@@ -309,7 +310,7 @@ def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(stage: 
 
 
 def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) -> None:
-    """Last in this file: eve is gone after it."""
+    """One of the last in this file: eve is gone after it."""
 
     def refused() -> str:
         with Client(stage.store.credentials.endpoint, kind="person", identity=EVE) as client:
@@ -331,3 +332,17 @@ def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) ->
     with stage.client(EVE) as eve:
         assert stage.command(eve, EVE, "*", Verb.STOP) == [], "nor over a new link"
         assert EVE in refused(), "and our own programs say why"
+
+
+def test_revoke_of_car_stops_it_first(stage: SecureStage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Last in this file: red is gone after it."""
+    monkeypatch.setenv("FLEET_ENDPOINT", stage.store.credentials.endpoint)
+    stage.free()
+    with stage.client(ANN) as ann:
+        assert stage.command(ann, ANN, "red", Verb.MODE, mode="tracking")
+        wait_for(lambda: driving(stage.sim, "red"), "red drives")
+    done = in_process.fleet("hub", "revoke", RED)
+    assert done.returncode == 0, done.stderr
+    assert not driving(stage.sim, "red")
+    assert "NOT STOPPED" not in done.stderr
+    assert "red is stopped first" in done.stderr

@@ -1,5 +1,7 @@
 """What a computer stores that is a hub or joins one: for its user, a car, a service."""
 
+from pathlib import Path
+
 import pytest
 
 from fleet.hub.hub_store import HubStore
@@ -7,6 +9,8 @@ from fleet.hub.invitation import Joined
 from fleet.hub.local_hub import SECURE_ENDPOINT, store_joined
 from schemas.bus import Credentials, NoCredentials
 from schemas.identity import Service, service
+from schemas.running_cars import RunningMark
+from schemas.state_dir import directory_of
 from tests.support import in_process
 
 
@@ -28,6 +32,21 @@ def test_a_computers_user_is_the_person_who_joined_last(
     credentials = Credentials.of(endpoint)
     assert credentials.me == user
     assert [credentials.identity(each) for each in joins] == joins
+
+
+def test_leave_refuses_beside_running_gateways(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    monkeypatch.delenv("FLEET_ENDPOINT", raising=False)
+    endpoint = store_joined("192.0.2.1", Joined("car.red", 7447, b"ca", b"certificate", b"key", ""))
+    mark = RunningMark(directory_of(endpoint), "fleet", "red")
+    mark.renew()
+    refused = in_process.fleet("leave")
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "(red)" in refused.stderr
+    assert Credentials.of(endpoint).exist
+    mark.end()
+    assert in_process.fleet("leave").returncode == 0
+    assert not Credentials.of(endpoint).exist
 
 
 def test_service_invited_elsewhere_is_taken_back(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:

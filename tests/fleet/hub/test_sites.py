@@ -1,5 +1,6 @@
 """Two sites, whose hubs link to one another: real routers, real certificates, invitations over real TLS."""
 
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,6 +18,7 @@ from schemas import identity, keys
 from schemas.bus import Bus, BusError, Credentials, hub, hub_renewals
 from schemas.bus.credentials import HUB
 from schemas.bus.hub import serve
+from tests.support import in_process
 from tests.support.ports import free_port
 from tests.support.processes import wait_for
 
@@ -151,6 +153,22 @@ def test_rules_of_first_hub_apply_at_every_site(sites: Sites) -> None:
                 return False
 
         wait_for(mia_stops, "mia does")
+
+
+def test_hub_show_tells_who_is_connected_at_another_site(sites: Sites, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEET_ENDPOINT", sites.first)
+    sites.start(sites.first)
+    sites.start(sites.second)
+
+    def shown() -> dict[str, str]:
+        lines = in_process.fleet("hub", "show", "--json").stdout.splitlines()
+        return {row["identity"]: row["from"] for row in map(json.loads, lines) if row["state"] == "connected"}
+
+    with gateway(sites.second, "blue"), Bus.open(sites.first, identity=ANN):
+        wait_for(lambda: {ANN, NORTH, identity.car("blue")} <= shown().keys(), "all are shown")
+        found = shown()
+        assert found[identity.car("blue")].endswith(" (north)")
+        assert "(" not in found[ANN]
 
 
 def test_a_site_invites_nobody(sites: Sites) -> None:
