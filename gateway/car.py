@@ -265,7 +265,7 @@ class CarGateway:
 
     async def _has_rival(self) -> bool:
         """Return True if another gateway of the car has to end. Raise AlreadyServed if this one has to."""
-        return await asyncio.to_thread(self._service.singleton.check_first)
+        return await asyncio.to_thread(self._service.singleton.raise_unless_first)
 
     async def _is_port_in_use(self) -> bool:
         """Return True if another gateway, which has to end, may still have the port open."""

@@ -2,5 +2,6 @@
 
 Read `words` first: the closed sets of words. Then read `keys`, `topics` and `commands`, and at last `messages`
 (classes of `proto/`, generated into `gen/`) and `bus`. `process` contains the common parts of the start and the end of
-a process. `gateway run` imports no other package of ours, so a module here that imports a framework says so.
+a process. Of our packages, `gateway run` imports only `gateway` and this one, and it imports no framework. So a module
+here that imports one says so.
 """

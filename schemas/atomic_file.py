@@ -1,4 +1,4 @@
-"""Writes files atomically: readers see the old file or the whole new one, never a part. State files are such files."""
+"""Writes files atomically: readers see the old file or the whole new one, never a part. All state is written so."""
 
 import contextlib
 import os
@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Final
 
 DAMAGE: Final = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
-"""What reading a JSON file of ours raises if somebody else has written into it."""
+"""The exceptions that reading one of our JSON files may raise after another program has changed it."""
 
 
 def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bool = False) -> None:
     """Write a file, or replace it and keep its mode. With `sync`, it survives a power failure. Raises OSError.
 
-    If `private`, only the user may read it, at any time.
+    With `private`, only the user can read it, also while it is being written.
     """
     scratch = path.with_name(f".{path.name}.new")
     try:
@@ -34,6 +34,6 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bo
 
 
 def write_state(path: Path, text: str, *, sync: bool = False, private: bool = False) -> None:
-    """Write a state file, whose directory may be missing. As `write_atomically`, which it uses."""
+    """Write a state file with `write_atomically`. Make its directory if it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, text.encode(), sync=sync, private=private)

@@ -1,7 +1,7 @@
 """The voltages at which the battery of a car is full, low, critical and empty: two Li-ion cells at rest. Pure.
 
-`gateway.control.battery` decides the level by them. A fleet file may set others for one car. A car with another number
-of cells has them in proportion.
+`gateway.control.battery` decides the level by them. A fleet file may set others for a car. They are scaled in
+proportion for a car with another number of cells.
 """
 
 from typing import Final

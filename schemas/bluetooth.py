@@ -1,21 +1,21 @@
-"""What a Bluetooth adapter of a computer can carry, and the words for one that is full. Pure."""
+"""The limits of a computer's Bluetooth adapter, and the text about a full one. Pure."""
 
 from typing import Final
 
 ADAPTER_CONNECTIONS: Final = 5
-"""Connections that most adapters hold (home-assistant #84331). Known before: an adapter tells nobody."""
+"""Connections that most adapters can hold (home-assistant #84331). An adapter does not report its limit."""
 SMALL_ADAPTER_CONNECTIONS: Final = 3
-"""Connections that some adapters hold (bleak #1858)."""
+"""Connections that the smallest adapters can hold (bleak #1858)."""
 ADAPTER_NOTIFICATIONS_PER_S: Final = 165
-"""Notifications that an adapter carries (docs/explanation/measurements.md#bluetooth)."""
-# In tracking up to 27 reports a second (docs/reference/protocol.md#rates), each in three pieces of 20 bytes.
+"""Notifications per second that an adapter carries (docs/explanation/measurements.md#bluetooth)."""
+# In tracking, a car sends up to 27 reports a second (docs/reference/protocol.md#rates), each in 3 pieces of 20 bytes.
 CAR_NOTIFICATIONS_PER_S: Final = 27 * 3
-"""Most notifications that one car sends."""
+"""Maximum notifications per second from one car."""
 ADAPTER_FULL: Final = "Bluetooth adapter is full"
-"""A part of the reason of a link that is lost because its adapter has no room."""
+"""Part of the reason of a link that is lost because its adapter has no room."""
 
 
 def describe_full(adapter: str, connections: int) -> str:
-    """Return in one line that an adapter is full, and what to do."""
-    what = f"the {ADAPTER_FULL}: {adapter} has {connections} connections, and most take {ADAPTER_CONNECTIONS}"
-    return f"{what}, some {SMALL_ADAPTER_CONNECTIONS}. Give this car another one, ?adapter=hci1, or write ?adapter=auto"
+    """Return one line that says that an adapter is full, and what to do."""
+    what = f"the {ADAPTER_FULL}: {adapter} has {connections} connections, and most can hold {ADAPTER_CONNECTIONS}"
+    return f"{what}, some {SMALL_ADAPTER_CONNECTIONS}. End this car's link with ?adapter=hci1 or ?adapter=auto"

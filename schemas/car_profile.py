@@ -9,7 +9,7 @@ class CarProfile(Protocol):
     """What cars of one kind can do. One object for each name of a platform."""
 
     def __hash__(self) -> int:
-        """Profiles are values: the same for the same name."""
+        """Return a hash. Profiles are values: two profiles of the same name are equal."""
 
     @property
     def name(self) -> str:
@@ -17,7 +17,7 @@ class CarProfile(Protocol):
 
     @property
     def capabilities(self) -> frozenset[str]:
-        """The verbs that the car takes, and parts such as `arm`, `imu`, `servo_vertical`."""
+        """The verbs that the car can carry out, and its parts such as `arm`, `imu`, `servo_vertical`."""
 
     @property
     def modes(self) -> frozenset[Mode]:
@@ -57,10 +57,10 @@ class CarProfile(Protocol):
 
     @property
     def not_observed(self) -> tuple[str, ...]:
-        """What was only read or assumed about such cars, for a person. Empty if all was observed."""
+        """Sentences about such cars that were only read or assumed. Empty if everything was observed on a car."""
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return everything that such a car can measure in this mode: `range`, `battery`, `line`, `wheels`."""
+        """Return the names of all readings that such a car can send in this mode: `range`, `battery`, `line`, ..."""
 
     def why_lacking(self, capability: str) -> str | None:
-        """Return why the car lacks a capability, for a person. None if it has it, or if every car has it."""
+        """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""

@@ -1,4 +1,4 @@
-"""Colors: their names, the reader of `red` and `#ff0000`, and the colors of cars in every view. Pure."""
+"""Colors: their names, the parser of `red` and `#ff0000`, and the colors of cars in every view. Pure."""
 
 import re
 from collections.abc import Mapping

@@ -48,9 +48,11 @@ class CommandType:
     min_duration_s: float = 0.0
     """Minimum of that field. 0 if any duration above 0 is allowed."""
     signal: bool = False
-    """True if the car gives a signal, and the verb and `duration_s` say all about it: control needs no class for it."""
+    """True if the car only gives a signal, such as the whistle. The verb and `duration_s` describe it fully, so control
+    needs no class for it."""
     subcommand: str = ""
-    """Its subcommand of `fleet`, if this row says all about it: cars, and `--for` if there is a maximum duration."""
+    """The subcommand of `fleet` that is made from this row alone. Its arguments are cars, and `--for` if there is a
+    maximum duration. Empty if none is."""
     section: str = ""
     """Heading of the subcommand in `fleet --help`."""
 
@@ -68,14 +70,14 @@ class CommandType:
 _ROWS: Final = (
     CommandType(
         Verb.DRIVE,
-        "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
+        "hold a motion for `duration_s` (default 0.5 s, at most 10 s unless the gateway has another limit), then stop",
         ttl_s=0.5,
     ),
-    CommandType(Verb.MODE, "bring the car into a mode; `manual` closes whatever is open", "switching to mode{detail}"),
-    CommandType(Verb.LED, "the color LED, 0..255 each", "LED color sent"),
-    CommandType(Verb.LIGHT, "the light's color, or `off`", "light{detail} sent"),
-    CommandType(Verb.SERVO, "move a servo a step, or the front one to `deg` (0..180)", "servo angle sent"),
-    CommandType(Verb.ARM, "six joints, 0..180 degrees each (option `+arm`)", "arm joints sent"),
+    CommandType(Verb.MODE, "bring the car into a mode; `manual` closes the open mode", "switching to mode{detail}"),
+    CommandType(Verb.LED, "set the color LED: red, green and blue, 0..255 each", "LED color sent"),
+    CommandType(Verb.LIGHT, "set the light's color, or `off`", "light{detail} sent"),
+    CommandType(Verb.SERVO, "move a servo by one step, or the front servo to `deg` (0..180)", "servo angle sent"),
+    CommandType(Verb.ARM, "move the six joints of the arm, 0..180 degrees each (option `+arm`)", "arm joints sent"),
     CommandType(
         Verb.WHISTLE,
         "sound the whistle once",
@@ -84,17 +86,23 @@ _ROWS: Final = (
         subcommand="whistle",
         section="Lights and parts",
     ),
-    CommandType(Verb.SPEED, "one step `up` or `down`: cars have no absolute speed", "speed step{detail} sent"),
-    CommandType(Verb.FAN, "toggle; `on` or `off` while its state is known", "fan{detail} sent"),
-    CommandType(Verb.STOP, "stop, and hold the car against the coordinator", wildcard=True, stops=True),
+    CommandType(
+        Verb.SPEED,
+        "change the speed by one step, `up` or `down`: cars have no absolute speed",
+        "speed step{detail} sent",
+    ),
+    CommandType(Verb.FAN, "toggle the fan; `on` and `off` work only while its state is known", "fan{detail} sent"),
+    CommandType(Verb.STOP, "stop the car, and keep the coordinator from moving it (a hold)", wildcard=True, stops=True),
     CommandType(
         Verb.ESTOP,
-        "stop, and reject everything until it is resumed by its id; `scope` is car or fleet",
+        "stop the car, and reject everything until a resume with the id of this e-stop; `scope` is car or fleet",
         wildcard=True,
         stops=True,
     ),
     CommandType(Verb.RESUME, "end the e-stops of these ids; without ids, the hold; `all` ends both", wildcard=True),
-    CommandType(Verb.PAUSE, "stop, and let only leads move the cars of the fleet until `unpause`", wildcard=True),
+    CommandType(
+        Verb.PAUSE, "stop the car, and let only leads move the cars of the fleet until `unpause`", wildcard=True
+    ),
     CommandType(Verb.UNPAUSE, "end the pause of the fleet; move nothing", "{words}", wildcard=True),
     CommandType(
         Verb.LEND,
@@ -115,4 +123,4 @@ _ROWS: Final = (
 COMMANDS: Final[Mapping[str, CommandType]] = MappingProxyType({row.verb: row for row in _ROWS})
 STOPS: Final = tuple(row.verb for row in _ROWS if row.stops)
 STOPPING_VERBS: Final = frozenset({*STOPS, Verb.PAUSE})
-"""Verbs that stop a car, for now or until somebody ends it."""
+"""Verbs that stop a car, whether or not somebody must end that afterwards."""

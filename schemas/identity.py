@@ -2,8 +2,8 @@
 
 An identity is `person.mia`, `car.red`, `service.recorder` or, at another site, `service.recorder@north`. It is the
 common name of a certificate, and a part of the keys of its commands (`keys.command_key`). The hub's rules let nobody
-use another's. The name of a sender in a command is only text, so whoever carries out a command asks `speaks_for`, and a
-service `sender_for`.
+use the identity of somebody else. But the name of the sender in a command is only text. So whoever carries out a
+command checks that name: a gateway with `speaks_for`, a service with `sender_for`.
 """
 
 from enum import StrEnum
@@ -15,7 +15,7 @@ from schemas.words import Rank
 
 
 class IdentityRole(StrEnum):
-    """What an identity is."""
+    """The kind of an identity's owner."""
 
     PERSON = "person"
     CAR = "car"
@@ -40,9 +40,9 @@ class Service(StrEnum):
 ANONYMOUS: Final = "anonymous"
 """The sender of a command that names none, on a hub without certificates."""
 _AT: Final = "@"
-"""Between a service and the site where it runs."""
+"""Separates a service from the site where it runs."""
 _FORWARDED: Final = frozenset({Verb.ESTOP, Verb.RESUME, Verb.PAUSE, Verb.UNPAUSE})
-"""What gateways tell one another in the name of whoever told one of them."""
+"""Verbs that a gateway passes on to the others, in the name of the sender who gave it the command."""
 
 
 def person(name: str) -> str:
@@ -66,7 +66,8 @@ def site(name: str) -> str:
 
 
 AS_THE_USER: Final = frozenset({service(Service.CONSOLE), service(Service.SIMULATOR)})
-"""The services that also run with the certificate of the user: the page is that person's then, and no truth is told."""
+"""The services that use the certificate of the user if they have none. Then the console acts as that person, and the
+simulator publishes no truth."""
 
 
 class NotTheSender(Exception):
@@ -74,7 +75,7 @@ class NotTheSender(Exception):
 
 
 def parse(identity: str) -> tuple[IdentityRole, str] | None:
-    """Return the role and the name of an identity, or None if it is not one. A service has its name at every site."""
+    """Return the role and the name of an identity, or None if it is not one. The site of a service is left out."""
     role, _, name = identity.partition(".")
     if role == IdentityRole.SERVICE:
         name, at, site = name.partition(_AT)
@@ -94,7 +95,8 @@ def role_of(identity: str) -> IdentityRole | None:
 def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
     """Return True if an identity may send this command in the name of a sender of this kind.
 
-    The console holds its people to their pairing, so it speaks for any person. The supervisor stops cars at the end.
+    The console checks by pairing who its people are, so it may speak for any person. The supervisor may stop cars,
+    because it stops them when it ends.
     """
     known = parse(identity)
     if known is None:
@@ -125,7 +127,7 @@ def may_locate(identity: str, of: str) -> bool:
 
 
 def sender_for(identity: str, sender: str, verb: str) -> str:
-    """Return the sender of a person's command to a service: as it is named, else the owner of the certificate.
+    """Return the sender of a person's command to a service: its name in the command, else the certificate's owner.
 
     `identity` is empty on a hub without certificates, where every name is believed. Raises NotTheSender.
     """

@@ -16,11 +16,11 @@ OPERATOR: Final = "@operator"
 BY: Final = "@by"
 """Part of a command's key before the identity that the rules of the hub have checked."""
 HUB_RULES: Final = "@hub/rules"
-"""Where the first hub of several sites answers with the rules for the others."""
+"""Where the first hub, to which the hubs of other sites are linked, answers them with their rules."""
 HUB_RENEWAL: Final = "@hub/@renew"
 """`@hub/@renew/<identity>` is where the first hub answers that identity with its next certificate."""
 REPLAY: Final = "@replay"
-"""`<fleet>/@replay/<session>` is the token of a fleet that is a replay."""
+"""`<fleet>/@replay/<session>` is the token of a program that plays this session in the fleet."""
 
 
 class BadKey(ValueError):
@@ -47,12 +47,12 @@ def person_of(sender: str) -> str:
 
 
 def name_of(sender: str) -> str:
-    """Return a sender's name for a text: its person, without the host and the process that JSON and records have."""
+    """Return a sender's name as texts show it: only the person. JSON and records also have the host and the process."""
     return person_of(sender) or sender
 
 
 def describe_fleet(fleet: str) -> str:
-    """Return a fleet's name for a person. The default name is left out."""
+    """Return a fleet's name as texts show it. The default name is left out."""
     return "the fleet" if fleet == DEFAULT_FLEET else f"fleet {fleet}"
 
 
@@ -103,7 +103,10 @@ def car_token(fleet: str, car: str) -> str:
 
 
 def recorder_token(fleet: str, site: str = "") -> str:
-    """Return the liveliness token of the recorder of a fleet, or of that at another site. Its status is below it."""
+    """Return the liveliness token of a fleet's recorder, or of its recorder at another site.
+
+    The key of that recorder's status begins with this token.
+    """
     return f"{fleet}/{RECORDER}/{site}" if site else f"{fleet}/{RECORDER}"
 
 
@@ -142,8 +145,8 @@ def recorded_keys(fleet: str) -> tuple[str, ...]:
 def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:
     """Return the whole key expression of a short form. Raises BadKey.
 
-    `red` stands for every reading of red. The fleet's name is put before `red/sensor/range` and `*/sensor/battery`. An
-    expression that begins with the fleet's name or with `**` stays as it is.
+    `red` and `fleet/red` stand for every reading of red. The fleet's name is put before an expression that does not
+    begin with it, such as `red/sensor/range`, `*/sensor/battery` or `**`.
     """
     text = expression.strip("/")
     if not text or "//" in text or set(text) & set("#? \t\n"):

@@ -1,6 +1,6 @@
 """Link URLs: each kind of link is a class, with its text, its port, its check and its help. Nothing is opened.
 
-A kind is a class here and a row in `KINDS`; `gateway.link` has its bytes, under the same scheme.
+A kind of link is a class here and a row in `KINDS`. The module of `gateway.link` with the name of its scheme opens it.
 """
 
 import ipaddress
@@ -27,7 +27,7 @@ _USB_FIELDS: Final = ("vid", "pid", "serial")
 _BLE_ADDRESS: Final = re.compile(r"[0-9A-F]{2}(:[0-9A-F]{2}){5}|[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}")
 _ADAPTER: Final = re.compile(r"auto|hci\d{1,3}")
 AUTO_ADAPTER: Final = "auto"
-"""The adapter of a Bluetooth link that takes any adapter with room."""
+"""In a Bluetooth link: any adapter with room."""
 # Core Specification, vol. 3, part C, 3.2.2
 _BLE_NAME_BYTES: Final = 248
 """Maximum length of the name of a Bluetooth device."""
@@ -41,7 +41,7 @@ class BadLink(ValueError):
 
 
 class Look(Protocol):
-    """What can be looked at without opening a link. Each returns whether all is well, and the words."""
+    """Looks for the device or host of a link, and opens no link. Each returns True if all is well, and a text."""
 
     def device(self, path: str) -> tuple[bool, str]:
         """Look at a serial port."""
@@ -50,12 +50,12 @@ class Look(Protocol):
         """Look for a USB device."""
 
     def host(self, host: str, port: int) -> tuple[bool, str]:
-        """Look for a host, and not at a port whose car would take harm."""
+        """Look for a host, without a connection to a port where that could harm a car."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkUrl(ABC):
-    """A link: how it is written, and what is known of it before it is opened. Its text is its URL."""
+    """A link: how it is written, and what is known about it before it is opened. `str` returns its URL."""
 
     scheme: ClassVar[str]
     forms: ClassVar[tuple[str, ...]]
@@ -63,13 +63,14 @@ class LinkUrl(ABC):
     options: ClassVar[str] = ""
     """What may follow its URL, for the help."""
     module: ClassVar[str] = ""
-    """The module that it needs beside the installation, if any; `extra` has it, `needs` is its name for people."""
+    """The Python module that it needs, if the basic installation lacks it. The extra `extra` installs it, and `needs`
+    is its name for people."""
     extra: ClassVar[str] = ""
     needs: ClassVar[str] = ""
     harm: ClassVar[str] = ""
-    """What opening and closing it may do to a car, in words. Empty if nothing."""
+    """The harm that opening and closing it may do to a car, in words. Empty if none."""
     same_car: ClassVar[Mapping[str, Any]] = {}
-    """Options that do not tell cars apart, as they are if left out."""
+    """Options that say nothing about which car it is, with their default values."""
 
     @classmethod
     @abstractmethod
@@ -98,13 +99,13 @@ class LinkUrl(ABC):
         yield self.port_key
 
     def check(self, look: Look) -> tuple[bool, str]:  # noqa: ARG002 - Bluetooth cannot be looked at
-        """Return whether a car may be there, with the words. Nothing is opened that could move, reset or end a car."""
+        """Return True if a car may be there, and a text. Open nothing that could move or reset a car, or end it."""
         if missing := self.missing():
             return False, missing
-        return True, f"{self.needs} is installed; whether the car is near, `fleet scan` shows"
+        return True, f"{self.needs} is installed; `fleet scan` shows whether the car is near"
 
     def doubt_baud(self) -> str:
-        """Return the sentence that asks for the baud rate if the bytes of this link have no frame."""
+        """Return a sentence that asks about the baud rate, for a link whose bytes contain no frame."""
         return f"Is the module at the baud rate of the car, {BAUD}?"
 
 
@@ -120,7 +121,7 @@ class _SerialLine(LinkUrl):
     def parse(cls, text: str) -> "LinkUrl | None":
         parts = _split(text)
         if parts.fragment:
-            raise BadLink("a # is written %23, and that only in a serial number")
+            raise BadLink("write # as %23, and only in a serial number")
         return _serial(parts.netloc, parts.path, parts.query)
 
     def doubt_baud(self) -> str:
@@ -150,7 +151,7 @@ class SerialUrl(_SerialLine):
         return ("device", device, frozenset())
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look at it as far as nothing is opened."""
+        """Look for it without opening it."""
         return look.device(self.path)
 
     def __str__(self) -> str:
@@ -181,14 +182,14 @@ class UsbUrl(_SerialLine):
         return ("usb", "", frozenset((name, str(value)) for name, value in ids if value is not None))
 
     def possible_ports(self) -> Iterator[PortKey]:
-        """Yield also the keys of links with fewer ids: all of them may name this device."""
+        """Yield also the keys of links with fewer ids, because they may name this device too."""
         kind, where, ids = self.port_key
         for count in range(1, len(ids) + 1):
             for fewer in combinations(sorted(ids), count):
                 yield (kind, where, frozenset(fewer))
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look at it as far as nothing is opened."""
+        """Look for it without opening it."""
         return look.usb(self)
 
     def __str__(self) -> str:
@@ -207,8 +208,8 @@ class TcpUrl(LinkUrl):
     scheme = "tcp"
     forms = ("tcp://host:8888",)
     harm = (
-        "a Raspberry Pi car's program dies when a TCP client disconnects, this one too. Its motors then stay as they "
-        "are."
+        "a Raspberry Pi car's program dies when a TCP client disconnects, also when this one does. Its motors "
+        "then stay as they are."
     )
 
     @classmethod
@@ -239,11 +240,11 @@ class TcpUrl(LinkUrl):
         return ("tcp", _host(self.host), frozenset({("port", str(self.port))}))
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look at it as far as nothing is opened."""
+        """Look for it without opening it."""
         return look.host(self.host, self.port)
 
     def doubt_baud(self) -> str:
-        """Return the sentence that asks for the baud rate."""
+        """Return a sentence that asks about the baud rate."""
         return f"Is the bridge at the baud rate of the car, {BAUD}?"
 
     def __str__(self) -> str:
@@ -294,11 +295,11 @@ _BY_SCHEME: Final = {kind.scheme: kind for kind in KINDS}
 LINK_HELP: Final = ", ".join(form for kind in KINDS for form in kind.forms)
 """How links are written, for the help of a command."""
 LINK_HELP_OPTIONS: Final = "".join(f"; {kind.scheme}:// also with {kind.options}" for kind in KINDS if kind.options)
-"""What may follow some of them."""
+"""Options that some kinds of links have, for the help of a command."""
 
 
 def car_link(url: LinkUrl) -> str:
-    """Return the text of a link without the options that do not tell cars apart: baud rate and adapter."""
+    """Return the text of a link without the options that say nothing about which car it is: baud rate and adapter."""
     return str(replace(url, **url.same_car))
 
 
@@ -312,7 +313,7 @@ def parse_link(text: str) -> LinkUrl:
     kind = _BY_SCHEME.get(scheme.lower())
     if colon and kind is not None and (link := kind.parse(text)) is not None:
         return link
-    _split(text)  # it names what is wrong with any URL
+    _split(text)  # raises BadLink with the fault if this is no URL at all
     raise BadLink(f"this is not a link. {_likely_link(text)}`fleet scan` lists the links that are there.")
 
 
@@ -351,12 +352,12 @@ def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
     baud = _baud(options.pop("baud", str(BAUD)))
     if path.strip("/") or netloc:
         if netloc and path.strip("/"):
-            raise BadLink("three slashes come before a device path")
+            raise BadLink("write three slashes before a device path")
         if netloc and not _WINDOWS_PORT.fullmatch(netloc):
             raise BadLink("it names no device")
         if options:
             ids = ", ".join(name for name in _USB_FIELDS if name in options)
-            raise BadLink(f"it names a device path, and {ids} too: one of the two")
+            raise BadLink(f"it names both a device path and {ids}: write only one of the two")
         return SerialUrl(path or netloc, baud)
     if not options:
         raise BadLink("it names no device")
@@ -390,10 +391,10 @@ def _ble(rest: str) -> BleUrl:
     if rest.startswith("name="):
         name = unquote(rest[5:])
         if not name or not name.isprintable() or len(name.encode()) > _BLE_NAME_BYTES:
-            raise BadLink(f"a name has 1 to {_BLE_NAME_BYTES} bytes, and can be printed")
+            raise BadLink(f"a name must have 1 to {_BLE_NAME_BYTES} bytes, all printable")
         return BleUrl(name=name, adapter=chosen)
     if _BLE_ADDRESS.fullmatch(rest.upper()) is None:
-        raise BadLink("it names no Bluetooth address, and no name=")
+        raise BadLink("it has neither a Bluetooth address nor a name=")
     return BleUrl(address=rest.upper(), adapter=chosen)
 
 

@@ -19,7 +19,7 @@ def date_and_clock(at_s: float) -> str:
 
 
 def date(at_s: float, days_before: int = 0) -> str:
-    """Return the local date, such as `2026-11-25`, of so many days before a time."""
+    """Return the local date of a time, or of `days_before` days earlier, such as `2026-11-25`."""
     return (_local(at_s) - timedelta(days=days_before)).strftime("%Y-%m-%d")
 
 
@@ -33,7 +33,7 @@ def exact(at_ns: int) -> str:
 
 
 def of_iso(text: str) -> str:
-    """Return a stored time (ISO 8601, UTC) as `date_and_clock`; other texts as they are."""
+    """Return a stored time (ISO 8601, UTC) in the form of `date_and_clock`. Return any other text unchanged."""
     try:
         when = datetime.fromisoformat(text)
     except ValueError:
@@ -42,7 +42,7 @@ def of_iso(text: str) -> str:
 
 
 def with_offset(at_ns: int) -> str:
-    """Return a time in ISO 8601 with milliseconds and the offset of the local zone: people may type it again."""
+    """Return a time in ISO 8601 with milliseconds and the local zone's offset: commands accept it again."""
     if not _is_date(at_ns / _NS):
         return f"{at_ns} ns"
     seconds, rest = divmod(at_ns, _NS)
@@ -52,7 +52,7 @@ def with_offset(at_ns: int) -> str:
 def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
     """Return when a local time of day (`14:05`, `14:05:12`) begins on each day from `start_ns` to `end_ns`.
 
-    Only those that are not over at `start_ns` and begin by `end_ns`. None if the text is not a time of day.
+    Leave out times that are over at `start_ns` or begin after `end_ns`. Return None if the text is not a time of day.
     """
     found = _CLOCK.fullmatch(text)
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3] or 0) > 59:
@@ -62,14 +62,14 @@ def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
         hour=int(found[1]), minute=int(found[2]), second=int(found[3] or 0), microsecond=0, tzinfo=None
     )
     days = [first + timedelta(days=day) for day in range((end_ns - start_ns) // (86_400 * _NS) + 2)]
-    # On the day that summer time ends, an hour is there twice (fold). On the day that it begins, one is missing.
+    # On the day on which summer time ends, one hour comes twice (fold). On the day on which it begins, one is missing.
     both = [round(day.replace(fold=fold).timestamp()) for day in days for fold in (0, 1)]
     begins = [each * _NS for each in dict.fromkeys(both) if _local(each).time() == first.time()]
     return [each for each in begins if each + length_ns > start_ns and each <= end_ns]
 
 
 def clock_length_ns(text: str) -> int:
-    """Return how long a time as people type it lasts: a minute without seconds (`14:05`), else a second, ns."""
+    """Return the length of a time as people type it, ns: a minute if it has no seconds (`14:05`), else a second."""
     return (60 if text.count(":") == 1 else 1) * _NS
 
 
@@ -78,4 +78,4 @@ def _local(at_s: float) -> datetime:
 
 
 def _is_date(at_s: float) -> bool:
-    return 0 <= at_s < 2e11  # not so: the clock of another writer was wrong
+    return 0 <= at_s < 2e11  # a time outside comes from a writer whose clock was wrong

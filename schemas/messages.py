@@ -19,15 +19,15 @@ JSON: Final = "application/json"
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A message, and since when it counts: s, of the observer's clock."""
+    """A message, and the time from which its age counts: s, by the observer's clock."""
 
     message: Any
     at: float
     earlier: "tuple[Observation, ...]" = ()
-    """Those before it, as far as somebody looks at them; the newest last."""
+    """The observations before this one that somebody still needs, the newest last."""
 
     def aged(self, by_s: float) -> "Observation":
-        """Return the same, so much older."""
+        """Return this observation as if it were `by_s` older."""
         return Observation(self.message, self.at - by_s, tuple(each.aged(by_s) for each in self.earlier))
 
 
@@ -94,7 +94,7 @@ def log_message(at_ns: int, level: Level, name: str, words: str) -> Message:
 
 
 def level_of(message: Any) -> Level:
-    """Return the level of a foxglove.Log: DEBUG for one below, ERROR for one above those that we write."""
+    """Return the level of a foxglove.Log. A level below those that we write becomes DEBUG, one above them ERROR."""
     below = [level for level, number in _FOXGLOVE_LEVELS.items() if number <= message.level]
     return below[-1] if below else Level.DEBUG
 
@@ -105,7 +105,7 @@ def stamp_ns(stamp: Any) -> int:
 
 
 def stamp_ms(stamp: Any) -> int:
-    """Return a Timestamp as ms since the epoch. Nanoseconds out of range raise nothing, unlike in ToMilliseconds."""
+    """Return a Timestamp as ms since the epoch. Unlike ToMilliseconds, accept nanoseconds that are out of range."""
     return stamp_ns(stamp) // 1_000_000
 
 

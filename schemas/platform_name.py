@@ -1,6 +1,6 @@
 """The names of platforms as users write them: `arduino`, `raspberry_pi+arm+imu`, `stm32+head=BALA`, `auto`."""
 
-# A gateway checks the name before it joins the bus. The profiles would delay that by 10 ms.
+# A gateway checks the name before it joins the bus. Importing the profiles for that would take 10 ms.
 
 import re
 from typing import Final
@@ -13,21 +13,21 @@ OPTIONS: Final = frozenset({"arm", "imu"})
 # Programs of one family differ in these (docs/reference/protocol.md#programs-that-people-have).
 NO_READINGS: Final = "no_readings"
 VARIANTS: Final = ("text", NO_READINGS, "3s", "fan_level", "ptz_direct")
-"""Options that say in what this car's program differs."""
+"""Options that say how this car's program differs from the others."""
 HEAD: Final = "head"
-"""The option with a value: the first word of the frames."""
+"""The option with a value, which is the first word of the car's frames."""
 HEAD_PATTERN: Final = "[A-Za-z0-9]{2,8}"
 AUTO: Final = "auto"
 AUTO_PLATFORMS: Final = tuple(str(kind) for kind in Platform if kind is not Platform.UNKNOWN)
-"""The platforms that a gateway finds out by itself."""
+"""The platforms that a gateway can recognize by itself."""
 
 _KNOWN: Final = OPTIONS | frozenset(VARIANTS)
 OPTION_WORDS: Final = ", ".join(f"+{option}" for option in (*sorted(OPTIONS), *VARIANTS, f"{HEAD}=WORD"))
-"""All options, for a person."""
+"""All options, for the text of an error."""
 
 
 def normalize_name(text: str) -> str:
-    """Return a name in small letters, without a change of the head's value."""
+    """Return a name in lower case. The value of the head stays as it is."""
     return "+".join(_normalize_part(part) for part in text.split("+"))
 
 
@@ -37,7 +37,7 @@ def kind_of(name: str) -> str:
 
 
 def parse_name(text: str) -> tuple[Platform, frozenset[str]]:
-    """Return platform and options of a name such as `raspberry_pi+arm+imu` in any case. Raises ValueError if wrong."""
+    """Return platform and options of a name such as `raspberry_pi+arm+imu`, in any case. Raises ValueError."""
     kind, *options = normalize_name(text).split("+")
     if kind not in set(Platform):
         hint = did_you_mean(kind, Platform) or f"There are {', '.join(Platform)}."
@@ -57,7 +57,7 @@ def parse_name(text: str) -> tuple[Platform, frozenset[str]]:
 def check_head(value: str) -> None:
     """Raise ValueError unless the value is allowed as the first word of a frame."""
     if not re.fullmatch(HEAD_PATTERN, value):
-        raise ValueError(f'The head "{value[:40]}" is not allowed: 2 to 8 letters and digits, as in +{HEAD}=4WD.')
+        raise ValueError(f'The head "{value[:40]}" is not allowed: use 2 to 8 letters and digits, as in +{HEAD}=4WD.')
 
 
 def parse_option(text: str) -> tuple[str, bool]:

@@ -1,6 +1,6 @@
-"""The codes at the end of texts, and the codes of events, each with its meaning. The docs print these tables. Pure.
+"""The codes that stand at the end of texts, and the codes of events, each with its meaning. Pure.
 
-docs/how-to/troubleshooting.md has a section for each code. A test compares tables, source and page.
+docs/how-to/troubleshooting.md has a section for each code. A test compares these tables, the source and the page.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ REASONS: Final[dict[str, str]] = {
     Reason.WRITE_FAILED: "The link broke while the gateway wrote the command.",
     Reason.QUEUE_FULL: "Too many commands wait for the car.",
     Reason.EXPIRED: "The time of the command was over before the gateway could send it, or its sender disconnected.",
-    Reason.LAPSED: "A sample of a stream continues a drive that is over.",
+    Reason.LAPSED: "The command only continues a drive, and that drive is over.",
     Reason.SUPERSEDED: "A later command ended this one.",
     Reason.DUPLICATE: "A command with this id was accepted before.",
     Reason.STALE: "The command arrived too late, or its time is in the future.",
     Reason.NOT_SHOWN: "The car could have confirmed the stop, but did not.",
-    Reason.STUCK: "A wheel stood during the drive, so the gateway ended it.",
+    Reason.STUCK: "A wheel stood still during the drive, so the gateway ended the drive.",
     "no_answer": "No gateway answered for this car.",
     "no_result": "The gateway accepted the command, but its result did not arrive.",
 }
@@ -57,7 +57,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     ),
     "rhythm_changed": EventCode(Level.WARNING, "The car reports in another rhythm: another program, or another car."),
     "learns_again": EventCode(
-        Level.INFO, "What was learned about the car belongs to another link or platform, and does not count."
+        Level.INFO, "The saved knowledge about the car is of another link or platform, so the gateway learns again."
     ),
     "unheard": EventCode(Level.WARNING, "The car is silent for longer than any normal silence. It may be moving."),
     "answers_again": EventCode(Level.INFO, "The car sends readings again, and the gateway stops it first."),
@@ -70,7 +70,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     ),
     "moves_unasked": EventCode(Level.WARNING, "The car moves, and nobody here drives it. The gateway stops it."),
     "other_program": EventCode(Level.WARNING, "Another program talks to the car, and can drive it."),
-    "wheel_stands": EventCode(Level.WARNING, "A wheel stands in a drive. The gateway stops the car."),
+    "wheel_stands": EventCode(Level.WARNING, "A wheel stands still during a drive. The gateway stops the car."),
     "battery_ok": EventCode(Level.INFO, "The battery is above both limits again."),
     "battery_low": EventCode(Level.WARNING, "The battery is below the first limit."),
     "battery_critical": EventCode(Level.ERROR, "The battery is below the second limit."),
@@ -89,7 +89,9 @@ EVENTS: Final[dict[str, EventCode]] = {
     "no_frames": EventCode(Level.WARNING, "Bytes arrive, but never a frame: the baud rate may be wrong."),
     "port_shared": EventCode(Level.WARNING, "Another program reads the car's port, and bytes are missing."),
     "not_saved": EventCode(Level.ERROR, "The gateway could not save holds and e-stops to the disk."),
-    "other_link": EventCode(Level.WARNING, "A hold, loan or e-stop of another link is not taken over."),
+    "other_link": EventCode(
+        Level.WARNING, "A saved hold, loan or e-stop belongs to another link, so it does not apply."
+    ),
     "state_unreadable": EventCode(Level.WARNING, "The file of holds and e-stops is damaged, so the car is on hold."),
     "no_hub": EventCode(Level.ERROR, "The gateway cannot reach the bus."),
     "revoked": EventCode(

@@ -1,7 +1,7 @@
 """Decides who may do what with a car: people and ranks, e-stops, pauses, holds, loans and leases. Pure.
 
-Gateway, console and coordinator ask the same object. A gateway makes its `Authority` of its own state, everybody else
-of the `state/safety` that it publishes. Only the gateway decides; the others show beforehand what it would say.
+Gateway, console and coordinator use the same rules. A gateway makes its `Authority` from its own state, the others from
+the `state/safety` that it publishes. Only the gateway decides; the others show in advance what it would answer.
 
 Without people every person may drive every car, and nobody is a lead. A name on the bus is a convention: the gateway
 checks nobody's identity. A stop or an e-stop needs no right.
@@ -26,7 +26,7 @@ def strength(rank: Rank) -> int:
 
 
 def rank_of(text: str) -> Rank:
-    """Return the rank that a message names; that of a person for another version's word."""
+    """Return the rank that a message names. An unknown word, of another version, counts as PERSON."""
     return Rank(text) if text in tuple(Rank) else Rank.PERSON
 
 
@@ -51,7 +51,7 @@ class Sender:
         return name_of(self.name)
 
     def told_beside(self, other: "Sender") -> str:
-        """Return the name for a text; the whole name beside another program of the same person."""
+        """Return the name for a text that also names `other`: the whole name if both belong to the same person."""
         return self.name if self.person == other.person else self.text_name
 
 
@@ -80,7 +80,7 @@ class People:
 
     @classmethod
     def of(cls, message: Any) -> Self:
-        """Return the people in a fleet.v1.CarPeople, or None if the fleet has no people."""
+        """Return the people in a fleet.v1.CarPeople. None means that the fleet has no people."""
         if message is None:
             return cls()
         roles = dict.fromkeys(message.others, PersonRole.OTHER) | dict.fromkeys(message.drivers, PersonRole.DRIVER)
@@ -119,7 +119,7 @@ class People:
         return replace(sender, kind=Rank.LEAD if leads else Rank.PERSON)
 
     def role(self, person: str) -> PersonRole | None:
-        """Return what a person is to this car, or None for a person who is not listed."""
+        """Return the role of a person, or None for a person who is not listed. Without people everyone is a driver."""
         return PersonRole.DRIVER if self.roles is None else self.roles.get(person)
 
     def may_drive(self, person: str) -> bool:
@@ -131,10 +131,11 @@ class People:
         if rank is not Rank.LEAD or sender.kind is Rank.LEAD:
             return True
         if self.roles is None:
-            # A gateway without a table knows one lead: who began it. If another lead ends a pause or a fleet-wide
-            # e-stop at the other gateways, this one learns the end from them.
+            # Without a table, this gateway knows only one lead: the one who began it. If another lead ends a pause or
+            # a fleet-wide e-stop at the other gateways, this gateway learns of the end from them.
             return sender.kind is Rank.PERSON and sender.person == person_of(by)
-        # After a restart with another table there may be no lead: then the car must not stay stopped for ever.
+        # After a restart with another table there may be no lead left. Then anyone may end it, else the car would stay
+        # stopped for ever.
         return not self.leads
 
     def may_direct(self, sender: Sender) -> "Denial | None":
@@ -163,7 +164,7 @@ def _parse(entry: str) -> tuple[str, PersonRole]:
     return name, _ROLES[role]
 
 
-# ---------------------------------------------------------------------- what may keep somebody from a car
+# ---------------------------------------------------------------------- holds, e-stops, pauses, loans, leases
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,12 +219,12 @@ class Loan:
 
 @dataclass(frozen=True, slots=True)
 class LeaseState:
-    """The sender who controls the car. `until` is the gateway's monotonic time, s. Elsewhere it is not known."""
+    """The sender who controls the car. `until`: s, monotonic, known only to the gateway."""
 
     holder: Sender
     until: float = inf
     gone: bool = False
-    """True if the holder has disconnected. A sender of the same rank need not wait then."""
+    """True if the holder has disconnected. Then a sender of the same rank need not wait."""
 
     @property
     def by(self) -> str:
@@ -345,7 +346,7 @@ class Authority:
         )
 
     def may(self, sender: Sender, right: Right) -> Denial | None:
-        """Return why this sender may not do it, or None if it may. The sender has its rank, see `People.ranked`."""
+        """Return why this sender may not do it, or None if it may. `People.ranked` must have set the sender's rank."""
         people = self.people
         match right:
             case Right.MOVE | Right.TAKE:
@@ -369,9 +370,9 @@ class Authority:
                 return people.may_direct(sender)
 
     def may_resume(self, sender: Sender, ids: tuple[str, ...] = (), *, every: bool = False) -> Denial | None:
-        """Return why the sender may end nothing of what a resume names, or None if it may end some of it.
+        """Return why the sender may end nothing that a resume names, or None if it may end at least a part of that.
 
-        It names the e-stops `ids`, or the hold. With `every`, it names the hold and all e-stops.
+        The resume names the e-stops `ids`, or without ids the hold. With `every`, it names the hold and all e-stops.
         """
         hold = self.may(sender, Right.RESUME)
         if sender.kind is Rank.COORDINATOR:
@@ -399,8 +400,8 @@ class Authority:
     def may_end_estop(self, estop: Estop, sender: Sender) -> bool:
         """Return True if the sender may end this e-stop. The coordinator ends none.
 
-        Only a lead ends a lead's e-stop. One of a person is ended by who latched it, by who may drive this car, and if
-        it is fleet-wide by every person of the fleet, so that all gateways decide alike.
+        Only a lead may end a lead's e-stop. Another e-stop may be ended by the person who latched it and by all who may
+        drive this car. A fleet-wide one may be ended by every person of the fleet, so that all gateways decide alike.
         """
         people, person = self.people, sender.person
         if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
@@ -409,13 +410,13 @@ class Authority:
         return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
 
     def estop_stays(self, estop: Estop, sender: Sender) -> Denial:
-        """Return why an e-stop stays that the sender may not end."""
+        """Return why the sender may not end this e-stop."""
         if self.people.may_end(sender, estop.by, estop.rank):
             return self._may_drive_at_all(sender) or Denial(Bar.UNLISTED)
         return Denial(Bar.LEADS_ESTOP, estop)
 
     def _may_drive_at_all(self, sender: Sender) -> Denial | None:
-        """Return why the people keep this sender from the car. A loan to another person does not matter."""
+        """Return why the people of the fleet keep this sender from the car. Ignore a loan to another person."""
         loan = self.loan if self.loan is not None and self.loan.to == sender.person else None
         return replace(self, loan=loan).may_drive(sender)
 

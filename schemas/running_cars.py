@@ -1,4 +1,4 @@
-"""Which cars have a gateway on this computer, by locks in the state directory: known also while the hub is gone."""
+"""Lists the cars that have a gateway on this computer, by locks in the state directory, so it needs no hub."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -12,23 +12,23 @@ _SUFFIX: Final = ".running"
 
 
 class RunningMark:
-    """The mark of one gateway. It ends with its process, however that ends. `directory` has the state of its bus."""
+    """The mark of one gateway: a lock, which goes with the process in any case. `directory`: the state of its bus."""
 
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self._lock = FileLock(directory / f"{fleet}.{car}{_SUFFIX}")
 
     def renew(self) -> None:
-        """Set the mark, if it is not set. Call it again and again: who looks for marks takes one for a moment."""
+        """Set the mark if it is not set. Call it regularly: a program that looks for marks locks each for a moment."""
         with suppress(OSError):  # a full disk, or a place without locks: the gateway runs all the same
             self._lock.try_take()
 
     def end(self) -> None:
-        """Take the mark away."""
+        """Remove the mark."""
         self._lock.release()
 
 
 def running_cars(endpoint: str) -> list[str]:
-    """Return the cars of this bus with a gateway of this user on this computer: `red`, or `two/red` of fleet two."""
+    """Return the cars with a gateway of this user and bus on this computer: `red`, or `two/red` of fleet two."""
     found = []
     for path in sorted(directory_of(endpoint).glob(f"*{_SUFFIX}")):
         lock = FileLock(path)

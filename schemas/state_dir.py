@@ -38,7 +38,8 @@ def default_directory() -> Path:
 
 def directory_of(endpoint: str, directory: Path | None = None) -> Path:
     """Return the state directory of one bus, so that fleets of one name at two hubs do not share state."""
-    # The default endpoint uses the directory itself, as all endpoints did before. So e-stops survive the upgrade.
+    # The default endpoint uses the directory itself, as all endpoints did in older versions, so that e-stops survive an
+    # upgrade.
     directory = default_directory() if directory is None else directory
     endpoint = _LOCALHOST.sub("127.0.0.1", endpoint.lower())
     if endpoint == DEFAULT_ENDPOINT:

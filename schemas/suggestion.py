@@ -1,7 +1,7 @@
-"""Words for users that name the likely fix: the name that was meant, and how to install an extra. Pure.
+"""Suggests to users what to type instead: the name that was meant, or how to install an extra. Pure.
 
-One rule for all: a name is near if few letters differ, or if the word begins it, or begins a part of it. A name that is
-only somewhat like the word is never suggested: who types `parking` does not mean `tracking`.
+There is one rule: a name is near a word if few letters differ, or if the name or a part of it begins with the word. A
+name that is only somewhat like the word is never suggested: whoever types `parking` does not mean `tracking`.
 """
 
 import re
@@ -9,14 +9,14 @@ from collections.abc import Iterable
 from typing import Final
 
 _LETTERS_PER_FAULT: Final = 3
-"""Letters of a word for each letter that may be wrong, missing, too much or swapped; one always may."""
+"""For every three letters of a word, one may be wrong, missing, extra or swapped; in a shorter word, one may be too."""
 _MIN_PART_LENGTH: Final = 3
-"""Minimum length of a word that is searched at the beginning of the parts of names."""
+"""Minimum length of a word that is looked for at the beginning of parts of names."""
 _NO_WORD: Final = re.compile(r"[^a-z0-9]+")
 
 
 def misspelled(wrong: str, names: Iterable[str]) -> list[str]:
-    """Return the names from which only few letters of the word differ, the nearest first."""
+    """Return the names that differ from the word in only few letters, the nearest first."""
     word = wrong.lower()
     allowed = min(max(1, len(word) // _LETTERS_PER_FAULT), len(word) - 1)
     found = [(_faults(word, name.lower()), name) for name in names if abs(len(name) - len(word)) <= allowed]
@@ -34,7 +34,7 @@ def near_names(wrong: str, names: Iterable[str]) -> list[str]:
 
 
 def _faults(word: str, name: str) -> int:
-    """Return how many letters are wrong, missing, too much, or swapped with the next one."""
+    """Return how many letters are wrong, missing, extra, or swapped with the next one."""
     rows = [list(range(len(name) + 1))]
     for at, letter in enumerate(word, 1):
         row = [at]

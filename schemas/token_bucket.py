@@ -1,4 +1,4 @@
-"""Limits a rate: a burst, and so much in the long run. Pure."""
+"""Limits how often something may happen: in a burst, and per second in the long run. Pure."""
 
 from dataclasses import dataclass, field
 

@@ -13,9 +13,9 @@ from schemas.words import UNKNOWN, Basis, BatteryLevel, LinkState, Mode, Motion,
 
 PROTOBUF: Final = "application/protobuf"
 HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
-# A hub or a recorder is back after two or three seconds.
+# A hub or a recorder that restarts is back after two or three seconds.
 CACHE_S: Final = 10.0
-"""Time for which a publisher caches its publications for backfill."""
+"""Time for which a publisher keeps its publications for backfill."""
 _MIN_CACHE_SIZE: Final = 100  # events and states come in bursts
 
 
@@ -46,7 +46,7 @@ class Topic:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lowest and highest published value by field (docs/reference/protocol.md#readings)."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """All published values by field, where a field has one of a few words."""
+    """The possible words by field, for fields whose value is one of a few words."""
     recorded: bool = True
     entity: str = ""
     """Rerun entity below the car. Empty if it is shown through frames and logs only."""
@@ -58,7 +58,7 @@ class Topic:
 
     @property
     def family(self) -> str:
-        """`sensor`, `state`, `frame`, `event` or `sim`. The service's name for the topics of a service."""
+        """`sensor`, `state`, `frame`, `event` or `sim`; for a topic of a service, the name of the service."""
         return self.name.partition("/")[0]
 
     @property
@@ -151,7 +151,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sensor/odometer",
         "fleet.v1.Odometer",
-        "way of the wheels since the car was switched on",
+        "distance that the wheels have covered since the car was switched on",
         Qos.READING,
         20.0,
         _READING,
@@ -172,7 +172,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sensor/pose",
         "fleet.v1.Pose",
-        "where the car is, by odometry or a program outside of it",
+        "where the car is, by its odometry or a program outside the car",
         Qos.READING,
         20.0,
         _READING,
@@ -205,7 +205,7 @@ CAR_TOPICS: Final = (
     Topic(
         "state/mode",
         "fleet.v1.Mode",
-        "mode asked, inferred and the evidence",
+        "the mode that was asked for, the mode that the readings show, and the evidence",
         Qos.STATE,
         1.0,
         _STATE,
@@ -289,7 +289,7 @@ SERVICE_TOPICS: Final = (
     Topic(
         "@recorder/status",
         "fleet.v1.Recording",
-        "the recorder",
+        "the state of the recorder",
         Qos.STATE,
         1.0,
         _STATE,
@@ -310,7 +310,7 @@ SERVICE_TOPICS: Final = (
     Topic(
         "@sim/world",
         "fleet.v1.World",
-        "a simulated world with lamps, things or cars that meet: where all is but the cars",
+        "a simulated world with lamps, things or cars that meet: where everything is except the cars",
         Qos.READING,
         10.0,
         _STATE,
@@ -321,11 +321,12 @@ SERVICE_TOPICS: Final = (
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
 
 FROM_OUTSIDE: Final = frozenset({"sensor/pose"})
-"""Readings that a program outside of the car may publish, of any car and in any mode. They are not a sign of life."""
+"""Readings that a program outside the car may publish, for any car and in any mode. They do not show that the car is
+alive."""
 RESULT: Final = "fleet.v1.Result"
 _FAMILIES: Final = tuple(dict.fromkeys(topic.family for topic in CAR_TOPICS))
 _MIN_WORD_LENGTH: Final = 4
-"""Minimum length of a word that is searched in what topics are about: shorter ones are in many texts."""
+"""Minimum length of a word that is looked up in the descriptions of topics: shorter words are in many of them."""
 
 
 def of_key(key: str) -> Topic | None:
@@ -337,9 +338,9 @@ def of_key(key: str) -> Topic | None:
 
 
 def likely_name(name: str) -> str | None:
-    """Return the topic that was probably meant by a wrong name: `sensor/rang` or `sensor/distance` is sensor/range."""
+    """Return the topic that a wrong name probably means: sensor/range for `sensor/rang` and for `sensor/distance`."""
     family, _, last = name.rpartition("/")
-    # The last part decides: with the family, any two topics of one family would be alike.
+    # Compare only the last part: with the family, any two topics of one family would be near each other.
     there = sorted(TOPICS, key=lambda each: (each.rpartition("/")[0] != family, each.startswith("@")))
     parts = [each.rpartition("/")[2] for each in there]
     if last == "*" or (not family and last not in parts):
@@ -353,7 +354,7 @@ def likely_name(name: str) -> str | None:
 
 
 def _topic_about(word: str, there: list[str]) -> str | None:
-    """Return the first topic that is about this word, or that has a field of this name. None if none is."""
+    """Return the first topic with this word in its description or in a field's name, or None."""
     about: dict[str, str] = {}
     for name in there:
         for each in re.findall(r"[a-z]+", f"{TOPICS[name].about} {' '.join(TOPICS[name].units)}".lower()):

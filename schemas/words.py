@@ -1,8 +1,8 @@
-"""The closed sets of words: whatever a field of a message, a key or a file names by one of a few words. Pure.
+"""The closed sets of words: the values of fields, parts of keys and entries of files that allow only a few. Pure.
 
-A word has the same spelling in messages, files, commands and code. What a word is on a car's wire is in
+A word has the same spelling in messages, files, commands and code. How a word is written on a car's wire is in
 `gateway.drivers.yahboom.protocol`. Messages hold words as text, so another version's word never breaks a reader. The
-verbs are in `commands`, each beside what is true of it.
+verbs are in `commands`, each with its properties.
 """
 
 from enum import StrEnum
@@ -34,7 +34,7 @@ class Motion(StrEnum):
 
 
 class Mode(StrEnum):
-    """A mode of the car's program. In `MANUAL` its driver steers; in the others it moves by itself or only shines."""
+    """A mode of the car's program. In `MANUAL` the car is driven; in the others it moves by itself or only shines."""
 
     MANUAL = "manual"
     REMOTE_CONTROL = "remote_control"
@@ -47,7 +47,7 @@ class Mode(StrEnum):
 
 MODE_TEXTS: Final = {
     Mode.MANUAL: ("Manual", "Stops the car. Then you drive it."),
-    Mode.REMOTE_CONTROL: ("Infrared remote", "Only the infrared remote drives the car. It reports nothing."),
+    Mode.REMOTE_CONTROL: ("Infrared remote", "Only the infrared remote drives the car. The car reports nothing."),
     Mode.TRACKING: ("Line tracking", "Drives off at once, along a line on the floor."),
     Mode.OBSTACLE_AVOIDANCE: (
         "Obstacle avoidance",
@@ -133,7 +133,7 @@ CAPABILITIES: Final = (
     *("mode", "led", "servo_deg", "arm", "servo_vertical", "servo_horizontal"),
     *("drive", "whistle", "speed", "servo", "fan", "light"),
 )
-"""What a car may be able to do, as `state/health` lists it. First those that some cars lack."""
+"""What cars may be able to do, as `state/health` lists it. Capabilities that some cars lack come first."""
 
 
 class Rank(StrEnum):
@@ -187,14 +187,14 @@ class Reason(StrEnum):
     QUEUE_FULL = "queue_full"
     EXPIRED = "expired"
     LAPSED = "lapsed"
-    """The drive that a sample of a stream continues is over."""
+    """The command only continues a drive, and that drive is over."""
     SUPERSEDED = "superseded"
     DUPLICATE = "duplicate"
     STALE = "stale"
     NOT_SHOWN = "not_shown"
     """The car could have shown the stop and did not."""
     STUCK = "stuck"
-    """A wheel stood in the drive."""
+    """A wheel stood still during the drive."""
 
 
 # ------------------------------------------------------------------ states
@@ -226,12 +226,12 @@ class MotionSource(StrEnum):
 
 
 class Motors(StrEnum):
-    """The claim about a car's motors. What `off` rests on is a `Basis`."""
+    """The claim about a car's motors. A `Basis` is the evidence for `off`."""
 
     OFF = "off"
     ON = "on"
     STOPPING = "stopping"
-    """Frames of a stop were sent, and nothing is shown yet."""
+    """The frames of a stop were sent, but the car has not shown the stop yet."""
     UNKNOWN = "unknown"
 
 
@@ -335,7 +335,7 @@ class FrameOrigin(StrEnum):
     STOP = "stop"
     RECOVERY = "recovery"
     SETUP = "setup"
-    """What prepares a car, asks it, or keeps its link alive: no motion and no stop."""
+    """A frame that sets the car up, queries it, or keeps its link alive. It is no motion and no stop."""
     SHUTDOWN = "shutdown"
 
 
@@ -371,7 +371,7 @@ class RecorderState(StrEnum):
 
 
 class PinCause(StrEnum):
-    """Why a time of a recording is pinned, so that the quota takes it last."""
+    """Why a time of a recording is pinned, so that the quota deletes it last."""
 
     CONDITION = "condition"
     """A condition of the fleet file."""

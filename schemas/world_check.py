@@ -1,7 +1,7 @@
-"""Checks a world file (YAML 1.2): each field, and what no single field shows: shapes, places and carriers. Pure.
+"""Checks a world file (YAML 1.2): each field alone, then shapes, places and carriers, which several fields make. Pure.
 
-Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. `world` has the fields. The simulator
-builds a world of what passes, and `fleet check` only asks whether it passes.
+Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. `world_fields` has the fields. The
+simulator builds a world from a file that passes. `fleet check` only reports whether it passes.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ MIN_SIZE_M: Final = 0.02
 def check_world(text: str, source: str, cars: Sequence[str] | None = None) -> WorldEntry:
     """Return the fields of the world in a text. Raises BadFile with every fault, if any.
 
-    `source` is the name of the file in errors. `cars` has the cars that can carry something. None means any car.
+    `source` is the name of the file in errors. `cars` are the cars that can carry something; None: any car.
     """
     document = Document(text, source)
-    # Other faults are searched in what remains without the faulty values.
+    # Look for further faults in the values that are valid.
     entry = document.validate(WorldEntry) or document.validate_partial(WorldEntry, {})
     if entry is not None:
         _WorldCheck(document, entry, cars).check()
@@ -53,7 +53,8 @@ class _WorldCheck:
     def check(self) -> None:
         for index, (x1, y1, x2, y2) in enumerate(self._entry.walls):
             if hypot(x2 - x1, y2 - y1) < MIN_SIZE_M:
-                self._document.report(("walls", index), f"is shorter than {MIN_SIZE_M:g} m: write [x1, y1, x2, y2]")
+                words = f"is shorter than {MIN_SIZE_M:g} m (a wall is [x1, y1, x2, y2])"
+                self._document.report(("walls", index), words)
         self._check_line()
         for name, thing in self._entry.things.items():
             self._check_thing(name, thing)
@@ -62,7 +63,7 @@ class _WorldCheck:
         self._check_starts()
 
     def _given(self, where: Where, entry: Entry) -> set[str]:
-        """Return the names of the fields in the file, also of those with a faulty value."""
+        """Return the names of the fields that the file has, including fields with a faulty value."""
         faulty = {name for name in type(entry).model_fields if self._document.is_faulty((*where, name))}
         return entry.model_fields_set | faulty
 
@@ -74,18 +75,18 @@ class _WorldCheck:
                 words = f"{line.radius_m:g} is not allowed: up to half of the shorter side, {most:g}"
                 self._document.report(("line", "radius_m"), words)
         elif line and len(set(line)) < 3:
-            self._document.report(("line",), "is a closed loop: at least 3 points [x, y]")
+            self._document.report(("line",), "needs at least 3 different points [x, y], because it is a closed loop")
 
     def _check_thing(self, name: str, entry: ThingEntry) -> None:
         report, where = self._document.report, ("things", name)
         given = self._given(where, entry)
         sides = {"width_m", "depth_m"} & given
         if ("radius_m" in given) == bool(sides):
-            report(where, "is a disc or a box: write radius_m, or width_m and depth_m")
+            report(where, "must be a disc or a box: write radius_m, or width_m and depth_m")
         elif len(sides) == 1:
-            report((*where, "depth_m" if "width_m" in given else "width_m"), "is missing: a box has both")
+            report((*where, "depth_m" if "width_m" in given else "width_m"), "is missing: a box needs both")
         if entry.path and len(set(entry.path)) < 2:
-            report((*where, "path"), "has at least 2 points [x, y] that differ")
+            report((*where, "path"), "needs at least 2 different points [x, y]")
         for other in ("x_m", "y_m", "carried_by"):
             if {"path", other} <= given:
                 report((*where, other), "is not allowed beside a path: the path gives its place")
@@ -93,15 +94,15 @@ class _WorldCheck:
             if "path" not in given and other in given:
                 report((*where, other), "is not allowed without a path")
         if "path" not in given:
-            self._check_place(where, given, "where it stands, or a path, or carried_by")
+            self._check_place(where, given, "write where it stands, or a path, or carried_by")
         if entry.carried_by:
-            self._check_carrier(where, entry.carried_by)
+            self._check_carrier(where, entry.carried_by, "car")
 
     def _check_lamp(self, name: str, entry: LampEntry) -> None:
         where = ("lamps", name)
-        self._check_place(where, self._given(where, entry), "where it stands, or carried_by")
+        self._check_place(where, self._given(where, entry), "write where it stands, or carried_by")
         if entry.carried_by and not self._is_thing(entry.carried_by):
-            self._check_carrier(where, entry.carried_by)
+            self._check_carrier(where, entry.carried_by, "car or thing")
 
     def _is_thing(self, name: str) -> bool:
         return name in self._entry.things or self._document.is_faulty(("things", name))
@@ -111,14 +112,14 @@ class _WorldCheck:
             if not {name, "carried_by"} & given:
                 self._document.report((*where, name), f"is missing: {needed}")
 
-    def _check_carrier(self, where: Where, name: str) -> None:
+    def _check_carrier(self, where: Where, name: str, kind: str) -> None:
         if self._cars is not None and name not in self._cars:
-            words = f"no car or thing {name!r} is simulated here: use {', '.join(self._cars) or 'a --car'}"
-            self._document.report((*where, "carried_by"), words)
+            todo = f"use {', '.join(self._cars)}" if self._cars else "add a car with --car"
+            self._document.report((*where, "carried_by"), f"no {kind} {name!r} is simulated here: {todo}")
 
     def _check_starts(self) -> None:
         report, entry, walls = self._document.report, self._entry, walls_of(self._entry)
-        # A thing with a fault of its own may not be where the file wants it.
+        # A thing with a fault is skipped: its place may be wrong.
         solid = {
             name: each
             for name, each in entry.things.items()
@@ -131,13 +132,13 @@ class _WorldCheck:
             if room is not None and (abs(x) > room.width_m / 2 or abs(y) > room.depth_m / 2):
                 report(where, "begins outside the room")
             elif inside or any(distance(x, y, wall) < RADIUS_M for wall in walls):
-                report(where, f"begins in a wall: at least {RADIUS_M:g} m from each")
+                report(where, f"begins in a wall: keep at least {RADIUS_M:g} m from every wall")
             for thing in (each for each in solid if _is_in(solid[each], x, y)):
-                report(where, f"begins in {thing}, a thing: at least {RADIUS_M:g} m from it")
+                report(where, f"begins in {thing}, a thing: keep at least {RADIUS_M:g} m from it")
         for (one, first), (other, second) in combinations(entry.cars.items(), 2):
             away = hypot(first.x_m - second.x_m, first.y_m - second.y_m)
             if entry.cars_meet and away < 2 * RADIUS_M:
-                words = f"begins {away:.2g} m from {one}: at least {2 * RADIUS_M:g} m, or write cars_meet: false"
+                words = f"begins {away:.2g} m from {one}: keep at least {2 * RADIUS_M:g} m, or write cars_meet: false"
                 report(("cars", other), words)
 
     def _is_faulty(self, where: Where) -> bool:

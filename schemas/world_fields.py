@@ -1,4 +1,4 @@
-"""The fields of a world file. `world_check` checks what no single field shows. Pure."""
+"""The fields of a world file. `world_check` checks how the fields fit together. Pure."""
 
 from typing import Annotated, Final
 
@@ -42,7 +42,7 @@ class LineEntry(Entry):
 
     width_m: _Size = Field(description="its size along x, meters")
     depth_m: _Size = Field(description="its size along y, meters")
-    radius_m: _Size = Field(description="of its corners, meters: at most half of the shorter side")
+    radius_m: _Size = Field(description="the radius of its corners, meters: at most half of the shorter side")
 
 
 class StartEntry(Entry):
@@ -56,8 +56,8 @@ class StartEntry(Entry):
 class ThingEntry(Entry):
     """A disc or a box that stands, moves along a path, or is carried by a car."""
 
-    # Default factories keep defaults that mean nothing out of the schema for editors. `world_check` finds out what is
-    # missing or too much.
+    # A field whose default means nothing has a default factory, so that the schema for editors shows no default.
+    # `world_check` reports fields that are missing or not allowed.
     x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of the car's middle")
     y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of the car's middle")
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
@@ -82,11 +82,11 @@ class LampEntry(Entry):
     """A lamp that the light sensors see, if nothing is in between."""
 
     x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of its carrier's middle")
-    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of that")
-    reach_m: float = Field(default=1.5, gt=0, le=100, description="it is seen from this far with a brightness of 1")
-    brightness: float = Field(default=1.0, ge=0, le=100, description="4 is seen from twice as far")
+    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, left of its carrier's middle")
+    reach_m: float = Field(default=1.5, gt=0, le=100, description="how far away it is seen with brightness 1, meters")
+    brightness: float = Field(default=1.0, ge=0, le=100, description="with 4, it is seen from twice as far as with 1")
     on: bool = Field(default=True, description="whether it is lit")
-    overhead: bool = Field(default=False, description="true: nothing throws a shadow")
+    overhead: bool = Field(default=False, description="true: nothing blocks its light")
     carried_by: _Name = Field(default_factory=str, description="the thing or car that it moves with")
 
 
@@ -113,5 +113,5 @@ class WorldEntry(Entry):
         default_factory=dict, max_length=_MAX_ITEMS, description="lamps that light sensors see"
     )
     things: dict[_Name, ThingEntry] = Field(
-        default_factory=dict, max_length=_MAX_ITEMS, description="discs and boxes: seen, bumped into, followed"
+        default_factory=dict, max_length=_MAX_ITEMS, description="discs and boxes, which cars see, bump into and follow"
     )

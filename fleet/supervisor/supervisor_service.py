@@ -122,7 +122,7 @@ class SupervisorService:
         for expression in SUBSCRIPTIONS:
             self.bus.subscribe(f"{self.fleet}/{expression}", samples)
         await asyncio.sleep(SECOND_CHECK_DELAY_S)
-        await asyncio.to_thread(singleton.check_first)
+        await asyncio.to_thread(singleton.raise_unless_first)
 
     def publish(self, status: pb.Supervision) -> None:
         """Publish the status."""

@@ -1,7 +1,8 @@
 """The Zenoh bus, for every process of the fleet.
 
-Read `session` first: `Bus` is one Zenoh session. `endpoint` finds or starts the `hub`, `publisher` publishes a topic,
-`sample` and `replies` are the messages that come in and go out. `handover` passes them from Zenoh's threads to a loop.
+Read `zenoh_session` first: `Bus` is one Zenoh session. `endpoint` finds or starts the `hub`, `publisher` publishes a
+topic. `sample` has the messages that come in, `replies` those that go out. `handover` passes messages from Zenoh's
+threads to a loop.
 `hub_keeper` restarts a lost hub, `singleton` makes sure that there is only one service of a kind.
 """
 

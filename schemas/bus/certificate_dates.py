@@ -1,6 +1,6 @@
-"""The dates of a certificate, read without a library of cryptography, which each command would load. Pure.
+"""Reads the dates of a certificate without a library of cryptography, which each command would have to load. Pure.
 
-Only for certificates in our own directory, which we made: nothing is checked here.
+Nothing is checked here, so use it only for certificates in our own directory, which we made.
 """
 
 import binascii
@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Final, Self
 
 RENEWED_SHARE: Final = 1 / 3
-"""Share of a certificate's life before its end in which it is renewed."""
+"""Share of a certificate's life that is left when it is renewed."""
 _PEM: Final = re.compile(rb"-----BEGIN CERTIFICATE-----([^-]+)-----END CERTIFICATE-----")
 # RFC 5280, 4.1.2.5: Validity is two times in a row, UTCTime to 2049 and GeneralizedTime after it.
 _TIME: Final = rb"(?:\x17\x0d(\d{12}Z)|\x18\x0f(\d{14}Z))"
@@ -37,7 +37,7 @@ class CertificateDates:
             return None
 
     def is_due(self, now: datetime) -> bool:
-        """Return True from a third of its life before its end."""
+        """Return True if at most a third of its life is left."""
         return now >= self.ends - (self.ends - self.begins) * RENEWED_SHARE
 
 

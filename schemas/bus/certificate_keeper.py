@@ -1,7 +1,7 @@
-"""Keeps the certificate of a session in force: asks for the next one in time, and lets the session go on with it.
+"""Renews the certificate of a session in time, and makes the session use the new one.
 
-Each program has one for its session, so the next certificate also comes to a computer on which only commands run. If
-another program of the same identity was first, its certificate is taken from the file.
+Each program has such a keeper for its session, so a certificate is also renewed on a computer on which only commands
+run. If another program with the same identity has renewed it first, the new certificate is read from the file.
 """
 
 import sys
@@ -15,16 +15,16 @@ from schemas.bus.credentials import Credentials
 from schemas.bus.errors import BusError
 
 CHECK_INTERVAL: Final = timedelta(minutes=10)
-"""Interval at which a program looks at its certificate, and asks again for the next one."""
+"""Interval at which a program looks at its certificate, and at which it repeats a failed renewal."""
 SHORTEST_CHECK_INTERVAL: Final = timedelta(seconds=1)
 SHARE_OF_A_CHECK: Final = 0.1
-"""The same as a share of the time that a certificate has left, if that is shorter."""
+"""The same interval as a share of the time that the certificate has left. The shorter of the two counts."""
 WARNED_SHARE: Final = 0.1
-"""Share of a certificate's life before its end in which a program says that nobody renews it."""
+"""Share of a certificate's life that is left when a program warns that nobody has renewed it."""
 RENEWAL_QUERY_TIMEOUT_S: Final = 10.0
 """Timeout of a request to the hub, which starts a process to sign the certificate."""
 REOPEN_DELAY_S: Final = 5.0
-"""Time until a session goes on with the next certificate. Most commands have ended by then: no need for them."""
+"""Time until a session uses the new certificate. Most commands have ended by then, and need not reopen theirs."""
 
 
 class CertificateKeeper(threading.Thread):
@@ -40,7 +40,7 @@ class CertificateKeeper(threading.Thread):
         closing: threading.Event,
         clock: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        """Begin with the certificate that is in the file now. ask, reopen: of the session."""
+        """Begin with the certificate that is in the file now. `ask` and `reopen` are functions of the session."""
         super().__init__(name="bus-certificate", daemon=True)
         self._credentials = credentials
         self._identity = identity
@@ -58,7 +58,7 @@ class CertificateKeeper(threading.Thread):
             wait_s = self.check()
 
     def check(self) -> float:
-        """Do what there is to do now. Return the time until the next check, s."""
+        """Renew the certificate if it is due, or use a new one. Return the time until the next check, s."""
         now = self._clock()
         found = self._credentials.dates(self._identity)
         if found is None or self._used is None:
@@ -78,7 +78,7 @@ class CertificateKeeper(threading.Thread):
         return max(SHORTEST_CHECK_INTERVAL, min(CHECK_INTERVAL, left)).total_seconds()
 
     def _renew(self, now: datetime) -> str:
-        """Store the next certificate. Return why there is none, or an empty text if it is stored."""
+        """Fetch and store the next certificate. Return why that failed, or an empty text if it is stored."""
         return renew_file(self._credentials, self._identity, self._identity, now, lambda _, request: self._ask(request))
 
     def _warn(self, found: CertificateDates, now: datetime, why: str) -> None:
@@ -86,17 +86,18 @@ class CertificateKeeper(threading.Thread):
             self._has_warned = True
             sys.stderr.write(
                 f"The certificate of {self._identity} ends on {found.ends:%Y-%m-%d}, and the hub has not renewed it: "
-                f"{why}. After that it cannot even stop a car. `fleet hub invite` there and `fleet join` here renew "
-                "it, too.\n"
+                f"{why}. After that it cannot even stop a car. `fleet hub invite` on the hub's computer and "
+                "`fleet join` here renew it, too.\n"
             )
 
 
 def renew_file(
     credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[str, bytes], bytes]
 ) -> str:
-    """Store the next certificate of an identity. Return why there is none, or an empty text if it is stored.
+    """Fetch and store the next certificate of an identity. Return why that failed, or an empty text if it is stored.
 
-    identity: empty: as the certificate names it. file: of the certificate. ask: asks the hub for an identity.
+    Without `identity`, use the one in the certificate. `file` is the name of the certificate's file. `ask` sends an
+    identity and its request to the hub, and returns the answer.
     """
     try:
         from schemas.bus import certificate_request  # cryptography takes a while to load

@@ -1,4 +1,4 @@
-"""Asks the hub for the next certificate of an identity, with the key that it has: the key never leaves its computer.
+"""Asks the hub for the next certificate of an identity. The key stays the same, and never leaves this computer.
 
 The library of cryptography takes a while to load, so programs import this module when a certificate is due.
 """
@@ -29,7 +29,7 @@ def identity_in(path: Path) -> str:
 
 
 def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[bytes], bytes]) -> str:
-    """Store the next certificate of an identity. Return why there is none, or an empty text if it is stored.
+    """Fetch and store the next certificate of an identity. Return why that failed, or an empty text if it is stored.
 
     file: name of the certificate's file. `ask` sends a request to the hub, and returns the answer; empty if there is
     none.
@@ -46,11 +46,11 @@ def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask
     answer = ask(json.dumps(asked).encode())
     dates = CertificateDates.of(answer)
     if dates is None or dates.is_due(now):
-        return "the hub gives no certificate"
+        return "the hub gave no certificate"
     try:
         if x509.load_pem_x509_certificate(answer).public_key() != key.public_key():
             return "the certificate of the hub is for another key"
     except ValueError:
-        return "the hub gives no certificate"
+        return "the hub gave no certificate"
     write_atomically(path, answer, sync=True, private=True)
     return ""

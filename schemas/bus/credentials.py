@@ -67,7 +67,7 @@ class Credentials:
     def identity(self, wanted: str = "") -> str:
         """Return the wanted identity, by default that of the user, if its certificate is here. Raises NoCredentials.
 
-        A gateway that spoke as somebody else would be heard by nobody, without a word.
+        Never use another certificate instead: the hub would drop the messages of such a gateway without an error.
         """
         names = (wanted, self.me) if wanted in AS_THE_USER else (wanted or self.me,)
         for name in names:
@@ -107,7 +107,7 @@ class Credentials:
             return None
 
     def why_invalid(self, identity: str, now: datetime) -> str:
-        """Return why a hub refuses the certificate of an identity here: it has ended, or not begun. Else empty."""
+        """Return why a hub refuses this identity's certificate: it has ended, or not yet begun. Empty if neither."""
         dates = self.dates(identity)
         if dates is None or dates.begins <= now < dates.ends:
             return ""
@@ -150,7 +150,7 @@ class Credentials:
 
     @property
     def first_hubs(self) -> list[str]:
-        """Return the endpoints of the hub to which the hub of this site links; none if it is the first one itself."""
+        """Return the endpoints of the first hub, to which this site's hub links. Empty if this is the first hub."""
         try:
             return list(self.hub_settings()[CONNECT])
         except NoCredentials:
@@ -170,7 +170,7 @@ class Credentials:
         write_atomically(self.directory / HUB_FILE, json.dumps(made, indent=1).encode(), sync=True, private=True)
 
     def hub_settings(self) -> dict[str, Any]:
-        """Return what the hub's file has. Raises NoCredentials."""
+        """Return the content of the hub's file. Raises NoCredentials."""
         path = self.directory / HUB_FILE
         try:
             found = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Declarations of a bus, which can be repeated in its next session (`Bus.reopen`)."""
+"""The declarations of a bus, each of which can be repeated in the bus's next session (`Bus.reopen`)."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,7 +10,7 @@ import zenoh
 from schemas.bus.overlap import Overlap, mark_of_sample
 
 Declare = Callable[[zenoh.Session, int], Any]
-"""Declares something in a session. The number is that of the session: the callbacks of each know which one it is."""
+"""Declares something in a session. The number is the session's: a callback must know over which one it is called."""
 
 
 class Declared:
@@ -19,7 +19,7 @@ class Declared:
     def __init__(self, declare: Declare) -> None:
         self._declare = declare
         self.current: list[Any] = []
-        """The declarations of Zenoh, one for each session that is open; the newest is the last."""
+        """Zenoh's own declarations, one for each open session, the newest last."""
         self.is_over = False
 
     def __enter__(self) -> Self:
@@ -44,7 +44,7 @@ class Declared:
             self.current.pop(0).undeclare()
 
     def keep_oldest(self) -> None:
-        """Forget it in all sessions but the oldest, which the others end with."""
+        """Keep it only in the oldest session. The others are about to close, and end their declarations."""
         del self.current[1:]
 
 
@@ -56,10 +56,10 @@ class SampleChannel(Declared):
         self._declaration = declaration
         self._older_is_over = False
         self.try_recv: Callable[[], zenoh.Sample | None] = lambda: None
-        """Return the next sample, None if there is none. It is Zenoh's own method: a call in between costs."""
+        """Return the next sample, or None if there is none. It is Zenoh's own method, as a wrapper would cost time."""
 
     def add(self, session: zenoh.Session, number: int) -> None:
-        """Declare it in a session. Two are read until the older one is over and empty."""
+        """Declare it in a session. Read two declarations until the older one has ended and is empty."""
         super().add(session, number)
         if len(self.current) == 1:
             self.try_recv = self.current[0].handler.try_recv
@@ -68,12 +68,12 @@ class SampleChannel(Declared):
         self._read_both(self.try_recv, self.current[-1].handler.try_recv)
 
     def keep_newest(self) -> None:
-        """End it in all sessions but the newest. What the older ones still hold can be read."""
+        """End it in all sessions but the newest. Samples that the older ones still hold can be read."""
         super().keep_newest()
         self._older_is_over = True
 
     def keep_oldest(self) -> None:
-        """Forget it in all sessions but the oldest, which the others end with."""
+        """Keep it only in the oldest session. The others are about to close, and end their declarations."""
         super().keep_oldest()
         self.try_recv = self.current[0].handler.try_recv
 

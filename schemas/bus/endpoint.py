@@ -23,8 +23,8 @@ _RETRY: Final = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_f
 LOOPBACK: Final = "127.0.0.1"
 LOOPBACK_TIMEOUT_S: Final = 1.0
 NETWORK_TIMEOUT_S: Final = 3.5
-"""Time for the answer of a listener. A TCP stack sends the first packet of a connection again after 1 s and after 3 s,
-so two may be lost. Where each way loses 5 %, one second was too short for 19 of 200 connections."""
+"""Timeout for the answer of a listener. A TCP stack repeats the first packet of a connection after 1 s and after 3 s,
+so two may be lost. On a network that lost 5 % each way, a timeout of 1 s was too short for 19 of 200 connections."""
 _LOOPBACK_HOSTS: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
@@ -65,7 +65,7 @@ def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
     if not insecure_lan and not is_loopback(endpoint) and not is_secure(endpoint):
         raise BadEndpoint(
             f"a hub at {endpoint} would let everyone on that network drive the cars: "
-            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or accept it with --insecure-lan"
+            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or allow it with --insecure-lan"
         )
 
 
@@ -80,12 +80,12 @@ def _common(link: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_secure(endpoint: str) -> bool:
-    """Return True if links to the endpoint have certificates."""
+    """Return True if links to the endpoint need certificates."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def router_settings(endpoint: str) -> dict[str, Any]:
-    """Return the settings of the hub in Zenoh's form. All others are its clients. Raises BadEndpoint, BusError."""
+    """Return the settings of the hub in Zenoh's form. Raises BadEndpoint, BusError."""
     _host_and_port(endpoint)
     listen: dict[str, Any] = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
     if not is_secure(endpoint):
@@ -130,14 +130,15 @@ def accepts(endpoint: str) -> bool:
 
 def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     """Start a hub if nothing accepts connections at a loopback endpoint, and wait until it listens. Raises BusError."""
-    # The hub outlives the process that started it: it runs in its own session. So Ctrl-C at a terminal does not end
-    # the bus before the cars have stopped. It exits 10 s after its last link. On a busy machine the start takes 10 s.
+    # The hub runs in a session of its own and outlives the process that started it. So Ctrl-C at a terminal does not
+    # end the bus before the cars have stopped. The hub exits 10 s after its last link has closed. On a busy machine its
+    # start takes 10 s.
     if accepts(endpoint):
         return
     if not is_loopback(endpoint):
         raise HubUnreachable(
-            f"Nothing listens at {endpoint}, and a hub starts by itself on loopback only. Start a Zenoh router there "
-            "(or `fleet up --insecure-lan`), or name another place with --connect.",
+            f"Nothing listens at {endpoint}, and a hub is started automatically only on loopback. Start a Zenoh router "
+            "there (or `fleet up --insecure-lan`), or give another address with --connect.",
             endpoint,
         )
     import subprocess
@@ -154,7 +155,7 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     while not accepts(endpoint):
         if time.monotonic() > deadline:
             raise BusError(f"No hub came up at {endpoint} within {timeout_s:g} s. Does another program use the port?")
-        # If two hubs start at once, the loser ends, and the winner listens in a moment.
+        # If two hubs start at once, one of them cannot listen and ends. The other one listens in a moment.
         with contextlib.suppress(subprocess.TimeoutExpired):
             hub.wait(0.02)
             time.sleep(0.02)

@@ -14,7 +14,7 @@ class NoFleet(BusError):
 
 
 class HubUnreachable(NoFleet):
-    """Nothing answers at an endpoint of another computer. Whether cars move there is not known."""
+    """Nothing answers at an endpoint of another computer. It is not known whether cars move there."""
 
 
 class BadEndpoint(BusError):

@@ -1,6 +1,6 @@
 """Bounded queues from Zenoh's threads to one asyncio loop.
 
-A Zenoh callback runs on a foreign thread. It only hands its object over to the loop that owns the state.
+A Zenoh callback runs on a thread of Zenoh. It only hands its object over to the loop, which owns the state.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ _BATCH: Final = 16
 
 
 class Handover(Generic[T]):
-    """A bounded queue in order. If it is full, it drops the new object or, with `newest`, the oldest one.
+    """A bounded first-in-first-out queue. If it is full, it drops the new object or, with `newest`, the oldest one.
 
     It may be created before the loop. Objects then wait until `attach`.
     """
@@ -50,7 +50,7 @@ class Handover(Generic[T]):
         loop.call_soon(self._drain)
 
     def __call__(self, item: T, *, reserve: int = 0) -> bool:
-        """Queue an object, on a Zenoh thread. Return False if it was dropped. `reserve` is extra room for it."""
+        """Queue an object, on a Zenoh thread. Return False if it was dropped. `reserve` raises the limit for it."""
         with self._lock:
             if len(self._queue) >= self._limit + reserve:
                 self.dropped += 1
@@ -81,7 +81,7 @@ class Handover(Generic[T]):
 
 
 class Backlog(Generic[T]):
-    """A bounded queue in order for one task, which handles one object at a time: for work that takes long.
+    """A bounded first-in-first-out queue for slow work: one task handles one object at a time.
 
     It may be created before the loop.
     """
@@ -93,10 +93,10 @@ class Backlog(Generic[T]):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._not_empty: asyncio.Event | None = None
         self.dropped = 0
-        """Number of objects that found the queue full."""
+        """Number of objects that were dropped because the queue was full."""
 
     def attach(self, loop: "asyncio.AbstractEventLoop", not_empty: "asyncio.Event") -> None:
-        """Set the loop, and the event that is set if there are objects. Runs on the loop's thread."""
+        """Set the loop, and the event that tells it that there are objects. Runs on the loop's thread."""
         with self._lock:
             self._loop, self._not_empty = loop, not_empty
         not_empty.set()
@@ -127,10 +127,10 @@ class Backlog(Generic[T]):
 
 
 class Latest(Generic[T]):
-    """Hands over the latest value of each name: changes of one name are merged (debounced by `INTERVAL_S`).
+    """Hands over only the latest value of each name, at most once per `INTERVAL_S` (debounced).
 
-    The first change is handed over at once, later ones together after the interval. Changes of more than `limit` names
-    within the interval are dropped.
+    The first change is handed over at once, later ones together after the interval. Within one interval, changes of
+    further names are dropped once `limit` names have changed.
     """
 
     INTERVAL_S: Final = 0.05
@@ -158,7 +158,7 @@ class Latest(Generic[T]):
             if len(self._changed) >= self._limit and name not in self._changed:
                 self.dropped += 1
                 return False
-            self._changed.pop(name, None)  # in the order of the last changes
+            self._changed.pop(name, None)  # keeps the names in the order of their last changes
             self._changed[name] = value
             loop = self._loop
         if first and loop is not None:

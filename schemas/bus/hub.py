@@ -1,7 +1,7 @@
 """The hub: a Zenoh router on loopback in its own process, which exits when it has no links.
 
-The listening port is the mutex: a second hub on it fails at once. `bus.ensure_hub` starts it, or you by hand:
-`python -m schemas.bus.hub --endpoint tcp/127.0.0.1:7447`.
+The listening port is the mutex: a second hub on the same port fails at once. `bus.ensure_hub` starts a hub; you can
+start one by hand: `python -m schemas.bus.hub --endpoint tcp/127.0.0.1:7447`.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from schemas.process import signals
 from schemas.process.panic_watch import PanicWatch
 
 IDLE_S: Final = 10.0
-"""Time from the last link until the hub exits."""
+"""Time without a link after which the hub exits."""
 _POLL_S: Final = 0.5
 RULES_POLL_S: Final = 2.0
 """Interval at which the hub of another site asks for the rules."""
@@ -35,7 +35,7 @@ RULES_TIMEOUT_S: Final = 1.0
 def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
     """Route until `stop` is set or there was no link for `idle_s`. Raises zenoh.ZError if the port is in use, BusError.
 
-    A hub with rules opens a new session when they change, as Zenoh reads them only then. Clients are back soon.
+    When the rules of a hub change, it opens a new session, because Zenoh reads rules only then. Clients reconnect soon.
     """
     last_link = time.monotonic()
     links = HubLinks(Credentials.of(endpoint)) if is_secure(endpoint) else None
@@ -59,7 +59,7 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
 
 
 def _has_clients(session: zenoh.Session) -> bool:
-    """Return True if anybody is linked but the hubs of other sites, which would keep one another up."""
+    """Return True if any client is linked. Hubs of other sites do not count: they would keep one another running."""
     hubs = (HUB, f"{IdentityRole.SITE}.")
     return any(not (link.auth_identifier or "").startswith(hubs) for link in session.info.links())
 
@@ -98,7 +98,7 @@ def _take_rules(links: HubLinks, session: zenoh.Session) -> None:
 
 
 def _rules_changed_at(endpoint: str) -> tuple[int, ...]:
-    """Return when the rules and the certificate of a hub were written, ns since the epoch. Empty without them."""
+    """Return when a hub's rules and certificate were written, ns since the epoch. Empty if it has none."""
     if not is_secure(endpoint):
         return ()
     directory = Credentials.of(endpoint).directory
@@ -112,7 +112,7 @@ def main() -> int:
     """Run a hub. Return 0 at its regular end, 1 if it could not listen, 2 for wrong use."""
     parser = argparse.ArgumentParser(prog="python -m schemas.bus.hub", description=__doc__)
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
-    parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")
+    parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after this time without a link (default 10)")
     parser.add_argument(
         "--insecure-lan", action="store_true", help="listen on a network, where everyone may drive the cars"
     )
@@ -135,14 +135,14 @@ def main() -> int:
 
 
 def _begin_again(watch: PanicWatch) -> None:
-    """Replace this process with a new hub after a panic in Zenoh: its router passes nothing on for some of its links.
+    """Replace this process with a new hub after a panic in Zenoh, as the router then ignores some of its links.
 
-    A panic was seen when the hub of one site was restarted several times within seconds (Zenoh 1.10.2). Clients are
-    back within a second, as after a change of the rules.
+    A panic was seen when the hub of one site was restarted several times within seconds (Zenoh 1.10.2). Clients
+    reconnect within a second, as after a change of the rules.
     """
     watch.panicked.wait()
     watch.restore()
-    sys.stderr.write("hub: Zenoh's router has failed, so the hub begins again\n")
+    sys.stderr.write("hub: Zenoh's router has failed, so the hub restarts\n")
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - itself
 

@@ -20,7 +20,7 @@ class HubKeeper:
         self._linked_at = time.monotonic()
 
     def check(self, *, connected: bool) -> None:
-        """Start a hub if it is time to. It blocks until the hub listens."""
+        """Start a hub if the link has been lost for long enough. This blocks until the hub listens."""
         if not connected and time.monotonic() - self._linked_at < HUB_RESTART_DELAY_S:
             return
         if not connected:

@@ -1,7 +1,7 @@
 """The hub's part in the renewal of certificates. The hub routes; another process signs (fleet/hub/renewals.py).
 
-So the hub need not load a library of cryptography, nor hold the key of the authority. It renews its own certificate,
-too. The hub of another site has no authority: it asks the first one, as everybody does.
+So the hub need not load a library of cryptography, nor hold the key of the authority. It also renews its own
+certificate. The hub of another site has no authority, so it asks the first hub, as all others do.
 """
 
 import queue
@@ -22,15 +22,16 @@ from schemas.bus.replies import BUSY
 
 MAX_RENEWAL_BYTES: Final = 16_384
 MAX_QUEUED_RENEWALS: Final = 16
-"""Maximum identities that wait for a certificate. The others ask again."""
+"""Maximum requests that wait for a certificate. Further ones are refused as busy, and repeated later."""
 OWN_CHECK_INTERVAL_S: Final = 600.0
 FIRST_OWN_CHECK_S: Final = 10.0
-"""Delay of the second check: at the first one, the hub of a site is not linked to the first hub yet."""
+"""Delay of the second check of the hub's own certificate. At the first check, the hub of another site is not yet linked
+to the first hub."""
 SIGN_TIMEOUT_S: Final = 10.0
 
 
 class HubRenewals:
-    """Answers in one session of a hub, on a thread of its own, one query at a time. Close it before the session."""
+    """Answers renewal queries in one session of a hub, one at a time, on a thread. Close it before the session."""
 
     def __init__(self, endpoint: str, session: zenoh.Session) -> None:
         self._endpoint = endpoint
@@ -46,7 +47,7 @@ class HubRenewals:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread. A certificate that is being made is made first."""
+        """End the thread, after it has finished a certificate that it is making."""
         if self._thread is not None:
             with suppress(queue.Full):
                 self._queue.put(None, timeout=SIGN_TIMEOUT_S)
@@ -79,7 +80,7 @@ class HubRenewals:
             self._answer(query)
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Answer one query with a certificate, or with why there is none. Its key has the identity, without doubt."""
+        """Answer one query with a certificate, or with an error. The hub's rules prove the identity in the key."""
         identity = str(query.key_expr).rpartition("/")[2]
         with query:
             assert query.payload is not None
@@ -98,7 +99,7 @@ class HubRenewals:
         return subprocess.run(command, input=request, capture_output=True, timeout=SIGN_TIMEOUT_S, check=False)
 
     def _renew_own(self) -> None:
-        """Renew the hub's own certificate if it is due. The hub sees the new file, and opens its session again."""
+        """Renew the hub's own certificate if it is due. The hub notices the new file, and opens a new session."""
         now, dates = datetime.now(UTC), self._credentials.dates(HUB)
         if dates is None or not dates.is_due(now):
             return

@@ -1,12 +1,13 @@
-"""Tells what comes twice while a bus has two sessions, so that each message is handled once.
+"""Recognizes the second copy of a message while a bus has two sessions, so that each message is handled once.
 
 A bus opens its second session before it closes the first one (`Bus.reopen`). Meanwhile the hub sends every message and
-every query to both, over two links: either may be first. So each is counted by what it is: on one side, a message is a
-twin if the other side has had one more of it a moment ago. Equal queries of two clients are not mixed up that way.
+every query to both, over two links: either copy may be first. So copies are counted by content: a message is a twin if
+the other session has delivered the same content once more than this one. Equal queries of two clients still count as
+two.
 
-A query that came over the first session just before the hub knew the second one has no twin. It is forgotten after
-`TWIN_S`: else the next equal query, such as the same stop once more, would be taken for its twin and dropped. No two
-messages are equal, as they have a time.
+Suppose a query came over the first session just before the hub learned of the second session. Then it has no twin, and
+is forgotten after `TWIN_S`: else the next equal query, such as the same stop once more, would be taken for its twin and
+dropped. Published messages need no such limit: each has a time stamp, so no two are equal.
 """
 
 import threading
@@ -22,16 +23,19 @@ TWIN_S: Final = 0.3
 
 
 class Overlap:
-    """What has come over one of two sessions only, and when. Times: s, monotonic."""
+    """The messages that have come over only one of two sessions, and when. Times: s, monotonic."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._once: tuple[dict[Hashable, deque[float]], dict[Hashable, deque[float]]] = {}, {}
         self.older_is_deaf = False
-        """True once everything comes over the newer session: nothing counts over the older one then."""
+        """True once everything comes over the newer session. Whatever still comes over the older one is dropped."""
 
     def is_twin(self, what: Hashable, now: float, *, newer: bool, within_s: float = inf) -> bool:
-        """Return True if the same has come over the other session in time. `newer` tells over which one this came."""
+        """Return True if the same message has come over the other session at most `within_s` ago.
+
+        `newer`: this one came over the newer session.
+        """
         with self._lock:
             if self.older_is_deaf and not newer:
                 return True
@@ -50,13 +54,13 @@ class Overlap:
 
 
 def mark_of_sample(declaration: int, sample: zenoh.Sample) -> Hashable:
-    """Return what tells a sample from others. Its time is that of its sender, or of the first hub."""
+    """Return the mark of a sample: no other sample has it. Its time is that of its sender, or of the first hub."""
     stamp = sample.timestamp
     when = None if stamp is None else (stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id()))
     return declaration, str(sample.key_expr), when
 
 
 def mark_of_query(declaration: int, query: zenoh.Query) -> Hashable:
-    """Return what tells a query from others: equal ones are counted."""
+    """Return the mark of a query. Equal queries have the same mark, so `Overlap` counts them."""
     payload = query.payload
     return declaration, str(query.selector), b"" if payload is None else payload.to_bytes()

@@ -46,11 +46,11 @@ class Publisher:
         )
 
     def prepare(self, session: zenoh.Session) -> None:
-        """Get ready to publish in another session, as soon as others in it know of the publisher."""
+        """Declare the publisher in another session too, so that subscribers there know it before `move`."""
         self._next = self._declared_in(session)
 
     def move(self) -> None:
-        """Publish in that session from now on. The cache and Zenoh's number start again there. `seq` goes on."""
+        """Publish in that session from now on. Its cache is empty, and Zenoh's numbers restart, but `seq` continues."""
         self._publisher = self._next
 
     def put(self, message: Any, stamp_ns: int) -> bytes:

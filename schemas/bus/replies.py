@@ -25,7 +25,7 @@ def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str, *, expres
 
 def reply_value(query: zenoh.Query, key: str, payload: bytes, topic: Topic, *, express: bool = True) -> None:
     """Reply with a value of a topic, as protobuf or, if the query has `?format=json`, as JSON."""
-    # Many values must not be express: each would be a batch of its own, and Zenoh drops batches when its queue is full.
+    # Do not send many values with `express`: each would be its own batch, and Zenoh drops batches beyond its queue.
     if query.parameters.get("format") == "json":
         from schemas import messages
 

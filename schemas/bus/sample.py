@@ -36,7 +36,7 @@ class Sample:
     """The publisher's sequence number for the key, modulo 2^32. 0 if there is none."""
     deleted: bool = False
     unread: str = ""
-    """Why there is no payload: it is too large. Empty if there is one."""
+    """The reason if the payload was not read because it is too large. Empty if it was read."""
 
     def message(self) -> "Message":
         """Parse the payload as the message that the encoding names. Raises messages.BadPayload or KeyError."""
@@ -45,7 +45,8 @@ class Sample:
         name = messages.name_in(self.encoding)
         if name is None:
             raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
-        # Anybody may publish or answer under any key. Readers use the fields of the topic's message.
+        # Anybody may publish any message under any key, but readers use the fields of the topic's message. So parse it
+        # as that.
         topic = topics.of_key(self.key)
         return messages.parse(name if topic is None else topic.message, self.payload, self.encoding)
 
@@ -58,7 +59,7 @@ class Failure:
 
 
 def messages_of(answers: "Iterable[Sample | Failure]") -> "Iterator[Any]":
-    """Yield the messages of answers. Skip error replies, and those of programs that are not of this fleet."""
+    """Yield the messages of answers. Skip error replies, and replies of foreign programs."""
     for answer in answers:
         if isinstance(answer, Sample):
             with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
@@ -89,7 +90,7 @@ def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
 def _too_many_bytes(size: int, largest: int) -> str:
     if size <= largest:
         return ""
-    return f"a payload of {size} bytes is too large: at most {largest} are read, so nothing of it was"
+    return f"a payload of {size} bytes is too large and was not read: the limit is {largest} bytes"
 
 
 def unread(query: zenoh.Query) -> str:
@@ -99,5 +100,5 @@ def unread(query: zenoh.Query) -> str:
         return words
     longest = max(len(str(query.selector)), len(str(query.encoding)) if query.encoding is not None else 0)
     if longest > LONGEST_SELECTOR:
-        return f"a key, parameters or an encoding of {longest} characters: at most {LONGEST_SELECTOR} are read"
+        return f"a key, parameters or an encoding of {longest} characters is too long: the limit is {LONGEST_SELECTOR}"
     return ""

@@ -1,7 +1,8 @@
 """Makes sure that there is only one service of a kind, such as one gateway per car.
 
-Each service answers queries of its status. At its start, a service queries the others and gives up if one answers. Of
-two that start at the same moment, the one with the higher boot id yields: it queries again after both have declared.
+Each service answers queries of its status. At its start, a service queries the others and gives up if one answers. Two
+that start at the same moment may miss each other, so each queries again after both have declared. Then the one with the
+higher boot id gives up.
 """
 
 import time
@@ -14,7 +15,7 @@ from schemas.bus.zenoh_session import Bus
 
 
 class Singleton:
-    """The check of one service. `describe` returns the error for the status message of another one."""
+    """The check of one service. `describe` makes the error from the status message of another service."""
 
     def __init__(self, bus: Bus, status_key: str, describe: Callable[[Any], Exception], timeout_s: float = 2.0) -> None:
         self._bus = bus
@@ -28,7 +29,7 @@ class Singleton:
         deadline, busy = time.monotonic() + self._timeout_s, True
         while busy and time.monotonic() < deadline:
             answers = list(self._bus.query(self._status_key, timeout_s=self._timeout_s))
-            busy = Failure(BUSY) in answers  # there is one, and it will answer soon
+            busy = Failure(BUSY) in answers  # there is another service, which will answer soon
             found += [status for status in messages_of(answers) if status.boot_id != self._bus.boot_id]
         return found
 
@@ -37,8 +38,8 @@ class Singleton:
         for other in self.others():
             raise self._describe(other)
 
-    def check_first(self) -> bool:
-        """Raise the error if another service has a lower boot id. Return True if there is another one, which yields."""
+    def raise_unless_first(self) -> bool:
+        """Raise the error if another service has a lower boot id. Return True if another one has to give up."""
         others = self.others()
         for other in others:
             if other.boot_id < self._bus.boot_id:

@@ -27,7 +27,7 @@ from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
 
-# On a busy machine, existing tokens arrive late. A token that disappears at this moment never arrives.
+# On a busy machine, existing tokens arrive late. A token that disappears meanwhile never arrives, so there is a limit.
 _TOKEN_HISTORY_TIMEOUT_S: Final = 2.0
 """Timeout for the existing tokens at the start of a watch."""
 
@@ -36,17 +36,17 @@ _THREAD_END_TIMEOUT_S: Final = 2.0
 _DECLARE_LOCK: Final = threading.Lock()
 
 OVERLAP_S: Final = 0.5
-"""Time in which everything comes over both sessions, until also the hubs of other sites know the second one; and once
-more for what is still on its way over the first one."""
+"""Time during which both sessions are used, until also the hubs of other sites know the second one. Then the first one
+stays for the same time, for messages that are still on their way."""
 ANSWERS_S: Final = 12.0
-"""Time for which the first session stays open for answers on their way. No query waits for longer than 10 s."""
+"""Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
 REOPEN_TIMEOUT_S: Final = 5.0
 TOKENS_OF_NOBODY: Final = "*/@hub"
-"""Everyone may ask for these tokens, and there are none: the answer only says that the hub has read what came before.
-"""
+"""Tokens that everyone may ask for, and that do not exist. The answer shows that the hub has handled all earlier
+messages of the session."""
 
 _MAX_QUEUED_ANSWERS: Final = 1 << 16
-"""Maximum number of queued answers of one query. Beyond it, the link stalls and Zenoh drops answers on the way."""
+"""Maximum number of queued answers of one query. If the queue is full, the link stalls, and Zenoh drops answers."""
 
 
 class Bus:
@@ -55,16 +55,16 @@ class Bus:
     def __init__(self, session: zenoh.Session, endpoint: str, identity: str = "") -> None:
         self._session = self._declaring = session
         self.identity = identity
-        """Whose certificate this session has, such as `person.mia`. Empty on a bus without certificates."""
+        """Owner of this session's certificate, such as `person.mia`. Empty on a bus without certificates."""
         self._declarations: list[Declared] = []
         self._publishers: list[Publisher] = []
         self._declared = itertools.count()
         self._number = 0
-        """Number of the session: each is followed by another one (`reopen`)."""
+        """Number of the newest session: `reopen` opens the next one."""
         self._overlap: Overlap | None = None
-        """What has come over one of two sessions, while there are two."""
+        """Recognizes second copies while there are two sessions."""
         self._changing = threading.Lock()
-        """Held while something is declared, and while all of it is declared again."""
+        """Held while something is declared, and while everything is declared again in a new session."""
         self._lock = threading.Lock()
         self._threads: set[threading.Thread] = set()
         """Threads of Zenoh that run our callbacks."""
@@ -83,16 +83,16 @@ class Bus:
     ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
-        With `start_hub`, start a hub if there is none. Otherwise a missing hub raises NoFleet, one of another computer
-        HubUnreachable.
-        identity: the one to connect as, such as `car.red`; by default that of the user. It matters only to a hub with
-        certificates. Raises NoCredentials if this computer has no such certificate.
+        With `start_hub`, start a hub if there is none. Without, raise NoFleet if there is no hub on this computer, and
+        HubUnreachable if there is none on another computer.
+        `identity` is the owner of the certificate to use, such as `car.red`; by default it is the user. It matters only
+        to a hub with certificates. Raises NoCredentials if this computer has no such certificate.
         """
         where = resolve_endpoint(endpoint)
         if is_secure(where):
             identity = Credentials.of(where).identity(identity)
-            # A hub that waits for TLS takes the probe of `accepts` for a failed handshake, and takes no link for 0.1 s
-            # then. So first try as if there is one.
+            # For a hub with TLS, the probe of `accepts` is a failed handshake, after which the hub accepts no link for
+            # 0.1 s. So first try to connect without that probe.
             with signals.held_back(), suppress(zenoh.ZError):
                 return cls(zenoh.open(client_config(where, 0.0, identity)), where, identity)._with_keeper()
         else:
@@ -102,13 +102,13 @@ class Bus:
         elif not accepts(where):
             if not is_loopback(where):
                 raise HubUnreachable(
-                    f"Nothing answers at {where}. Is that computer on and in reach, and does its hub run? --connect "
-                    "names another place.",
+                    f"Nothing answers at {where}. Is that computer on and in reach, and does its hub run? Give another "
+                    "address with --connect.",
                     where,
                 )
             raise NoFleet(
                 "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
-                f"(Looked at {where}; --connect names another place.)",
+                f"(Tried {where}; give another address with --connect.)",
                 where,
             )
         with signals.held_back():
@@ -124,7 +124,7 @@ class Bus:
             return cls(session, where, identity)._with_keeper()
 
     def _with_keeper(self) -> Self:
-        """Renew the certificate from now on, if the session has one."""
+        """Start to renew the certificate of this session, if it has one."""
         if self.identity:
             own, me = Credentials.of(self.endpoint), self.identity
             keeper = CertificateKeeper(own, me, ask=self._ask_hub, reopen=self.reopen, closing=self._closing)
@@ -133,7 +133,7 @@ class Bus:
         return self
 
     def _ask_hub(self, request: bytes) -> bytes:
-        """Return the hub's answer to a request for the next certificate. Empty if there is none, or it refuses."""
+        """Return the hub's answer to a request for the next certificate. Empty if it does not answer, or refuses."""
         key = renewal_key(self.identity)
         for answer in self.query(key, payload=request, timeout_s=RENEWAL_QUERY_TIMEOUT_S):
             if isinstance(answer, Sample):
@@ -166,7 +166,7 @@ class Bus:
             self.close()
 
     def _declare(self, declare: Declare) -> Declared:
-        """Declare something with a callback, and keep it."""
+        """Declare something with a callback, and remember it for `reopen`."""
         declared = Declared(declare)
         self._keep(declared, self._on_a_daemon)
         return declared
@@ -181,9 +181,9 @@ class Bus:
         declared.add(self._declaring, self._number)
 
     def _on_a_daemon(self, declared: Declared) -> None:
-        # Zenoh starts a Python thread for each callback. The interpreter joins such a thread when it exits, before it
-        # runs any exit handler: unless the thread is a daemon, which it is if the declaring thread is one.
-        # A Future would import logging: 4 ms of a gateway's start.
+        # Zenoh starts a Python thread for each callback. At its exit, before any exit handler runs, the interpreter
+        # joins all threads but daemons. Zenoh's thread is a daemon if the thread that declares is one.
+        # A Future instead of the list would import logging, which is 4 ms of a gateway's start.
         errors: list[BaseException] = []
 
         def run() -> None:
@@ -204,26 +204,26 @@ class Bus:
                 raise errors[0]
 
     def _is_twin(self, number: int, mark: Callable[[], Hashable], within_s: float = inf) -> bool:
-        """Return True if this came over another session, too, and was handled. `number` is that of its session."""
+        """Return True if this message is handled over the other session. It came over the session with this number."""
         overlap, is_newest = self._overlap, number == self._number
         if overlap is None:
             return not is_newest
         return overlap.is_twin(mark(), monotonic(), newer=is_newest, within_s=within_s)
 
     def reopen(self, overlap_s: float = OVERLAP_S, answers_s: float = ANSWERS_S) -> None:
-        """Go on in a second session, which has the certificate that is in the file now, and close the first one.
+        """Continue in a second session, with the certificate that is in the file now, and close the first session.
 
-        Nothing is lost, and nothing comes twice: tokens last, and what comes over both is handled once. It blocks for
-        the overlap, and for answers on their way; `close` ends that. Raises BusError: the first session goes on then.
+        No message is lost or handled twice, and tokens do not disappear. The call blocks for the overlap and for late
+        answers; `close` ends that wait. If it raises BusError, the first session stays in use.
         """
         first = self._session
         try:
             second = zenoh.open(client_config(self.endpoint, REOPEN_TIMEOUT_S, self.identity))
         except zenoh.ZError as error:
-            raise BusError(f"{self.endpoint} takes no second session of {self.identity}: {error}") from error
+            raise BusError(f"{self.endpoint} refuses a second session of {self.identity}: {error}") from error
         try:
             self._declare_again(second)
-            # Declaring does not wait for the hub. Its answer comes after it has passed everything on.
+            # Declaring does not wait for the hub. But when it answers this query, it has passed on the declarations.
             for _ in second.liveliness().get(TOKENS_OF_NOBODY, timeout=REOPEN_TIMEOUT_S):
                 pass
         except zenoh.ZError as error:
@@ -289,10 +289,10 @@ class Bus:
         largest: int | None = None,
         admits: Callable[[str], bool] | None = None,
     ) -> Declared:
-        """Subscribe. The callback runs on a Zenoh thread: it must hand over and return.
+        """Subscribe. The callback runs on a Zenoh thread, so it must hand the sample over and return.
 
-        largest: maximum size of a payload in bytes (see `Sample.unread`). admits: asked with the key of each message
-        before anything else of it is read. What it refuses is dropped.
+        `largest` is the maximum size of a payload in bytes (see `Sample.unread`). `admits` is called with the key of
+        each message before anything else of it is read. If it returns False, the message is dropped.
         """
         declaration = next(self._declared)
 
@@ -309,7 +309,7 @@ class Bus:
 
     def subscribe_channel(self, expression: str, capacity: int) -> SampleChannel:
         """Subscribe with a channel for `try_recv`. Read it often: a full channel stalls the whole session."""
-        # Per message, it costs half as much as a callback. The recorder, which reads everything, needs that.
+        # A channel costs half as much per message as a callback. The recorder needs that, because it reads everything.
         channel = SampleChannel(
             lambda session, _: session.declare_subscriber(expression, zenoh.handlers.FifoChannel(capacity)),
             next(self._declared),
@@ -324,10 +324,10 @@ class Bus:
         *,
         too_large: Callable[[zenoh.Query, str], object] | None = None,
     ) -> Declared:
-        """Declare a queryable. The callback runs on a Zenoh thread: it must hand over and return.
+        """Declare a queryable. The callback runs on a Zenoh thread, so it must hand the query over and return.
 
-        If it returns False, the query is answered with BUSY. A query with a part that is too large is passed to
-        `too_large` with the reason, or rejected.
+        If the callback returns False, the query is answered with BUSY. A query with a part that is too large is passed
+        to `too_large` with the reason; without `too_large` it is refused.
         """
         declaration = next(self._declared)
 
@@ -335,7 +335,7 @@ class Bus:
             def on_query(query: zenoh.Query) -> None:
                 words = unread(query)
                 if self._is_twin(number, lambda: mark_of_query(declaration, query), TWIN_S):
-                    with query:  # the other one is answered
+                    with query:  # its other copy is answered
                         return
                 if words and too_large is None:
                     refuse(query, words)
@@ -353,7 +353,7 @@ class Bus:
         return token
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
-        """Return the existing tokens. Empty also after a timeout."""
+        """Return the existing tokens. After a timeout, the list is empty, too."""
         # In a session with a watch, Zenoh may leave the watched tokens out of the answer to a get: of 300 sessions that
         # watched `fleet/*`, ten got `*/*` without them. So take those from the watch.
         wanted = zenoh.KeyExpr(expression)
@@ -401,7 +401,7 @@ class Bus:
         timeout_s: float = 1.0,
         qos: Qos = Qos.COMMAND,
     ) -> Iterator[Sample | Failure]:
-        """Query everyone and yield the answers as they come. A timeout yields a Failure."""
+        """Send a query to everyone, and yield the answers as they arrive. A timeout yields a Failure."""
         replies = self._session.get(
             selector,
             zenoh.handlers.FifoChannel(_MAX_QUEUED_ANSWERS),
@@ -421,7 +421,7 @@ class Bus:
     def recall(self, expression: str, last_s: float, *, timeout_s: float = 5.0) -> Iterator[zenoh.Sample]:
         """Return publications of the last seconds from the caches of running publishers (`Publisher`).
 
-        They have their original time and sequence number. Those of one publisher come in order. It blocks until all
+        They have their original time and sequence number. Those of one publisher are in order. Reading blocks until all
         publishers have answered.
         """
         replies = self._session.get(
@@ -444,7 +444,7 @@ class Bus:
         self.put_again(key, payload, encoding, sequence, Qos.COMMAND)
 
     def put_again(self, key: str, payload: bytes, encoding: str, sequence: int, qos: Qos) -> None:
-        """Publish a payload unchanged, with this sequence number (0: with none)."""
+        """Publish a payload unchanged, with this sequence number, or without one if it is 0."""
         source = zenoh.SourceInfo(self._session.id, (sequence - 1) & 0xFFFFFFFF) if sequence else None
         self._session.put(key, payload, encoding=encoding, source_info=source, **ZENOH_QOS[qos])
 

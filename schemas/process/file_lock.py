@@ -1,4 +1,4 @@
-"""A lock between the processes of one user that ends with its holder, however that ends: a locked file."""
+"""A lock between the processes of one user: a locked file. The lock ends with its holder, even if that is killed."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ _MODE: Final = 0o600
 
 
 class FileLock:
-    """A lock on one file, which is made if it is missing. Nobody waits here: the caller tries again."""
+    """A lock on one file, which is made if it is missing. It never waits: the caller tries again."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -50,7 +50,7 @@ class FileLock:
 
 
 def _lock(descriptor: int) -> bool:
-    """Lock an open file until it is closed. Return False if another process has locked it. Raises OSError otherwise."""
+    """Lock an open file until it is closed. Return False if another process has locked it. Raises OSError."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)

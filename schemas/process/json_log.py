@@ -1,11 +1,11 @@
 """Log lines as JSON, for every process, if FLEET_LOG is `json`. One id follows a command through all of them.
 
-Without the variable each process logs as it always did: lines for a person. With it each log line on stderr is one JSON
-object with `time`, `level`, `process`, `pid` and `message`. A line about a command also has its `command_id`, `verb`
-and `phase`. The id is made by the client (a command line, the console, the coordinator, a program) and is in the
-command's message, so the gateway logs the same. It is in the recording, too, in `event/command` and `frame/tx`.
+Without the variable each process logs lines for a person. With it, each log line on stderr is one JSON object with
+`time`, `level`, `process`, `pid` and `message`. A line about a command also has its `command_id`, `verb` and `phase`.
+The client (a command line, the console, the coordinator, a program) makes the id and sends it in the command's message,
+so the gateway logs the same id. The recording has it too, in `event/command` and `frame/tx`.
 
-A line of a client says what was sent and how it ended. A gateway has one line for each record of `event/command`.
+A client logs each command that it sent and how it ended. A gateway logs one line for each record of `event/command`.
 """
 
 import io
@@ -19,7 +19,7 @@ from typing import Any, Final
 LOG_VARIABLE: Final = "FLEET_LOG"
 JSON_FORMAT: Final = "json"
 COMMANDS: Final = "fleet.commands"
-"""Name of the logger of lines about commands. Without JSON its lines go nowhere: texts say the same in better words."""
+"""Name of the logger of lines about commands. Without JSON they are dropped: people read the same in other texts."""
 _FIELDS: Final = "fleet_fields"
 _STDERR: Final = "stderr"
 
@@ -30,7 +30,7 @@ def is_wanted() -> bool:
 
 
 def fields(**values: Any) -> dict[str, Any]:
-    """Return the `extra` of a log call: fields of its line in JSON. What is empty is left out."""
+    """Return the `extra` of a log call, with fields of its JSON line. Leave out empty values."""
     return {_FIELDS: {name: value for name, value in values.items() if value not in (None, "")}}
 
 
@@ -42,7 +42,7 @@ class JsonFormatter(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line. It has no newline and no control character, whatever the texts hold."""
+        """Return the line. It never contains a newline or a control character."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -57,7 +57,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class _JsonLines(io.TextIOBase):
-    """Takes the place of stderr: what is written there for a person becomes log lines, too."""
+    """Replaces stderr: text that is written there for a person becomes log lines, too."""
 
     encoding = "utf-8"
     errors = "replace"
@@ -78,7 +78,7 @@ class _JsonLines(io.TextIOBase):
 
 
 def begin(process: str) -> bool:
-    """Let this process log as JSON if FLEET_LOG says so. Return whether it does."""
+    """Let this process log as JSON if FLEET_LOG says so. Return True if it does."""
     if not is_wanted():
         return False
     handler = logging.StreamHandler(sys.stderr)
@@ -91,7 +91,7 @@ def begin(process: str) -> bool:
 def message_in(line: str) -> tuple[str, str] | None:
     """Return level and message of a line that a process of ours has logged as JSON. None if it is not one.
 
-    What it said to a person on stderr counts as an error: it may have been its last words.
+    Text that it wrote to stderr for a person counts as an error, because it may say why the process ended.
     """
     if not line.startswith("{"):
         return None

@@ -1,7 +1,7 @@
-"""Notices a panic of a library in Rust, whose threads otherwise end one by one while the process looks alive.
+"""Notices a panic in a library that is written in Rust: its threads may end while the process still looks alive.
 
-Rust writes the message of a panic to stderr, and has no other sign for Python. So stderr goes through a pipe here, and
-on to where it went before.
+Rust writes the message of a panic to stderr, and Python gets no other sign of it. So stderr goes through a pipe that is
+read here, and from there to where it went before.
 """
 
 import os
@@ -15,7 +15,7 @@ _MAX_READ_BYTES: Final = 65_536
 
 
 class PanicWatch:
-    """Passes stderr on, and sets `panicked` once a panic was written to it. Use it as a context, in the main module."""
+    """Passes stderr on, and sets `panicked` after the message of a panic. Use it as a context, in the main module."""
 
     def __init__(self, descriptor: int = 2) -> None:
         self._descriptor = descriptor
@@ -39,7 +39,7 @@ class PanicWatch:
         os.close(self._real)
 
     def restore(self) -> None:
-        """Let stderr go where it went before, also that of a program that takes the place of this one."""
+        """Let stderr go where it went before, also for a program that replaces this one by `exec`."""
         sys.stderr.flush()
         os.dup2(self._real, self._descriptor)  # the pipe has no other writer, so it ends
 

@@ -4,15 +4,15 @@ import os
 
 
 def parent_option() -> tuple[str, str]:
-    """Return the option for a new process that ends with this one."""
+    """Return the option that makes a new process end with this one."""
     return ("--parent", str(os.getpid()))
 
 
 def watched_pid(starter: int | None) -> int | None:
     """Return the process id that `os.getppid` reports while the starter runs, or None if nothing is to be watched.
 
-    The starter passes its own id: it may end before the new process could ask for it. On Windows `os.getppid` never
-    changes, and reports the launcher of the virtual environment.
+    The starter passes its own id, because it may end before the new process could ask for it. On Windows, `os.getppid`
+    reports the launcher of the virtual environment, and never changes.
     """
     return starter if starter is None or os.name == "posix" else os.getppid()
 

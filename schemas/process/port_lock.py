@@ -16,7 +16,7 @@ _MAX_COMMAND_LENGTH: Final = 80
 
 
 def find_holder(file_stat: os.stat_result) -> str | None:
-    """Return which process has locked a file or device, in words, or None if none has, or if that is unknown."""
+    """Describe the process that has locked a file or device. Return None if there is none, or if that is unknown."""
     try:
         locks = LOCKS.read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -30,7 +30,7 @@ def find_holder(file_stat: os.stat_result) -> str | None:
 
 
 def find_users(path: str) -> list[str]:
-    """Return which other processes have a device open, in words. Those of other users are found by root only.
+    """Describe the other processes that have a device open. Only root finds those of other users.
 
     Takes some 10 ms. Empty on a system other than Linux.
     """
@@ -42,7 +42,7 @@ def find_users(path: str) -> list[str]:
         return []
     terminal = _PSEUDO.fullmatch(os.path.realpath(path))
     users = [pid for pid in _processes() if pid != os.getpid() and _has_open(pid, device.st_rdev)]
-    # A simulated car is at the other end of its terminal, and has this end open, too.
+    # A simulated car uses the other end of its terminal, and keeps this end open too, so leave it out.
     return [_describe(pid) for pid in users if terminal is None or not _is_master(pid, terminal[1])]
 
 

@@ -1,4 +1,4 @@
-"""Tells systemd that a service is up, and that its loop still turns (sd_notify(3)). Without systemd it does nothing."""
+"""Tells systemd that a service is up, and that its loop still runs (sd_notify(3)). Without systemd it does nothing."""
 
 import os
 import socket
@@ -11,11 +11,11 @@ NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 WATCHDOG_USEC: Final = "WATCHDOG_USEC"
 WATCHDOG_PID: Final = "WATCHDOG_PID"
 FEEDS_PER_WATCHDOG: Final = 4
-"""Number of messages in the time of the watchdog. systemd asks for two; with four a turn of the loop may take three
-quarters of that time."""
+"""Number of messages within the watchdog's timeout. systemd asks for two. With four, one turn of the loop may take
+three quarters of the timeout."""
 READY_RETRY_S: Final = 1.0
-"""Time until a message that could not be sent is sent again: without `READY=1` systemd ends the service after the 90 s
-of its TimeoutStartSec."""
+"""Delay before a message that could not be sent is repeated. Without `READY=1`, systemd ends the service after its
+TimeoutStartSec (90 s)."""
 
 
 class ServiceNotifier:
@@ -25,7 +25,7 @@ class ServiceNotifier:
         self._socket: socket.socket | None = None
         self._interval_s = inf
         self.due_at = inf
-        """When `feed` has to be called next. Infinite if nobody waits for it."""
+        """When `feed` has to be called next. Infinite if there is no systemd to notify."""
         address = environment.get(NOTIFY_SOCKET, "")
         if not address.startswith(("/", "@")) or not hasattr(socket, "AF_UNIX"):
             return
@@ -33,18 +33,18 @@ class ServiceNotifier:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.settimeout(0)  # a full queue must not hold up the loop
         self.due_at = -inf
-        # A process that inherits the variables is not the one that systemd watches.
+        # A child process inherits the variables, but systemd does not watch it, so compare the process ids.
         watched, usec = environment.get(WATCHDOG_PID, ""), environment.get(WATCHDOG_USEC, "")
         if usec.isdecimal() and int(usec) > 0 and watched in ("", str(os.getpid() if pid is None else pid)):
             self._interval_s = int(usec) / 1e6 / FEEDS_PER_WATCHDOG
         self._message = b"READY=1\nWATCHDOG=1"
 
     def feed(self, now: float) -> None:
-        """Say that the loop has turned, if that is due."""
+        """Tell systemd that the loop is running, if a message is due."""
         if self._socket is None or now < self.due_at:
             return
         self.due_at = now + min(self._interval_s, READY_RETRY_S)
-        with suppress(OSError):  # systemd restarts, or its queue is full: the next one is soon
+        with suppress(OSError):  # systemd restarts, or its queue is full: the next message follows soon
             self._socket.sendto(self._message, self._address)
             self._message = b"WATCHDOG=1"
             self.due_at = now + self._interval_s

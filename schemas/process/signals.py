@@ -27,7 +27,7 @@ def calls(end: Callable[[], object]) -> None:
 
 
 def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], object]) -> None:
-    """Call `end` with the number of the signal on each of them, in this loop."""
+    """Call `end` with the signal's number on each of the signals, in this loop."""
     for number in signals():
         try:
             loop.add_signal_handler(number, end, number)
@@ -72,7 +72,7 @@ def _in_loop() -> bool:
 @contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
     """Call `interrupt` on each of the signals during a block, in the main thread. SIGINT raises KeyboardInterrupt."""
-    # A shell starts background processes with SIGINT ignored, and Python keeps that. Here, SIGINT is handled anyway.
+    # A shell starts background processes with SIGINT ignored, and Python leaves it so. Here, handle SIGINT anyway.
     others = [number for number in signals() if number is not signal.SIGINT]
     ignored = [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else []
     with _taken(ignored, signal.default_int_handler), _taken(others, lambda *_: interrupt()):
@@ -81,7 +81,7 @@ def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """Take every signal that ends a process, SIGTERM above all, as Ctrl-C: raise KeyboardInterrupt."""
+    """Treat every signal that shuts down a process, such as SIGTERM, like Ctrl-C: raise KeyboardInterrupt."""
 
     def interrupt() -> None:
         raise KeyboardInterrupt

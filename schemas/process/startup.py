@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from typing import Final
 
 INTERRUPTED: Final = 130
-"""Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""
+"""Exit code after Ctrl-C, as in shells: 128 + SIGINT."""
 
 
 def end_at_ctrl_c() -> None:
     """Let Ctrl-C end the process at once and without a traceback, until `interruptible`."""
-    # There is nothing to clean up yet, or no more. An ignored SIGINT stays ignored.
+    # There is nothing to clean up yet, or nothing left to clean up. An ignored SIGINT stays ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
 

@@ -7,7 +7,7 @@ from typing import IO
 
 def complete() -> None:
     """Open /dev/null on closed standard descriptors, so that no port or socket gets descriptor 0, 1 or 2."""
-    # stdin is then at its end, writing to stdout fails as on a full disk, and stderr is discarded.
+    # Then reading stdin returns end of file, writing to stdout fails as on a full disk, and stderr is discarded.
     for number in range(3):
         try:
             os.fstat(number)
@@ -42,5 +42,5 @@ def shows_colors(stream: IO[str]) -> bool:
 
 
 def printable(text: str | None, instead: str = "") -> str:
-    """Return a text that somebody else has chosen for one line of a terminal or a file, without control characters."""
+    """Return a foreign text without control characters, fit for one line of a terminal or a file."""
     return "".join(each if each.isprintable() else instead for each in text or "")

@@ -6,8 +6,8 @@
 | macOS | CLOCK_MONOTONIC_RAW (`mach_continuous_time`) | CLOCK_UPTIME_RAW (`mach_absolute_time`) |
 | Windows | GetTickCount64 | QueryUnbiasedInterruptTime |
 
-On every other system no sleep is noticed: the wall clock also steps when somebody sets it. A paused virtual machine is
-no sleep either: no clock of its system counts the pause.
+On every other system no sleep is noticed: the wall clock would not do, because it also steps when somebody sets it. A
+pause of a virtual machine is not noticed either, because no clock of its system counts the pause.
 """
 
 import sys
@@ -20,15 +20,15 @@ from typing import Final
 if sys.platform == "win32":
     import ctypes
 
-# Of GetTickCount64 each reading is up to 16 ms old. On Linux and macOS the readings are exact.
+# A reading of GetTickCount64 is up to 16 ms old. On Linux and macOS the readings are exact.
 MIN_SLEEP_S: Final = 0.1
 """Minimum difference of the clocks that counts as a sleep. No computer sleeps for a shorter time."""
 MAX_READ_S: Final = 0.001
-"""Maximum duration of an undisturbed reading of the clocks. After a longer one the first look reads them again."""
+"""Maximum duration of an undisturbed reading of the clocks. At its start, `SleepWatch` repeats a longer one."""
 MAX_READS: Final = 10
-"""Maximum readings of the first look. If the scheduler disturbs all of them, the best one counts."""
+"""Maximum readings at the start. If the scheduler disturbs all of them, the best one counts."""
 MONOTONIC_COUNTS_SLEEP: Final = sys.platform == "win32"
-"""True if `time.monotonic()` and the times of asyncio go on during a sleep."""
+"""True if `time.monotonic()` and the times of asyncio continue during a sleep."""
 
 _CLOCKS: Final = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
@@ -36,7 +36,7 @@ _CLOCKS: Final = {
 }
 
 ClockPair = tuple[Callable[[], float], Callable[[], float]]
-"""Two clocks, s: one that goes on during a sleep of the computer, and one that stands still."""
+"""Two clocks, s: one that continues during a sleep of the computer, and one that stands still."""
 
 
 def clock_pair() -> ClockPair | None:
@@ -64,17 +64,17 @@ def clock_pair() -> ClockPair | None:
 
 @dataclass(slots=True)
 class _Reading:
-    """The time slept since the start of the computer, s, as far as two clocks show it."""
+    """Bounds of the time that the computer has slept since its start, s."""
 
     at_least: float
     at_most: float
 
 
 class SleepWatch:
-    """Measures the sleeps of the computer. `clocks` is None if the system has none, and no sleep is noticed.
+    """Measures the sleeps of the computer. If `clocks` is None, no sleep is noticed.
 
-    A process may be interrupted between its readings of the two clocks. So it reads the one without sleep before and
-    after the other. Only what is certainly a sleep counts: an interruption never does.
+    A process may be interrupted between its readings of the two clocks. So the clock without sleep is read before and
+    after the other one. Only a difference that is certainly a sleep counts; an interruption never does.
     """
 
     def __init__(self, clocks: ClockPair | None) -> None:

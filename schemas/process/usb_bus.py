@@ -6,7 +6,7 @@ from typing import Final
 from schemas.process.port_lock import is_running
 
 CH340: Final = (0x1A86, 0x7523)
-"""Ids of the CH340, the serial adapter of most cars. brltty takes it for a Braille display of the same ids."""
+"""Ids of the CH340, the serial adapter of most cars. brltty mistakes it for a Braille display with the same ids."""
 _CH340_TEXT: Final = f"{CH340[0]:04x}:{CH340[1]:04x}"
 DEVICES: Final = Path("/sys/bus/usb/devices")
 BRLTTY: Final = "brltty"
@@ -14,7 +14,7 @@ BRLTTY: Final = "brltty"
 
 def explain_missing_port(devices: Path | None = None) -> str:
     """Return why a CH340 that is plugged in has no serial port, and what to type. Empty if there is none."""
-    # brltty detaches the driver of the adapter some seconds after it was plugged in. The port was there, and vanishes.
+    # brltty detaches the driver of the adapter some seconds after it was plugged in, so the port appears and vanishes.
     if not any(map(_is_without_port, _adapters(DEVICES if devices is None else devices))):
         return ""
     plugged = f"A CH340 adapter ({_CH340_TEXT}) is plugged in and has no serial port"

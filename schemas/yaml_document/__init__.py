@@ -1,5 +1,5 @@
 """YAML files that people write, checked with line and column.
 
-`document` reads the text and collects faults, `messages` puts pydantic's errors into words, `partial` lets the sound
-rest of a faulty file be checked too.
+`document` reads the text and collects faults. `fault_words` puts pydantic's errors into words. `partial` makes it
+possible to check the valid part of a faulty file for further faults.
 """

@@ -1,7 +1,7 @@
 """Reads YAML 1.2 text into a pydantic model and reports all faults at once, each with line and column.
 
-It limits size, depth and aliases. fault_words.py puts faults into words. Their own packages check what a fleet file or
-a plan means.
+It limits size, depth and aliases. fault_words.py puts faults into words. The meaning of a fleet file or a plan is
+checked in the packages of those files.
 """
 
 import json
@@ -41,7 +41,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """One fault of a file. line, column: from 1; 0 if there is no such file. field: empty for the file as a whole."""
+    """One fault of a file. `line` and `column` count from 1; both are 0 if there is no file. `field` may be empty."""
 
     line: int
     column: int
@@ -87,7 +87,7 @@ def schema_of(model: type[BaseModel], title: str) -> dict[str, Any]:
 
 
 def _without_titles(part: Any) -> Any:
-    """Remove the titles that pydantic makes of names: editors show them instead of the descriptions."""
+    """Remove the titles that pydantic makes from names, because editors would show them instead of descriptions."""
     if isinstance(part, list):
         return [_without_titles(each) for each in part]
     if not isinstance(part, dict):
@@ -98,7 +98,7 @@ def _without_titles(part: Any) -> Any:
 def name_special_file(path: Path) -> str:
     """Name the type of a path that is not a regular file (`directory`, `FIFO`, ...). Empty if it is one.
 
-    Call it before opening: opening a FIFO blocks, and opening a serial port resets the car on it.
+    Call it before opening the path: opening a FIFO blocks, and opening a serial port resets the car on it.
     """
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
@@ -130,7 +130,7 @@ def read_text(path: Path, source: str | None = None) -> str:
         words = error.strerror if isinstance(error, OSError) else None
         raise _bad_file(source, f"cannot be read: {words or error}") from None
     if kind:
-        raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that")
+        raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that file")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -175,13 +175,13 @@ class Document:
         self.tree = self._construct((), None, root)
 
     def report(self, where: Where, words: str, *, on_key: bool = False) -> None:
-        """Add a fault of a value, of its key, or of something missing in it."""
+        """Add a fault of a value, of its key, or of a missing field."""
         where = self._partial.original(where)
         self._faulty.add(where)
         self._problems.append(self._problem_at(where, words, on_key=on_key))
 
     def validate(self, model: type[_Model]) -> _Model | None:
-        """Return the document as this model (strictly: text is not a number), or None, with its faults added."""
+        """Return the document as this model, or None after adding its faults. Text is never read as a number."""
         try:
             return model.model_validate_json(json.dumps(self.tree), strict=True)
         except ValidationError as error:
@@ -209,7 +209,7 @@ class Document:
         return None
 
     def faulty_within(self, where: Where) -> bool:
-        """Return True if a field at this place is faulty. Other faults at the place may only follow from it."""
+        """Return True if a field at this place is faulty. Then other faults at the place may only follow from that."""
         place = self._partial.original(where)
         return any(each[:-1] == place for each in self._faulty if each)
 
@@ -240,7 +240,7 @@ class Document:
         self._faulty.update(where for where, _, _ in heads)
 
     def _locate(self, error: ValidationError) -> list[tuple[Where, bool, Any]]:
-        """Return pydantic's errors, each with its place and whether it is about the key there."""
+        """Return pydantic's errors, each with its place, and True if it is about the key there."""
         errors = []
         for each in error.errors(include_url=False):
             where, on_key = self._place_of(each["loc"], missing=each["type"] == "missing")
@@ -251,7 +251,7 @@ class Document:
         return [each for each in errors if each[0] not in inner or not each[2]["type"].endswith("_type")]
 
     def _place_of(self, loc: Sequence[str | int], *, missing: bool) -> tuple[Where, bool]:
-        """Return the place of pydantic's loc (which also names members of unions), and whether it is that of a key."""
+        """Return the place of pydantic's loc (which also names members of unions), and True if it is that of a key."""
         where: Where = ()
         for part in loc[:-1] if missing else loc:
             if self._partial.original((*where, part)) in self._places:
@@ -309,7 +309,7 @@ class Document:
             elif name in seen:
                 place, words = (*where, name), f"is given twice, first in line {seen[name]}"
             elif not _can_encode(name):
-                words = "a key is half a character"
+                words = "a key contains half a character (a lone surrogate)"
             if words:
                 self._problems.append(Problem(mark.line + 1, mark.column + 1, format_place(place), words))
                 continue
@@ -323,10 +323,10 @@ class Document:
         except yaml.MarkedYAMLError:
             self.report(where, f"the tag {_quote_tag(node)} is not allowed: leave it out")
         except (ValueError, KeyError, IndexError):  # `!!int zz`, a number of five thousand digits
-            self.report(where, f"{text} is not what its tag says, or too long a number")
+            self.report(where, f"{text} does not fit its tag, or has too many digits")
         else:
             if isinstance(value, str) and not _can_encode(value):
-                self.report(where, f"{text} has half a character (a lone surrogate)")
+                self.report(where, f"{text} contains half a character (a lone surrogate)")
             elif isinstance(value, float) and not math.isfinite(value):
                 self.report(where, f"{text} is not a finite number")
             elif isinstance(value, int) and abs(value) > _MAX_INTEGER:
@@ -340,7 +340,7 @@ class Document:
 
 
 class _Loader(CoreLoader):  # type: ignore[misc]  # the class has no stubs
-    """YAML 1.2's core schema with a limit of depth, as PyYAML composes by recursion."""
+    """YAML 1.2's core schema, with a limit of depth because PyYAML composes by recursion."""
 
     def __init__(self, text: str) -> None:
         self._depth = 0
@@ -361,7 +361,8 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     mark = error.problem_mark or error.context_mark
     line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
     if mark is not None and mark.buffer is not None:
-        # A comment hides the closing bracket, and the error is at the next token, often a line below.
+        # A color without quotes is a comment, which hides the closing bracket. PyYAML reports the error at the next
+        # token, often a line below.
         begin = max(0, min(mark.line - 1, error.context_mark.line if error.context_mark else mark.line))
         for at, text in enumerate(mark.buffer.splitlines()[begin : mark.line + 1], begin + 1):
             if color := _COLOR_COMMENT.search(text):
@@ -372,7 +373,7 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     elif "'@'" in problem or "'`'" in problem:
         problem = f"a text that begins with {'@' if '@' in problem else '`'}. Write it in quotes"
     elif "single document" in (error.context or ""):
-        problem = "a second document (`---`). A file has one"
+        problem = "a second document (`---`). A file must have only one"
     return Problem(line, column, "", f"this is not YAML: {problem}")
 
 

@@ -1,6 +1,6 @@
 """Puts pydantic's errors into words for a person. Pure.
 
-The allowed values come from the model's JSON schema, which knows all members of a union. document.py adds the place.
+The allowed values come from the model's JSON schema, which has all members of a union. document.py adds the place.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -20,7 +20,7 @@ Where = tuple[str | int, ...]
 _MAX_VALUE_LENGTH: Final = 60
 _MAX_WORDS_LISTED: Final = 12
 _ITEMS: Final = {"boxes": "box", "capabilities": "capability", "line": "point", "path": "point", "then": "effect"}
-"""Names of a list's items, if not the list's name without its s."""
+"""Names of a list's items, for lists where that is not the list's name without its s."""
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",
@@ -33,7 +33,7 @@ _TYPES: Final = {
 
 
 def format_place(where: Where, tree: object = None) -> str:
-    """Format a place: `cars.red.limits`, `rule 2, when`. Items of a list with a name in `tree` are called by it."""
+    """Format a place: `cars.red.limits`, `rule 2, when`. If an item of a list has a name in `tree`, use the name."""
     segments, words = list[str](), list[str]()
     for part in where:
         try:
@@ -123,7 +123,7 @@ def _sentence(words: str) -> str:
 
 
 def _example(schema: Mapping[str, Any], value: object, definitions: Mapping[str, Any]) -> str:
-    """Return an example of a mapping with the fields that it needs; `value`: what stands there."""
+    """Return an example of a mapping with the fields that it needs. `value` is what the file has there."""
     properties = schema["properties"]
     shown = [name for name, each in properties.items() if "examples" in each]
     names = schema.get("required") or shown or [*properties][:1]
@@ -171,7 +171,7 @@ def _resolve_members(schema: Mapping[str, Any], definitions: Mapping[str, Any]) 
         members += _resolve_members(definitions[schema["$ref"].rpartition("/")[2]], definitions)
     for key in ("anyOf", "oneOf", "allOf"):
         members += [member for each in schema.get(key, ()) for member in _resolve_members(each, definitions)]
-    # A description beside a reference or a union is the field's own.
+    # A description beside a reference or a union belongs to the field, so it replaces that of the members.
     return [schema] if not members else [{**each, **_own_description(schema)} for each in members]
 
 

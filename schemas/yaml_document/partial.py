@@ -1,4 +1,4 @@
-"""A document's values without the faulty ones, and their places in the whole document. Pure."""
+"""The valid values of a document, with their places in the whole document. Pure."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -7,7 +7,7 @@ from schemas.yaml_document.fault_words import Where
 
 
 class PartialTree:
-    """A copy of plain data without some places and with others added; document.py searches it for more faults."""
+    """A copy of plain data without some places and with others added. document.py looks for more faults in it."""
 
     def __init__(self, tree: Any, dropped: Collection[Where] = (), added: Mapping[Where, object] | None = None) -> None:
         self._indices: dict[Where, list[int]] = {}
@@ -15,7 +15,7 @@ class PartialTree:
         self.tree = self._copy((), tree) if dropped or added else tree
 
     def original(self, where: Where) -> Where:
-        """Return the place in the whole tree of a place in this one."""
+        """Translate a place of this tree to its place in the whole tree."""
         place: Where = ()
         for part in where:
             indices = self._indices.get(place)

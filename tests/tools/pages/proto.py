@@ -11,6 +11,8 @@ PROTO = Path(__file__).parents[3] / "schemas/proto/fleet_v1.proto"
 COMMON = frozenset({"stamp", "car", "seq", "boot_id"})
 COMMON_OF_COMMANDS = frozenset({"sender", "kind", "id", "asked", "take", "ttl_s"})
 _FIELD = re.compile(r"  (optional |repeated )?(map<[^>]+>|[\w.]+) (\w+) = \d+;(?:\s*// (.*))?")
+_NEXT_LINE = re.compile(r"\s+// (.*)")
+"""A further line of a field's comment."""
 
 
 @dataclass
@@ -32,6 +34,9 @@ def read() -> list[ProtoMessage]:
         elif (each := _FIELD.match(line)) and found:
             label, kind, name, words = each[1] or "", each[2], each[3], each[4] or ""
             found[-1].fields.append((name, f"{label}{kind.removeprefix('google.protobuf.')}", words))
+        elif (more := _NEXT_LINE.match(line)) and found:
+            name, kind, words = found[-1].fields[-1]
+            found[-1].fields[-1] = name, kind, f"{words} {more[1]}"
         comment = [*comment, line.removeprefix("//").strip()] if line.startswith("// ") and "----" not in line else []
     return found
 
