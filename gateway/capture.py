@@ -1,4 +1,4 @@
-"""Capture files of `gateway monitor --raw`: raw bytes with their times, one JSON object per line.
+"""Writes and reads capture files of `gateway monitor --raw`: raw bytes with their times, one JSON object per line.
 
 The first line describes the file. Every other line has `t` (seconds since the start) and `rx` (bytes as Latin-1).
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 FORMAT: Final = "zenoh-car-fleet raw 1"
-# A link returns at most 1 MiB at once, and JSON needs at most 6 bytes for one.
+# A link returns at most 1 MiB at once, and JSON needs at most 6 bytes for each byte.
 MAX_LINE_BYTES: Final = 8 * 1024 * 1024
 
 
@@ -91,7 +91,7 @@ def _piece(path: Path, number: int, content: dict[str, Any]) -> CapturedBytes:
         else:
             if math.isfinite(piece.at):
                 return piece
-    raise BadCapture(f"{path}:{number}: a line has t, a number from 0 on, and rx, a text of bytes (Latin-1)")
+    raise BadCapture(f"{path}:{number}: a line must have t, a number of at least 0, and rx, a text of bytes (Latin-1)")
 
 
 def _parse(path: Path, number: int, line: bytes) -> dict[str, Any]:
@@ -100,5 +100,5 @@ def _parse(path: Path, number: int, line: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):  # ValueError: no UTF-8, no JSON, or a number with thousands of digits
         content = None
     if not isinstance(content, dict):
-        raise BadCapture(f"{path}:{number}: not a JSON object: did `gateway monitor --raw` keep this file?")
+        raise BadCapture(f"{path}:{number}: not a JSON object: did `gateway monitor --raw` write this file?")
     return content

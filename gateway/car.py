@@ -1,8 +1,9 @@
 """The gateway of one car: joins link, decoder, control and bus in one asyncio loop. Read this file first.
 
-Up: `LinkLoop` takes bytes from the link. The decoder makes events of them. `CarPublisher` publishes the measurements,
-and control updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler` passes the
-command to control, and answers after control could write. Only `Writer` writes to the car, one frame at a time.
+Up: `LinkLoop` reads bytes from the link, and the driver decodes them into events. `CarPublisher` publishes the
+measurements, and control updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler`
+passes the command to control, and answers it after the writer has had a turn. Only `Writer` writes to the car, one
+frame at a time.
 """
 
 import asyncio
@@ -51,18 +52,18 @@ from schemas.words import Level, Shows
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
 RIVAL_CHECK_DELAY_S: Final = 0.5
-"""Delay of the second check for another gateway of the car. Both must have declared by then
+"""Delay of the second check for another gateway of the car. By then, both must have declared themselves on the bus
 (docs/reference/keys.md#one-gateway-per-car)."""
 RIVAL_SHUTDOWN_S: Final = SHUTDOWN_S + 2.0
 """Maximum time that the remaining gateway waits for the port. The other one must notice the conflict, stop the car and
 close the port."""
 HEALTH_INTERVAL_S: Final = 1.0
 LEARNED_INTERVAL_S: Final = 10.0
-"""Minimum interval at which what was learned of the car is kept."""
+"""Minimum time between two saves of what was learned about the car."""
 ANSWER_PAUSE_S: Final = 0.005
-"""Pause between the slices of a long answer, in which Zenoh sends a slice. It drops answers beyond its buffer."""
+"""Pause after each slice of a long answer, so that Zenoh can send it. Zenoh drops what exceeds its buffer."""
 CANCEL_RETRY_S: Final = 0.5
-"""Interval after which a task that still runs is cancelled again."""
+"""Time after which a cancelled task that still runs is cancelled again."""
 
 log = logging.getLogger("gateway")
 
@@ -74,11 +75,11 @@ class Settings:
     car: str
     url: LinkUrl
     platform: str
-    """As in the fleet file: `arduino+arm`, or `auto` to find it out."""
+    """As in the fleet file, such as `arduino+arm`, or `auto` if the gateway has to find out."""
     fleet: str
     state_dir: Path
     retry: bool
-    """True to retry if the first attempt to open the link fails."""
+    """True to try again if the first attempt to open the link fails."""
     battery: BatteryPolicy = field(default_factory=BatteryPolicy)
     speed_max: float = 1.0
     people: People = field(default_factory=People)
@@ -86,7 +87,7 @@ class Settings:
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
     holds_of: str = ""
-    """The car that holds and loans belong to. Empty for the car at this link."""
+    """The car to which the holds and loans belong. Empty: the car at this link."""
 
 
 class CarGateway:
@@ -117,7 +118,7 @@ class CarGateway:
             now_ns=now_ns,
         )
         self._driver = self._control.driver
-        self._state_damage, self._not_taken = state_file.damage, state_file.not_taken
+        self._state_damage, self._other_link_words = state_file.damage, state_file.other_link_words
         self._mark = RunningMark(settings.state_dir, settings.fleet, settings.car)
         self._mark.renew()
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
@@ -144,7 +145,7 @@ class CarGateway:
             self._commands,
             self._wake,
             on_gap=self._on_gap,
-            on_open=self._on_open,
+            log_open=self._log_link_open,
         )
         self._notifier = ServiceNotifier()
         self._writer = Writer(
@@ -153,7 +154,7 @@ class CarGateway:
             self._publisher,
             self._wake,
             on_gap=self._on_gap,
-            on_opened=partial(self._save_learned, at_once=True),
+            on_opened_as_changed=partial(self._save_learned, at_once=True),
             notifier=self._notifier,
         )
         self._hub_lost = asyncio.Event()
@@ -173,8 +174,8 @@ class CarGateway:
         self._publish_states(now)
         if self._state_damage:
             self._commands.log(Level.WARNING, "state_unreadable", self._state_damage)
-        if self._not_taken:
-            self._commands.log(Level.WARNING, "other_link", self._not_taken)
+        if self._other_link_words:
+            self._commands.log(Level.WARNING, "other_link", self._other_link_words)
         self._service.attach(
             self._loop,
             values=self._values_due,
@@ -206,7 +207,7 @@ class CarGateway:
                     if not self._ending:
                         self.stop()
                     await asyncio.wait([stopped, writing], return_when=asyncio.FIRST_COMPLETED)
-                if writing.done():  # it writes nothing any more
+                if writing.done():  # nothing can be written any more
                     self._fail_commands()
                 failed[0].result()
         finally:
@@ -241,7 +242,7 @@ class CarGateway:
         self._wake.set()
 
     def _fail_commands(self) -> None:
-        """Fail what is under way, and take back every claim. The driver may be what failed."""
+        """Fail all commands, and withdraw all claims. Ignore errors, as the driver itself may have failed."""
         with contextlib.suppress(Exception):
             self._driver.link_down("its gateway failed", self._loop.time())
 
@@ -258,21 +259,21 @@ class CarGateway:
         self._wake.set()
 
     async def _check_rival(self) -> None:
-        """Check again for another gateway. If two started together, the gateway with the higher id ends."""
+        """Check a second time for another gateway. If two started together, the one with the higher boot id ends."""
         await asyncio.sleep(RIVAL_CHECK_DELAY_S)
         await self._has_rival()
         await self._writer.finished.wait()
 
     async def _has_rival(self) -> bool:
-        """Return True if another gateway of the car has to end. Raise AlreadyServed if this one has to."""
+        """Return True if another gateway of the car has to end. Raise AlreadyServed if this one has to end."""
         return await asyncio.to_thread(self._service.singleton.raise_unless_first)
 
     async def _is_port_in_use(self) -> bool:
         """Return True if another gateway, which has to end, may still have the port open."""
         return self._loop.time() < self._began_at + RIVAL_SHUTDOWN_S and await self._has_rival()
 
-    def _on_open(self) -> None:
-        """Log that the link is open, once it is proven."""
+    def _log_link_open(self) -> None:
+        """Log that the link is open, and if the saved knowledge about the car is not used, why."""
         if self._learned_file.trouble:
             self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
             self._learned_file.trouble = ""
@@ -281,7 +282,7 @@ class CarGateway:
     # ------------------------------------------------------------------ commands
 
     async def _answer(self, backlog: bus.Backlog[tuple[str, zenoh.Query]]) -> None:
-        """Answer queries of values, one at a time. Between them the loop serves the car."""
+        """Answer queries of values, one at a time. Let the loop serve the car between them."""
         while True:
             family, query = await backlog.next()
             try:
@@ -292,7 +293,7 @@ class CarGateway:
             await asyncio.sleep(0)
 
     def _flush(self) -> None:
-        """Publish records and states, save the safety state, answer the pending queries."""
+        """Publish records and states, save the safety state, and answer the pending queries."""
         self._commands.flush()
         self._publish_states(self._loop.time())
 
@@ -304,7 +305,7 @@ class CarGateway:
         self._wake.set()
 
     def _on_poses(self, newest: Mapping[str, bus.Sample]) -> None:
-        """Keep a pose that somebody published, for queries."""
+        """Store a pose that somebody else published, to answer queries with it."""
         for sample in newest.values():
             self._publisher.keep_pose(sample, self._loop.time())
 
@@ -360,7 +361,7 @@ class CarGateway:
                 self._worst_lag_s = 0.0
 
     def _on_gap(self, now: float) -> None:
-        """Handle a gap of the loop, or a sleep: the process may have lost the bus, and stops a driven car."""
+        """Handle a gap of the loop or a sleep: the bus may be lost meanwhile, and a driven car must be stopped."""
         if (slept_s := self._sleep.take()) > 0:
             self._publisher.on_bus_lost(now)
             if not MONOTONIC_COUNTS_SLEEP:
@@ -373,17 +374,17 @@ class CarGateway:
         self._driver.on_stall(gap_s, now)
 
     def _save_learned(self, now: float, *, at_once: bool = False) -> None:
-        """Keep what was learned of the car for the next gateway."""
+        """Save what was learned about the car for its next gateway."""
         if not at_once and now < self._learned_due_at:
             return
         self._learned_due_at = now + LEARNED_INTERVAL_S
         try:
             self._learned_file.save(self._driver.kept())
         except OSError as error:
-            log.debug("what was learned of %s is not kept: %s", self._settings.car, error)
+            log.debug("what was learned about %s could not be saved: %s", self._settings.car, error)
 
     def _publish_states(self, now: float, *, force: bool = False) -> None:
-        """Publish changed states. A finding about the car goes before the claims that rest on it."""
+        """Publish changed states. Publish a new finding about the car before the claims that rest on it."""
         if findings_of(self._driver.model) != self._published_findings:
             self._publish_health(now)
         self._publisher.publish_states(self._control, self._link.health, now, force=force)
@@ -394,7 +395,7 @@ class CarGateway:
         self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops)
 
     async def _keep_hub(self) -> None:
-        """Restart a lost hub. Jitter keeps a hundred gateways from trying at once."""
+        """Restart a lost hub. Jitter keeps a hundred gateways from starting it at once."""
         while True:
             await self._hub_lost.wait()
             await asyncio.sleep(bus.HUB_RESTART_DELAY_S * (1 + random.random()))  # noqa: S311 - jitter, no secret
@@ -408,7 +409,7 @@ class CarGateway:
 
 
 def begin_logging() -> None:
-    """Let this process log: lines for a person, or JSON."""
+    """Begin to log, as lines for a person or as JSON."""
     if not json_log.begin("gateway"):
         logging.basicConfig(
             format="%(asctime)s %(levelname)s %(message)s",
@@ -421,7 +422,8 @@ def begin_logging() -> None:
 async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> bool:
     """Serve one car until a signal. Return False if the car could not be stopped. Raises AlreadyServed or LinkError."""
     car = CarGateway(settings, opened, service)
-    # Imported objects stay alive. Without this the garbage collector scans them again while readings wait.
+    # Imported objects live as long as the process. Without this, the garbage collector scans them again and again while
+    # readings wait.
     gc.freeze()
     loop = asyncio.get_running_loop()
     signals.calls_in(loop, lambda _: car.stop())
@@ -430,7 +432,7 @@ async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> boo
     except (AlreadyServed, LinkError):
         raise
     except Exception:  # a driver may come from another package, and must not leave a moving car alone
-        log.exception("the gateway of %s failed, and its car is stopped by a new driver", settings.car)
+        log.exception("the gateway of %s failed; a newly started driver program now stops its car", settings.car)
         where = (settings.car, settings.url, settings.platform, settings.fleet, settings.state_dir)
         log.error("%s", await stop_alone(*where))
         return False

@@ -65,7 +65,7 @@ def main() -> None:
 
 
 class _GatewayParser(argparse.ArgumentParser):
-    """A parser with errors of one line, which fails if its help cannot be written."""
+    """A parser with errors of one line. It exits with 1 if its help cannot be written."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse the words. A subcommand rejects words that it does not know, because it can name the likely option."""
@@ -87,7 +87,7 @@ class _GatewayParser(argparse.ArgumentParser):
         super()._check_value(action, value)
 
     def error(self, message: str) -> NoReturn:
-        """Print the error and where the help is, and exit with 2. Leave out the usage, which has up to eight lines."""
+        """Print the error and how to get the help, and exit with 2. Omit the usage, which has up to eight lines."""
         sys.exit(_failed(f"{message} (see {self.prog} --help)", 2))
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
@@ -96,7 +96,7 @@ class _GatewayParser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """Prints the version. Imports packages' metadata only then, because a gateway starts faster without it."""
+    """Prints the version. It imports `importlib.metadata` only when called, so that a gateway starts faster."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
@@ -131,8 +131,8 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--platform",
         default="auto",
-        help="what the car is: arduino, stm32, raspberry_pi or unknown, with options as in arduino+arm. With auto the "
-        "gateway finds out (the default). It cannot find out wave_rover, ugv01, ugv02, ugv_rover, ugv_beast, and the "
+        help="what the car is: arduino, stm32, raspberry_pi or unknown, with options as in arduino+arm. With auto (the "
+        "default) the gateway finds out. It does not recognize wave_rover, ugv01, ugv02, ugv_rover, ugv_beast and the "
         "platforms of installed drivers: name these",
     )
     run.add_argument(
@@ -158,12 +158,13 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         metavar="NAME",
         action="append",
         help="a person who may drive this car: NAME, or NAME:lead for a lead. NAME:other is a person who may drive "
-        "other cars only. May be repeated. All others only watch and stop (default: all drive, nobody is a lead)",
+        "only other cars. May be repeated. Everybody else may only watch and stop (default: everybody may drive, and "
+        "nobody is a lead)",
     )
     run.add_argument(
         "--people-only",
         action="store_true",
-        help="let only the people of --person drive this car, and nobody if there are none",
+        help="let only the people of --person drive this car; without --person, nobody",
     )
     run.add_argument(
         "--longest-drive",
@@ -201,7 +202,7 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         "--parent",
         metavar="PID",
         type=int,
-        help=argparse.SUPPRESS,  # end with this process, which started this one
+        help=argparse.SUPPRESS,  # the process that started this one: the gateway ends with it
     )
 
 
@@ -229,16 +230,16 @@ def _run(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         return _failed(f"--longest-drive: {error}", 2)
     if not 0 < speed_max <= 1:
-        return _failed(f"--speed-max {speed_max:g}: allowed are more than 0 and at most 1, of full speed", 2)
+        return _failed(f"--speed-max {speed_max:g}: it must be more than 0 and at most 1 (full speed)", 2)
     if not 0 < critical_v <= low_v <= 30:
         message = (
-            f"--battery-critical-v {critical_v:g}, --battery-low-v {low_v:g}: allowed are 0 < critical <= low <= 30 V"
+            f"--battery-critical-v {critical_v:g}, --battery-low-v {low_v:g}: they must be 0 < critical <= low <= 30 V"
         )
         return _failed(message, 2)
     try:
         with _opened(arguments, car, url, platform, fleet) as opened:
             service = CarService(opened, fleet, car)
-            # The car is on the bus now. The following imports take as long again.
+            # The car is on the bus now. The following imports take as long again, so they come after it.
             import asyncio
 
             from gateway.car import Settings, begin_logging, serve
@@ -275,9 +276,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: str, fleet: str) -> "Bus":
-    """Return the bus. Raises BusError if the bus cannot be reached.
+    """Return the bus. If it cannot be reached, stop the car and raise BusError.
 
-    Stops the car before that, because the car may still do what it was told last.
+    Without the stop, the car might go on with its last command.
     """
     from schemas import identity
     from schemas.bus import BadEndpoint, Bus, BusError, resolve_endpoint

@@ -1,10 +1,10 @@
-"""Converts times of the event loop's monotonic clock to wall-clock times, in order."""
+"""Converts times of the event loop's monotonic clock to wall-clock times, and keeps their order."""
 
 import time
 from collections.abc import Callable
 from typing import Final
 
-# A slewed wall clock may gain 0.5 ms per second: the offset follows it in steps.
+# A wall clock that is slewed may gain 0.5 ms per second, and the offset follows it in steps of this size.
 MIN_STEP_NS: Final = 2_000_000
 """Minimum change of the offset between the clocks that is applied."""
 # Three readings of the clocks take less than this, unless the scheduler interrupts the process.
@@ -15,10 +15,11 @@ MAX_ATTEMPTS: Final = 10
 
 
 class WallClock:
-    """Keeps one offset between the two clocks until the wall clock steps.
+    """Uses one offset between the two clocks until the wall clock steps.
 
-    So two times keep their order and their distance, whenever they are converted. With a new offset for each event, a
-    process that is interrupted between reading the two clocks could stamp an event before an earlier one.
+    So two times keep their order and their distance, no matter when they are converted. With a new offset for each
+    event, an event could get an earlier stamp than the one before it, if the process was interrupted between reading
+    the two clocks.
     """
 
     def __init__(

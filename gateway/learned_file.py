@@ -1,7 +1,7 @@
-"""Keeps what was learned of one car in a small JSON file: its rhythm, its delays, and whether it can show a stop.
+"""Saves what was learned about one car in a small JSON file: its rhythm, its delays, and whether it can show a stop.
 
-It belongs to the car of one platform at one link. If either changes, the file counts as that of another car. A damaged
-file is no more than a car of which nothing is known yet.
+The file belongs to the car of one platform at one link. If either changes, the file counts as that of another car. If
+the file is damaged, the gateway begins as with an unknown car.
 """
 
 import json
@@ -25,21 +25,21 @@ class LearnedFile:
         self._owner = {"link": link, "platform": platform}
         self._saved = ""
         self.trouble = ""
-        """Why nothing was taken from a file that exists, for a person. Empty if all is well."""
+        """A sentence on why an existing file was not used. Empty if it was used."""
 
     def load(self, use: Callable[[Mapping[str, Any]], T]) -> T:
-        """Return what `use` makes of what was learned, or of nothing. `use` raises ValueError for damage."""
+        """Call `use` with what was learned, or with an empty mapping. `use` raises ValueError for damaged content."""
         self.trouble = ""
         try:
             content = json.loads(self.path.read_text(encoding="utf-8")[:MAX_BYTES])
             if {key: content[key] for key in self._owner} != self._owner:
-                self.trouble = f"{self.path} is of {content['platform']} at {content['link']}, so it does not count"
+                self.trouble = f"{self.path} belongs to {content['platform']} at {content['link']}, so it is not used"
                 return use({})
             return use(dict(content["learned"]))
         except FileNotFoundError:
             return use({})
         except (OSError, *DAMAGE) as error:
-            self.trouble = f"{self.path} is damaged ({type(error).__name__}), so it does not count"
+            self.trouble = f"{self.path} is damaged ({type(error).__name__}), so it is not used"
             return use({})
 
     def save(self, learned: Mapping[str, Any]) -> None:

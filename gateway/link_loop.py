@@ -1,6 +1,7 @@
-"""Keeps the link of one car open, and reads from it: the decoder makes events of the bytes.
+"""Keeps the link of one car open, and reads from it: the driver decodes the bytes into events.
 
-Each event is published first, then control updates its state with it. A lost link is opened again, for ever.
+Each event is first published, and then given to the driver, which updates its state. A lost link is opened again, for
+ever.
 """
 
 import asyncio
@@ -21,14 +22,15 @@ from schemas.links import BAUD, SerialUrl, UsbUrl
 from schemas.words import FrameVerdict, Level, LinkState, Motors
 
 SLICE_BYTES: Final = 1024
-"""Maximum bytes that are decoded before other tasks run, a stop above all. A car sends 960 a second."""
+"""Maximum bytes that are decoded before other tasks, such as a stop, get a turn. A car sends 960 a second."""
 MAX_BYTES_AGE_S: Final = 0.25
-"""Discard bytes older than this; newer data matters more."""
+"""Maximum age of bytes that are decoded. Older ones are discarded, because newer ones matter more."""
 MIN_DAMAGED: Final = 3
+"""Number of damaged frames after which the link looks for the cause."""
 LOOK_INTERVAL_S: Final = 10.0
-"""Minimum damaged frames after which the link searches for the cause, and the interval of the searches."""
+"""Minimum interval of these looks."""
 FLOOD_LOG_PAUSE_S: Final = 10.0
-"""Minimum pause after a flood before the next one is logged."""
+"""Minimum time since the last bytes of a flood before another flood is logged."""
 BITS_PER_BYTE: Final = 10
 """Bits of a byte on a UART: 8N1."""
 
@@ -45,9 +47,13 @@ class LinkLoop:
         wake: Wake,
         *,
         on_gap: Callable[[float], None],
-        on_open: Callable[[], None],
+        log_open: Callable[[], None],
     ) -> None:
-        """`on_gap` looks for a gap of the loop before bytes are judged. `on_open` hears that the link is proven."""
+        """Call `on_gap` to detect a gap of the loop before bytes are judged.
+
+        Call `log_open` when an opening of the link should be logged: at once, or if the last link was lost soon, once
+        this one is proven (`Attempts`).
+        """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self.url = url
@@ -61,20 +67,20 @@ class LinkLoop:
         self._commands = commands
         self._wake = wake
         self._on_gap = on_gap
-        self._on_open = on_open
+        self._log_open = log_open
         self._baud = BaudWatch(url)
         self._flood_until = now
         self._attempts = Attempts()
         self._trouble = ""
-        """The trouble of an open link that was logged last."""
+        """The last logged trouble of an open link."""
         self._damaged = 0
-        """Frames that were rejected since the last search for the trouble of the link."""
+        """Frames that were rejected since the link last looked for trouble."""
         self._look_at = now
 
     async def keep_open(self, *, may_fail: bool, is_in_use: Callable[[], Awaitable[bool]]) -> None:
-        """Keep the link open, and read from it. Raises LinkError if the first attempt fails and must not (`may_fail`).
+        """Keep the link open, and read from it. Without `may_fail`, raise LinkError if the first attempt fails.
 
-        `is_in_use` is True if another gateway, which has to end, may still have the port open.
+        `is_in_use` returns True if another gateway, which has to end, may still have the port open.
         """
         looked_again = False
         while True:
@@ -84,7 +90,7 @@ class LinkLoop:
                 if not may_fail and not await is_in_use():
                     if looked_again or not isinstance(error, Busy):
                         raise
-                    looked_again = True  # the other gateway, which had the port, may have ended since
+                    looked_again = True  # the gateway that had the port may have ended meanwhile
                 else:
                     self.lost(str(error))
                 await self._pause()
@@ -96,7 +102,7 @@ class LinkLoop:
             self.health.on_open(now)
             self._control.link_up(now)
             if self._attempts.on_open(now):
-                self._on_open()
+                self._log_open()
             self._wake.set()
             try:
                 await self._read(link)
@@ -122,7 +128,7 @@ class LinkLoop:
             data = await link.read()
             read_at = now = self._loop.time()
             self.health.on_bytes(len(data), now)
-            self._on_gap(now)  # before the bytes: reports that are read late may look like a pause
+            self._on_gap(now)  # first, because reports that are read late may look like a pause of the car
             before = shown_state(self._driver.model)
             for start in range(0, len(data), SLICE_BYTES):
                 if start:
@@ -158,7 +164,7 @@ class LinkLoop:
                 self._on_flood("raw_not_published", 1, event.at)
             self._driver.on_event(event, self._loop.time())
             if isinstance(event, TextLine):
-                self.health.on_rejected(FrameVerdict.TEXT)  # it shows a program, but not that of a car
+                self.health.on_rejected(FrameVerdict.TEXT)  # text shows that some program runs, but no car's program
                 continue
             self.health.rx_frames += 1
             if isinstance(event, Rejected):
@@ -169,10 +175,10 @@ class LinkLoop:
             if not isinstance(event, Echo):
                 self.health.on_reading(event.at)
             if self._attempts.check_proven(event.at, has_reading=True):
-                self._on_open()
+                self._log_open()
 
     def lost(self, reason: str) -> None:
-        """Fail what waits for the link: it is down."""
+        """Note that the link is down, and fail the commands that wait for it."""
         now = self._loop.time()
         self.link = None
         self.health.on_lost(reason, now)
@@ -182,9 +188,12 @@ class LinkLoop:
         self._wake.set()
 
     def check(self, now: float) -> None:
-        """Log that the link has lasted, and what it found out if bytes are damaged or missing, once each."""
+        """Log the opening of a link that is now proven, if it is not logged yet.
+
+        If bytes are damaged or missing, let the link look for the cause. Log each cause once.
+        """
         if self._attempts.check_proven(now, has_reading=False):
-            self._on_open()
+            self._log_open()
         if self.link is None:
             return
         is_stale = self.health.state is LinkState.STALE
@@ -199,5 +208,5 @@ class LinkLoop:
 
 
 def at_rate(url: LinkUrl, baud: int) -> LinkUrl:
-    """Return a link at the rate of its car, unless it names a rate of its own."""
+    """Return a link with the baud rate of its car, unless its URL names another rate."""
     return replace(url, baud=baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url

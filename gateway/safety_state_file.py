@@ -1,7 +1,7 @@
 """Persists the safety state of one car (its hold, e-stops, pauses and loan) in a small JSON file.
 
-A hold, a loan and an e-stop of one car belong to the car at one link: a simulated red is not the red on the table. The
-file keeps them for each link. Pauses and e-stops of the whole fleet belong to the fleet, whatever the link.
+A hold, a loan or an e-stop of one car belongs to the car at one link: a simulated red is not the red on the table. So
+the file has them for each link. Pauses and e-stops of the whole fleet do not depend on the link.
 """
 
 import json
@@ -18,12 +18,12 @@ from schemas.rights import Estop, FleetPause, Hold, Loan
 from schemas.words import Rank
 
 MAX_OTHER_LINKS: Final = 16
-"""Maximum links besides the present one whose holds, loans and e-stops the file keeps. The oldest is dropped."""
+"""Maximum number of other links whose holds, loans and e-stops the file keeps. Beyond it, the oldest is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class _OfLink:
-    """What belongs to the car at one link."""
+    """The hold, e-stops and loan of the car at one link."""
 
     link: str
     hold: Hold | None
@@ -41,15 +41,15 @@ class SafetyStateFile:
     def __init__(self, directory: Path, fleet: str, car: str, link: str) -> None:
         self.path = directory / f"{fleet}.{car}.json"
         self.damage = ""
-        """Words for a person if the file that `load` found is unreadable."""
-        self.not_taken = ""
-        """Words for a person if `load` found a hold, a loan or an e-stop of another link."""
+        """A sentence for a person if `load` found an unreadable file, else empty."""
+        self.other_link_words = ""
+        """A sentence for a person if `load` found a hold, a loan or an e-stop of another link, else empty."""
         self._link = link
         self._others: tuple[_OfLink, ...] = ()
 
     def load(self, now_ns: int) -> PersistedSafety:
         """Return the persisted state. A corrupted file counts as a hold, so that the car does not drive off."""
-        self.damage, self.not_taken, self._others = "", "", ()
+        self.damage, self.other_link_words, self._others = "", "", ()
         try:
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
@@ -59,7 +59,7 @@ class SafetyStateFile:
         try:
             content = json.loads(text)
             state, others = _parse(content, now_ns), tuple(_parse_others(content, now_ns))
-            # Files of older versions name no link: they are of the only car of that name.
+            # Files of older versions name no link, because there was only one car of a name.
             link = _text(content.get("link", self._link))
         except DAMAGE:
             return self._unreadable("", now_ns)
@@ -67,7 +67,7 @@ class SafetyStateFile:
             others, state = _exchanged(others, state, was=link, now=self._link)
         self._others = others
         if others:
-            self.not_taken = self._words(others[-1], len(others) - 1)
+            self.other_link_words = self._words(others[-1], len(others) - 1)
         return state
 
     def save(self, state: PersistedSafety) -> None:
@@ -119,7 +119,7 @@ def _parse(content: Any, now_ns: int) -> PersistedSafety:
 
 
 def _parse_others(content: Any, now_ns: int) -> Iterator[_OfLink]:
-    """Yield what belongs to other links. Raises what `_parse` raises."""
+    """Yield the holds, e-stops and loans of other links. Raises the errors of `_parse`."""
     for each in content.get("others", ()):
         hold, loan = _hold(each["hold"], now_ns), _loan(each["loan"], now_ns)
         if not (other := _OfLink(_text(each["link"]), hold, _estops(each, now_ns), loan)).is_empty:

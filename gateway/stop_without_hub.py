@@ -2,11 +2,11 @@
 
 It is needed twice:
 
-- A gateway starts, its hub is away, and the car may still do what it was told last. A gateway that its watchdog has
-  ended in an outage of the network would leave a moving car alone, since its successor waits for the hub first.
-- A gateway fails, because its driver does, which may come from another package. That driver writes nothing any more.
+- A gateway starts while its hub is away, and the car may still follow its last command. Suppose the watchdog ended a
+  gateway during an outage of the network. Its successor waits for the hub first, and would leave a moving car alone.
+- A gateway fails because its driver fails, which may come from another package. That driver writes no frames any more.
 
-Nothing is taken from the bus here, and nothing is claimed on it.
+Nothing here reads from the bus or publishes on it.
 """
 
 import asyncio
@@ -28,16 +28,16 @@ from schemas.links import car_link
 log = logging.getLogger("gateway")
 
 _STOP_POLL_S: Final = 0.05
-"""Interval at which the stop goes on. Frames are tens of milliseconds apart."""
+"""Interval at which the driver is asked for its next frame. Frames are tens of milliseconds apart."""
 
 
 def run_stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Do what `stop_alone` does, in a loop of its own."""
+    """Run `stop_alone` in an event loop of its own."""
     return asyncio.run(stop_alone(car, url, platform, fleet, state_dir))
 
 
 async def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Stop the car without the bus, and return what became of it as a sentence for a person."""
+    """Stop the car without the bus. Return a sentence for a person that says whether it was stopped."""
     try:
         why_not = await _stop(car, url, platform, fleet, state_dir)
     except LinkError as error:
@@ -45,11 +45,11 @@ async def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_di
     except Exception as error:  # a driver may fail again
         log.exception("%s could not be stopped", car)
         return f"{car} may be moving, and was not stopped: {type(error).__name__}: {error}"
-    return f"{car} may be moving: {why_not}" if why_not else f"{car} was stopped all the same."
+    return f"{car} may be moving: {why_not}" if why_not else f"{car} was stopped without the bus."
 
 
 async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Open the link, stop the car, close the link. Return why it was not stopped. Empty if it was. Raises LinkError."""
+    """Open the link, stop the car, close the link. Return why it was not stopped, empty if it was. Raises LinkError."""
     learned = LearnedFile(state_dir, fleet, car, link=car_link(url), platform=platform)
     loop = asyncio.get_running_loop()
     make = learned.load(partial(drivers.driver_of, platform))
@@ -70,7 +70,7 @@ async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Pa
         driver.link_down(str(error), loop.time())
     finally:
         reads.cancel()
-        with contextlib.suppress(asyncio.CancelledError, Exception):  # a driver that cannot read still writes its stop
+        with contextlib.suppress(asyncio.CancelledError, Exception):  # a driver that cannot read can still write a stop
             await reads
         await link.close()
     return driver.not_stopped

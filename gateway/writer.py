@@ -1,4 +1,4 @@
-"""Writes to the car: only this module does, one frame at a time."""
+"""Writes frames to the car, one at a time. Nothing else writes to it."""
 
 import asyncio
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from schemas.words import Reason
 
 
 class Writer:
-    """The frames to one car. `run` runs until it is cancelled."""
+    """Writes the frames to one car. `run` runs until it is cancelled."""
 
     def __init__(
         self,
@@ -24,13 +24,14 @@ class Writer:
         wake: Wake,
         *,
         on_gap: Callable[[float], None],
-        on_opened: Callable[[float], None],
+        on_opened_as_changed: Callable[[float], None],
         notifier: ServiceNotifier,
     ) -> None:
-        """`on_gap` looks for a gap of the loop before a frame is chosen. `on_opened`: `Driver.opened_as` changed.
+        """Call `on_gap` to detect a gap of the loop before a frame is chosen.
 
-        `notifier`: is fed by each turn and each frame, and by nothing else. So if no frame can be written any more,
-        systemd starts another gateway, which stops the car.
+        `on_opened_as_changed` is called when `Driver.opened_as` has changed. `notifier` is fed by each turn and each
+        frame, and by nothing else. So if no frame can be written any more, systemd starts another gateway, which stops
+        the car.
         """
         self._loop = asyncio.get_running_loop()
         self._driver = driver
@@ -38,13 +39,13 @@ class Writer:
         self._publisher = publisher
         self._wake = wake
         self._on_gap = on_gap
-        self._on_opened = on_opened
+        self._on_opened_as_changed = on_opened_as_changed
         self._notifier = notifier
         self.finished = asyncio.Event()
         """Set when the driver has finished after `shut_down`."""
 
     async def run(self, flush: Callable[[], None]) -> None:
-        """Write frames when control needs it. After each turn, `flush` answers queries and publishes records."""
+        """Write frames when control needs it. Call `flush` after each turn: it publishes records, answers queries."""
         while True:
             self._wake.clear()
             await self._write_due()
@@ -57,7 +58,7 @@ class Writer:
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
-        self._on_gap(now)  # before the decoder: reports that are read late may look like a pause
+        self._on_gap(now)  # first, because reports that are decoded late may look like a pause of the car
         self._link.on_events(self._driver.flush(now))
         while (link := self._link.link) is not None and (write := self._next_frame()) is not None:
             self._driver.sends(write.data, self._loop.time())  # an echo may arrive before the write returns
@@ -75,14 +76,14 @@ class Writer:
             now = self._loop.time()
             opened_as = self._driver.opened_as
             self._driver.on_written(write, now)
-            if self._driver.opened_as != opened_as:  # the next gateway needs it to stop the car
-                self._on_opened(now)
+            if self._driver.opened_as != opened_as:  # the next gateway needs this to stop the car
+                self._on_opened_as_changed(now)
             self._link.health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
             self._notifier.feed(now)
 
     def _next_frame(self) -> OutgoingFrame | None:
-        """Return the frame to write now, if any. The computer may have slept since the last one."""
+        """Return the frame to write now, if any. Look for a gap first: the computer may have slept meanwhile."""
         now = self._loop.time()
         self._on_gap(now)
         return self._driver.poll(now)

@@ -1,6 +1,6 @@
 """Publishes one car's readings, frames, states and records as messages, and answers queries of values.
 
-The driver decides which measurements are published, and what is claimed of the car. This module fills the messages.
+The driver decides which measurements are published, and what is claimed about the car. This module fills the messages.
 """
 
 import math
@@ -27,27 +27,27 @@ from schemas.words import UNKNOWN, BatteryLevel, LinkState, MotionSource, Motors
 
 VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
-"""Maximum interval of a state; a changed state is published at once (docs/reference/keys.md#topics)."""
+"""Maximum interval between two messages of a state. A change is published at once (docs/reference/keys.md#topics)."""
 ANSWERS_PER_SLICE: Final = 50
-"""Maximum answers to a query without a pause: 3 ms as JSON."""
+"""Maximum answers to a query without a pause. As JSON, they take 3 ms."""
 CLIENTS_BACK_S: Final = 1.0
-"""Time after a loss of the bus until its other clients, a recorder above all, are connected again."""
+"""Time after a loss of the bus until the other clients, such as the recorder, are connected again."""
 BUS_LOSS_GAP_S: Final = 1.0
-"""Minimum gap of the loop that may have cost the link to the bus unnoticed (Zenoh's lease is 2 s)."""
+"""Minimum gap of the loop after which the link to the bus may have been lost unnoticed (Zenoh's lease is 2 s)."""
 MAX_PENDING_RECORDS: Final = 1000
 """Maximum records of commands and events that wait for the bus. The oldest are dropped and counted."""
 RAW_PER_S: Final = 100.0
 RAW_BURST: Final = 1000.0
-"""Rate limit and burst of published raw frames. A car sends up to 27 a second (docs/reference/protocol.md#rates); a
-link may delay many."""
+"""Rate limit and burst of published raw frames. A car sends up to 27 a second (docs/reference/protocol.md#rates), and a
+link may delay many of them and deliver them together."""
 _CLASSES: Final[dict[str, Any]] = {
     topic.name: messages.message_class(topic.message)
     for topic in topics.CAR_TOPICS
     if topic.message.startswith("fleet.v1.")
 }
-"""Message classes by topic. Each message is a new object: a cleared one would keep its old memory."""
+"""Message classes by topic. Each message is a new object, because a cleared one would not free its memory."""
 _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
-"""Phases at the arrival of a command. They have no `took_s`."""
+"""Phases that are recorded when a command arrives, so without `took_s`."""
 
 
 class CarPublisher:
@@ -84,7 +84,7 @@ class CarPublisher:
     def publish_event(self, event: Event) -> bool:
         """Publish the measurements of an event, then its raw frame. Return False if raw frames exceed their rate limit.
 
-        The driver decides what is a measurement.
+        The driver decides which measurements an event has.
         """
         model = self._driver.model
         stamp_ns = self._wall.ns(event.at)
@@ -115,9 +115,9 @@ class CarPublisher:
         self._histories[name].add(Value(at, stamp_ns, payload))
 
     def keep_pose(self, sample: bus.Sample, now: float) -> None:
-        """Keep a pose that a program outside of the car has published, so that queries are answered with it.
+        """Store a pose that a program outside the car has published, so that queries are answered with it.
 
-        A payload that is not a pose, or has no finite numbers, is dropped, because no program of ours sent it.
+        Drop and count a payload that is not a pose, or whose numbers are not finite: no program of ours sends it.
         """
         name = "sensor/pose"
         if sample.deleted or sample.unread:
@@ -129,12 +129,12 @@ class CarPublisher:
             self.dropped += 1
             return
         if message.boot_id == self._boot_id:
-            return  # the driver's own
+            return  # the pose was published by this gateway, which has stored it already
         if not all(math.isfinite(each) for each in (message.x_m, message.y_m, message.heading_rad)):
             self.dropped += 1
             return
         if not message.stamp.seconds:
-            message.stamp.FromNanoseconds(self._wall.ns(now))  # when it came
+            message.stamp.FromNanoseconds(self._wall.ns(now))  # it has no stamp, so use the time of arrival
         self._histories[name].add(Value(now, messages.stamp_ns(message.stamp), message.SerializeToString()))
 
     # ------------------------------------------------------------------ frames out, records
@@ -149,7 +149,7 @@ class CarPublisher:
         self._publishers["frame/tx"].put(frame, self._wall.ns(at))
 
     def publish_command(self, record: CommandRecord, request: tuple[bytes, str] | None) -> None:
-        """Publish one transition of a command. The first one has the original request."""
+        """Publish one transition of a command. `request` is the original request, for the first transition only."""
         event = _CLASSES["event/command"]()
         command = record.command
         event.id = command.id
@@ -190,11 +190,11 @@ class CarPublisher:
             self.dropped += 1
 
     def on_bus_lost(self, now: float) -> None:
-        """Buffer records from now on: the bus is unreachable, or may be."""
+        """Buffer records from now on, because the bus is, or may be, unreachable."""
         self._bus_lost_at = now
 
     def on_bus_connected(self, now: float, *, at_once: bool = False) -> None:
-        """Publish the buffered records at once, or when the other clients are connected again."""
+        """Publish the buffered records once the other clients are connected again. With `at_once`, publish them now."""
         if self._pending and (at_once or now > self._bus_lost_at + CLIENTS_BACK_S):
             for publisher, message, stamp_ns in self._pending:
                 publisher.put(message, stamp_ns)
@@ -263,7 +263,7 @@ class CarPublisher:
         self._put_kept(name, message, now, self._wall.ns(now))
 
     def on_slept(self, slept_s: float) -> None:
-        """Count a sleep of the computer that the monotonic clock does not count, s."""
+        """Make the stored values older by a sleep of the computer, s, which the monotonic clock does not count."""
         for history in self._histories.values():
             history.age(slept_s)
 
@@ -272,7 +272,7 @@ class CarPublisher:
     def answer_query(self, family: str, query: zenoh.Query) -> Iterator[None]:
         """Answer a query for one family, `sensor` or `state`, with the latest values or the history.
 
-        Yields after each slice, so that the caller can serve the car: the whole history as JSON would take too long.
+        Yields after each slice, so that the caller can serve the car: to send a whole history as JSON takes long.
         """
         with query:
             parameters = query.parameters
@@ -343,7 +343,7 @@ def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> Non
 
 
 def findings_of(model: DriverClaims) -> tuple[object, ...]:
-    """Return what was found out about the car itself."""
+    """Return the findings about the car itself: its profile, and whether it shows its stops."""
     return model.profile.name, model.shows, model.doubted
 
 

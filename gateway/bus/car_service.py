@@ -1,10 +1,10 @@
 """The bus service of one car: its queryables, its drive subscription, its token, and the check for a second gateway.
 
-The gateway declares it before it imports the rest of its modules, which takes half of the start. So the car is on the
-bus at once, and queries wait for `attach`. Do not import heavy modules here.
+The gateway declares the service before it imports the rest of its modules, which takes half of its start. So the car is
+on the bus early, and queries wait for `attach`. Do not import heavy modules here.
 
-Commands go before queries of values. A command waits for one turn of the loop. Queries of values wait in a queue, and
-queries of the history in another one.
+Commands go before queries of values: a command waits for one turn of the loop. Queries of the latest values wait in a
+queue, and queries of the history in another one.
 """
 
 import time
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
 
 FAMILIES: Final = ("sensor", "state")
 MAX_QUEUED_DRIVES: Final = 32
-"""Maximum waiting drives of streams. Older ones are dropped. Few, so that a stop never waits long behind them."""
+"""Maximum waiting drives of streams. Older ones are dropped. The number is small, so that a stop never waits long."""
 MAX_QUEUED_QUERIES: Final = 128
 """Maximum waiting command queries."""
 MAX_QUEUED_STOPS: Final = 128
-"""Additional room for stops. They share the queue of the commands, because a drive must not overtake its own stop."""
+"""Additional room for stops in the queue of commands. They have no queue of their own: a drive must not overtake the
+stop that was sent before it."""
 MAX_QUEUED_OVERSIZED: Final = 4
 """Maximum waiting commands that are too large and will be rejected. Each holds its payload in memory."""
 MAX_QUEUED_VALUE_QUERIES: Final = 256
@@ -36,12 +37,12 @@ MAX_QUEUED_VALUE_QUERIES: Final = 256
 MAX_QUEUED_HISTORY_QUERIES: Final = 8
 """Maximum waiting queries of the history. Each takes up to a second of work, and memory for every answer."""
 RIVAL_TIMEOUT_S: Final = 3.0
-"""Timeout for another gateway's answer. A stalled one answers within it or loses its Zenoh lease (2 s)."""
+"""Timeout for another gateway's answer. Within it, a stalled gateway answers, or loses its Zenoh lease (2 s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One command as the bus delivered it: by a query, or as one sample of a stream."""
+    """One command as the bus delivered it: a query, or one sample of a stream."""
 
     verb: str
     payload: bytes | None
@@ -51,7 +52,7 @@ class Request:
     unread: str = ""
     """Why the payload was not read, or an empty text if it was."""
     identity: str = ""
-    """Who sent it, proven by a certificate. Empty on a bus without certificates."""
+    """The sender's identity, proven by a certificate. Empty on a bus without certificates."""
     sampled_ns: int | None = None
     """Zenoh timestamp of a sample, ns since the epoch. None for a query."""
     query: zenoh.Query | None = None
@@ -88,15 +89,15 @@ class CarService:
         self._senders: bus.Latest[bool] = bus.Latest()
         self._cars: bus.Latest[bool] = bus.Latest()
         self._poses: bus.Latest[bus.Sample] = bus.Latest(limit=1)
-        # Queryables first, then the token: clients that see the token must get an answer.
+        # Declare the queryables before the token, because a client that sees the token must get an answer.
         for family in FAMILIES:
-            # A query on `fleet/**` reaches both: each answers for its own family only.
+            # A query on `fleet/**` reaches both queryables, so each answers only for its own family.
             opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._on_query, family))
         for expression in keys.command_keys(fleet, car):
             opened.queryable(expression, self._on_command, too_large=self._on_command)
         for expression in keys.command_keys(fleet, car, Verb.DRIVE):
             opened.subscribe(expression, self._on_sample, largest=bus.LARGEST_PAYLOAD, admits=self._admits)
-        # A program outside of the car may publish its pose. The gateway answers queries with it.
+        # A program outside the car may publish the car's pose. The gateway answers queries with it.
         pose = keys.topic_key(fleet, car, "sensor/pose")
         opened.subscribe(pose, lambda sample: self._poses(pose, sample), largest=bus.LARGEST_PAYLOAD)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
@@ -114,10 +115,10 @@ class CarService:
         cars: "Callable[[Mapping[str, bool]], object]",
         poses: "Callable[[Mapping[str, bus.Sample]], object]",
     ) -> None:
-        """Connect the handlers, also for items that wait already.
+        """Connect the handlers, also to items that wait already.
 
-        `senders` and `cars` take changes of tokens by name. `values` and `histories` are set when there are queries.
-        `poses` takes the newest pose that somebody published, the gateway itself, too.
+        `senders` and `cars` are called with changes of tokens by name. `values` and `histories` are set when there are
+        queries. `poses` is called with the newest published pose, which may be the gateway's own.
         """
         self.values.attach(loop, values)
         self.histories.attach(loop, histories)
@@ -136,8 +137,8 @@ class CarService:
 
     def _already_served(self, other: Any) -> AlreadyServed:
         return AlreadyServed(
-            f"car {self._car} is served already, by process {other.pid} on {other.host} "
-            f"(link {other.link}): stop that one first, or give this car another name"
+            f"car {self._car} already has a gateway, process {other.pid} on {other.host} "
+            f"(link {other.link}): stop that gateway first, or give this car another name"
         )
 
     def _on_query(self, family: str, query: zenoh.Query) -> bool:
@@ -150,7 +151,7 @@ class CarService:
         expression = str(query.key_expr)
         verb = expression.rpartition("/")[2]
         if "*" in verb:
-            bus.refuse(query, f"{expression}: name the command, there is no command {verb}")
+            bus.refuse(query, f"{expression}: give the name of one command, not {verb}")
             return True
         request = Request(
             verb,

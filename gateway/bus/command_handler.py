@@ -1,6 +1,6 @@
 """Handles the command queries and drive streams of one car: parses them, records them, answers them.
 
-Control decides about each command. Its answer goes out after control could write, and after the safety state is saved.
+Control decides about each command. Its answer is sent after the writer has had a turn and the safety state is saved.
 """
 
 import logging
@@ -37,7 +37,7 @@ command_log = logging.getLogger(json_log.COMMANDS)
 class CommandHandler:
     """The commands of one car. Use it in the loop: `clock` is the loop's, `wake` wakes the writer.
 
-    `on_gap` looks for a gap of the loop: after a sleep of the computer the car is stopped before any command is taken.
+    `on_gap` looks for a gap of the loop: after a sleep of the computer, the car is stopped before the next command.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class CommandHandler:
         self._wake = wake
         self._on_gap = on_gap
         self._unanswered: list[tuple[Request, str, Answer]] = []
-        """Queries with the id of their command and the answer to send."""
+        """Queries, each with the id of its command and the answer to send."""
         self._logs_commands = json_log.is_wanted()
         self._sent: set[str] = set()
-        """Ids of commands whose first frame was written since the last answers."""
+        """Ids of commands whose first frame was written since the last answers were sent."""
 
     def on_request(self, request: Request) -> None:
-        """Pass a command to control. Queue the answer to a query until control could write."""
+        """Pass a command to control. Queue the answer to a query until the writer has had a turn."""
         self._on_gap(self._clock())
         before = self._control.safety.persisted
         command, answer = self._carry_out(request)
@@ -83,7 +83,10 @@ class CommandHandler:
         self._wake()
 
     def _share(self, request: Request, command: Command, answer: Answer, before: PersistedSafety) -> None:
-        """Tell the other gateways what concerns the fleet. If they were asked, too, learn what this one has missed."""
+        """Forward a command that concerns the whole fleet to the other gateways.
+
+        If the command was sent to them too, query them instead: this gateway may have missed something before.
+        """
         if not request.by_wildcard:
             self._estop_sync.forward(command, before, self._control.safety.persisted)
         elif (
@@ -91,10 +94,10 @@ class CommandHandler:
             or (isinstance(command.what, EmergencyStop) and command.what.fleet_wide)
             or (isinstance(command.what, Resume) and answer.reason is Reason.ESTOPPED)
         ):
-            self._estop_sync.sync_soon()  # this gateway may have missed an e-stop or a pause, or its end
+            self._estop_sync.sync_soon()  # this gateway may have missed an e-stop, a pause, or the end of one
 
     def _carry_out(self, request: Request) -> tuple[Command, Answer]:
-        """Parse a request and pass it to control. Its first record has the original request."""
+        """Parse a request and pass it to control. Publish the original request in the command's first record."""
         now = self._clock()
         try:
             command = command_parser.parse(
@@ -124,7 +127,7 @@ class CommandHandler:
             bus.reply_message(query, key, result, as_json=as_json)
 
     def flush(self) -> None:
-        """Publish records, save the safety state, answer the pending queries."""
+        """Publish records, save the safety state, and answer the pending queries."""
         self._publish_records()
         self._save()
         sent, self._sent = self._sent, set()
@@ -134,7 +137,7 @@ class CommandHandler:
 
     def _save(self) -> None:
         """Save a changed safety state."""
-        # Before the answers: after "the e-stop is latched" a person may switch the computer off.
+        # Save before answering: a person who reads that the e-stop is latched may switch the computer off.
         safety = self._control.safety.persisted
         if safety == self._saved_safety:
             return
@@ -142,7 +145,7 @@ class CommandHandler:
         try:
             self._save_to_disk(safety)
         except OSError as error:
-            words = f"{self._car} loses its hold and e-stops at a restart of its gateway: {error}"
+            words = f"{self._car} will lose its hold and e-stops if its gateway restarts: {error}"
             self.log(Level.ERROR, "not_saved", words)
             lost = f"not saved: {error}"
             self._unanswered = [
@@ -164,7 +167,7 @@ class CommandHandler:
                 self._sent.add(record.command.id)
 
     def _log_command(self, record: CommandRecord) -> None:
-        """Log a record of a command, if anybody reads such lines."""
+        """Log a record of a command, if this process logs as JSON."""
         if not self._logs_commands:
             return
         command = record.command
@@ -186,7 +189,7 @@ class CommandHandler:
         self._publisher.publish_log(record)
 
     def _print(self, record: LogRecord) -> None:
-        """Print a log line, with the code that the troubleshooting page explains."""
+        """Print a log line that ends with the code, which the troubleshooting page explains."""
         car = "" if record.words.startswith(f"{self._car} ") else f"{self._car}: "
         extra = json_log.fields(car=self._car, code=record.code)
         log.log(_LOGGING_LEVELS[record.level], "%s%s [%s]", car, record.words, record.code, extra=extra)

@@ -1,6 +1,6 @@
 """Parses a command query or publication into a `Command`, or raises an error that names the mistake.
 
-It checks ranges. `gateway.control.refusals` decides whether the car may carry out the command now.
+It checks ranges. `gateway.control.refusals` decides whether the command may be carried out now.
 """
 
 import hashlib
@@ -48,11 +48,11 @@ W = TypeVar("W", bound=str)
 COLOR_MAX: Final = 255
 DEG_MAX: Final = 180
 ARM_JOINTS: Final = 6
-"""Maximum of a color and of an angle, degrees, and the number of joints (docs/reference/keys.md#command-keys)."""
+"""Maximum of a color, maximum of an angle in degrees, number of joints (docs/reference/keys.md#command-keys)."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
-"""Maximum time in which one query reaches every gateway."""
+"""Maximum time in which one query reaches all gateways."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
 """The kinds that a command may claim."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
@@ -60,7 +60,7 @@ WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wild
 
 
 class BadRequest(ValueError):
-    """An invalid request. `command` has its readable part, so that the rejection is recorded under its id."""
+    """An invalid request. `command` has its readable part, so that the rejection is recorded with the command's id."""
 
     def __init__(self, reason: Reason, words: str, command: Command) -> None:
         super().__init__(words)
@@ -79,14 +79,14 @@ def parse(
         words = f"{verb!r} is not a command. Commands: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
     if request.by_wildcard and verb not in WILDCARD_VERBS:
-        words = f"{verb} takes no wildcard: name one car (only {', '.join(WILDCARD_VERBS)} take one)"
+        words = f"{verb} allows no wildcard: name one car (only {', '.join(WILDCARD_VERBS)} allow one)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     if request.unread:
         if verb not in STOPS:
             raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
         return _stop_anyway(blank, request.unread, request)
     if request.payload is None and verb not in STOPS:
-        words = f"{verb} without a payload: give {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
+        words = f"{verb} has no payload: send {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
         command = _parse_payload(blank, request, car, longest_drive_s)
@@ -98,26 +98,29 @@ def parse(
 
 
 def _proven(command: Command, identity: str) -> Command:
-    """Return a command whose sender is the owner of the certificate. Raises BadRequest if it is in another's name."""
+    """Return the command if its identity may speak for its sender, else raise BadRequest.
+
+    A stop is always returned, in the name of the certificate's owner.
+    """
     sender = command.sender
     if not identity or speaks_for(identity, sender.name, sender.kind, command.verb):
         return command
-    words = f"{identity} sends it in the name of {sender.name} ({sender.kind})"
+    words = f"{identity} sent it in the name of {sender.name} ({sender.kind})"
     own = Sender(identity.partition(".")[2] or identity)
-    if command.verb in STOPS:  # whoever it was: the car stops, and holds for nobody else
+    if command.verb in STOPS:  # the car stops for everybody, but its hold must not have a false name
         return replace(command, sender=own, note=f"the gateway stops the car in spite of an error: {words}")
     words = f"{command.verb}: {words}. Each certificate speaks for its owner only."
     raise BadRequest(Reason.NOT_ALLOWED, words, replace(command, sender=own))
 
 
 def _stop_anyway(command: Command, words: str, request: Request) -> Command:
-    """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
+    """Return the stop for an invalid stop or e-stop, because the car must stop whatever the error is."""
     what = Stop() if request.verb == Verb.STOP else _readable_estop(request)
     return replace(command, what=what, note=f"the gateway stops the car in spite of an error: {words}")
 
 
 def _id(request: Request, now_ns: int) -> str:
-    """Return an id for a request without one. For an e-stop to all cars every gateway makes the same id."""
+    """Return an id for a request without one. For an e-stop to several cars, all gateways make the same id."""
     if request.verb != Verb.ESTOP or not request.by_wildcard:
         return uuid.uuid4().hex
     query = (request.payload or b"") + str(now_ns // _SAME_QUERY_NS).encode()
@@ -186,29 +189,29 @@ def _encoding(request: Request) -> str:
 
 
 def _age_s(message: Any, request: Request, now_ns: int) -> float | None:
-    """Return the age of a request, s, or None if unknown, negative if its sender's clock is ahead of ours."""
+    """Return the age of a request, s; None if unknown, negative if the sender's clock is ahead of ours."""
     if message.HasField("asked"):
         age_ns: int = now_ns - messages.stamp_ns(message.asked)
         return age_ns / 1e9
     if request.sampled_ns is None:
         return None
-    # After a wall clock was set back, the timestamps of Zenoh stay ahead of it until it has caught up.
+    # After the wall clock was set back, Zenoh's timestamps are ahead of it until it has caught up.
     return max(0.0, (now_ns - request.sampled_ns) / 1e9)
 
 
 def _text(field: str, value: str, forbidden: str = "") -> str:
-    """Check a name for states and files. The sender's name is also part of the key of its token."""
+    """Check a name that states and files will contain. A sender's name is also part of the key of its token."""
     if set(value) & set(forbidden):
-        raise ValueError(f"{field} {value!r} is not allowed: none of {' '.join(forbidden)} may be in it")
+        raise ValueError(f"{field} {value!r} is not allowed: it must not contain any of {' '.join(forbidden)}")
     if not value.isprintable():
-        raise ValueError(f"{field} {value!r} is not allowed: no control characters")
+        raise ValueError(f"{field} {value!r} is not allowed: it must not contain control characters")
     if len(value) > MAX_NAME_LENGTH:
         raise ValueError(f"{field} of {len(value)} characters is too long: at most {MAX_NAME_LENGTH}")
     return value
 
 
 def _word(field: str, value: str, allowed: Iterable[W]) -> W:
-    """Return the allowed word of this value. Raises ValueError with the likely one, else with all."""
+    """Return the allowed word that equals this value. Raises ValueError with the likely word, or with all."""
     words = list(allowed)
     if value in words:
         return words[words.index(value)]
@@ -264,7 +267,7 @@ def _servo(message: Any) -> Action:
     servo = Servo(message.servo or Servo.FRONT)
     if message.HasField("deg"):
         if servo is not Servo.FRONT or message.action:
-            raise ValueError("deg: only the front servo takes degrees, and then no action")
+            raise ValueError("deg: only the front servo turns to degrees. Send deg without an action")
         return AimServo(_whole("deg", message.deg, DEG_MAX))
     if message.action not in servo.moves:
         raise ValueError(
@@ -276,7 +279,7 @@ def _servo(message: Any) -> Action:
 
 def _fan(message: Any) -> Action:
     if message.state not in ("", *FanState):
-        raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
+        raise ValueError(f"state {message.state!r}: allowed are on and off, or leave it out to toggle")
     return Fan(None if not message.state else message.state == FanState.ON)
 
 
@@ -316,4 +319,4 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     Verb.PAUSE: lambda message: Pause(_why(message.why)),
     Verb.LEND: _lend,
 }
-"""Actions of the verbs whose fields need rules. `drive` also needs the limit of its gateway."""
+"""Functions that make the action of a verb whose fields need rules. `drive` is not here: it also needs a limit."""

@@ -1,7 +1,7 @@
 """Syncs fleet-wide e-stops and pauses between the gateways of a fleet.
 
-Each gateway serves its own car. Only a fleet-wide e-stop or a pause, and its end, concerns the others. A gateway
-queries the others and does not subscribe to them: with fifty cars that would be 2,500 states a second.
+Each gateway serves its own car. Only fleet-wide e-stops, pauses, and their ends concern the other gateways. A gateway
+queries the others. It does not subscribe to their states: with fifty cars, that would be 2,500 states a second.
 """
 
 import asyncio
@@ -23,9 +23,9 @@ from schemas.words import Scope
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
 MAX_BATCH_DELAY_S: Final = 3.0
-"""Maximum of that delay. It doubles while more gateways start."""
+"""Maximum of that delay, which doubles while more gateways start."""
 BATCH_RESET_S: Final = 1.0
-"""Time without a new gateway after which the delay is short again."""
+"""Time without a new gateway after which the delay begins at `BATCH_DELAY_S` again."""
 FIRST_RETRY_S: Final = 0.5
 """Delay before the first retry of gateways that did not answer. It doubles with each retry."""
 MAX_RETRY_S: Final = 10.0
@@ -34,19 +34,19 @@ SYNC_QUERY_TIMEOUT_S: Final = 2.5
 """Time for the answers to one query. Two sites that are linked again ask each other at once, over a link that is full:
 with 1 s, and 5 % of its packets lost, an e-stop of one site took 2 to 17 s to the other one."""
 MAX_SINGLE_QUERIES: Final = 8
-"""Maximum gateways that are queried one by one, whatever their share of the fleet is."""
+"""Number of gateways that may always be queried one by one, whatever their share of the fleet is."""
 MAX_SINGLE_SHARE: Final = 0.5
 """Maximum share of the gateways that is queried one by one. For more, one query to all gateways is cheaper."""
-# After a restart of the hub each gateway queries all others: a hundred gateways cause 10,000 answers. If all queries
-# start at once, answers time out and are requested again, which keeps two processors busy for more than a minute. A new
-# e-stop does not wait for this: its gateway forwards it at once.
+# After a restart of the hub, each gateway queries all others: a hundred gateways cause 10,000 answers. If all queries
+# started at once, answers would time out and be requested again, and two processors would be busy for over a minute. A
+# new e-stop does not wait for these queries: its gateway forwards it at once.
 ANSWERS_PER_S: Final = 400.0
 """Maximum answers per second of all gateways together after a restart of the hub."""
 
 log = logging.getLogger("gateway")
 
 MergeSafety = Callable[[PersistedSafety, str], object]
-"""Takes the e-stops and pauses, in force and ended, and the car whose gateway has sent them."""
+"""Called with the e-stops and pauses, in force and ended, and the car whose gateway has sent them."""
 
 
 class EstopSync:
@@ -60,7 +60,7 @@ class EstopSync:
         self._changed = asyncio.Event()
         self._alive: set[str] = set()
         self._due: set[str] = set()
-        """Gateways that have not answered since they started."""
+        """Gateways that must be queried, as they started or `sync_soon` was called, and have not answered yet."""
 
     def on_tokens(self, changes: Mapping[str, bool]) -> None:
         """Record that gateways of the fleet started or ended."""
@@ -76,12 +76,12 @@ class EstopSync:
                 self._due.discard(name)
 
     def sync_soon(self) -> None:
-        """Query all gateways soon: there may be fleet-wide e-stops that this gateway does not know."""
+        """Query all gateways soon, because there may be fleet-wide e-stops that this gateway does not know."""
         self._due |= self._alive
         self._changed.set()
 
     def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
-        """Send a fleet-wide e-stop or a pause, or its end, to all gateways, if it came to this car only."""
+        """Send a fleet-wide e-stop, a pause, or the end of one to all gateways. Call it if only this car got it."""
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
         match command.what:
@@ -97,7 +97,7 @@ class EstopSync:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         if isinstance(command.what, Resume | Unpause):
-            # Under the same id it would be refused as a duplicate, or the sender's own command, if that comes later.
+            # With the same id, one of the two would be refused as a duplicate: this copy, or the sender's own command.
             payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
         key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)
@@ -127,7 +127,7 @@ class EstopSync:
                 await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
             first = False
             self._changed.clear()
-            # If each gateway queried all others at every start, a hundred that start would cause 300,000 answers.
+            # If each gateway queried all others whenever one starts, a hundred starts would cause 300,000 answers.
             names = ("*",) if self._queries_all() else sorted(self._due)
             async for answer in self._answers(names):
                 self._on_state(merge, answer)
@@ -139,7 +139,7 @@ class EstopSync:
                 retry = asyncio.get_running_loop().call_later(delay_s, self._changed.set)
 
     def _queries_all(self) -> bool:
-        """Return True if so many gateways are due that one query goes to all."""
+        """Return True if so many gateways are due that one query to all is cheaper."""
         return len(self._due) > max(MAX_SINGLE_QUERIES, MAX_SINGLE_SHARE * len(self._alive))
 
     def _on_state(self, merge: MergeSafety, answer: bus.Sample) -> None:
@@ -179,5 +179,5 @@ class EstopSync:
 
 
 def _shared(state: pb.Safety) -> PersistedSafety:
-    """Return the part of a gateway's state that concerns the others."""
+    """Return the part of a gateway's state that concerns the other gateways."""
     return PersistedSafety(None, estops_of(state), tuple(state.ended), pauses_of(state), tuple(state.ended_pauses))

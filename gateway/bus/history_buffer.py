@@ -1,7 +1,7 @@
 """Buffers the last values of one key, and selects them by the time range of a query. No bus.
 
-Time ranges have Zenoh's form: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`. Zenoh's other form, `[start;duration]`, never
-arrives whole: `;` separates the parameters of a query.
+Time ranges have Zenoh's form: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`. Zenoh's other form, `[start;duration]`, is not
+possible here, because `;` separates the parameters of a query.
 """
 
 import math
@@ -46,7 +46,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """One end of a time range: ns since the epoch, or ns from now where `from_now`."""
+    """One end of a time range: ns since the epoch, or with `from_now`, ns from now."""
 
     ns: int
     from_now: bool = False
@@ -54,8 +54,8 @@ class Bound:
     def before(self, value: Value, now: float) -> int:
         """Return how long the bound is before a value, ns.
 
-        A date is compared with the stamp, which is what a reader has seen. An age is counted by the monotonic clock, so
-        that it holds even if the wall clock was set meanwhile.
+        A date is compared with the stamp, because readers see the stamp. An age is counted by the monotonic clock, so
+        that it is right even if the wall clock was set meanwhile.
         """
         return (round((value.at - now) * 1e9) if self.from_now else value.stamp_ns) - self.ns
 
@@ -71,11 +71,11 @@ class HistoryBuffer:
         self._values.append(value)
 
     def age(self, slept_s: float) -> None:
-        """Let the values be older by a sleep of the computer that the monotonic clock does not count, s."""
+        """Make the values older by a sleep of the computer, s, which the monotonic clock does not count."""
         self._values = deque((replace(each, at=each.at - slept_s) for each in self._values), self._values.maxlen)
 
     def select(self, *, time_range: str | None, last: str | None, now: float) -> list[Value]:
-        """Return the latest value, those in a time range, or the last ones, or raise BadRange. `now` is monotonic."""
+        """Return the latest value, those in a time range, or the `last` ones. `now`: monotonic. Raises BadRange."""
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)
@@ -85,14 +85,14 @@ class HistoryBuffer:
         if last is not None:
             match = _COUNT.fullmatch(last)
             if match is None:
-                raise BadRange(f"last={last}: give a whole number from 1 on. The history has at most {HISTORY} values.")
+                raise BadRange(f"last={last}: give a whole number from 1 up. The history has at most {HISTORY} values.")
             if len(match[1]) <= len(str(HISTORY)):
                 values = values[-int(match[1]) :]
         return values
 
 
 def parse_range(text: str) -> tuple[Bound, Bound]:
-    """Return a Zenoh time range as half-open range [begin, end). Raises BadRange."""
+    """Return a Zenoh time range as a half-open range [begin, end). Raises BadRange."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise _bad(text)

@@ -1,9 +1,9 @@
-"""How many messages of each identity a gateway reads. One person's flood must not cost the others the gateway's time.
+"""Limits how many messages of each identity a gateway reads, so that one person's flood does not use up its time.
 
-On a bus with certificates a drive of a stream has its sender's identity in its key. The key is all that is looked at
-here: a message over the budget costs one callback, and neither a copy nor a turn of the loop. The budget is ten times
-what a joystick sends. Without certificates nobody knows whose a message is before it is read, and names are free, so
-there a flood is bounded only by the queue behind this.
+On a bus with certificates, the key of a drive of a stream has the sender's identity. Only the key is read here, so a
+message over the budget costs one callback, but no copy and no turn of the loop. The budget is ten times what a joystick
+sends. On a bus without certificates, the sender is only known after a message was read, and may use any name. So there,
+only the queue behind this limits a flood.
 """
 
 from typing import Final
@@ -14,9 +14,9 @@ from schemas.token_bucket import TokenBucket
 DRIVES_PER_S: Final = 200.0
 """Maximum drives of one identity in the long run. A page or a joystick sends ten to twenty a second."""
 DRIVES_AT_ONCE: Final = 64
-"""Maximum drives of one identity at once: what a network has held up for some seconds."""
+"""Maximum drives of one identity at once: a network that stood still for some seconds delivers so many."""
 MAX_IDENTITIES: Final = 256
-"""Maximum remembered identities. The hub lets nobody in whom it does not know."""
+"""Maximum remembered identities. Only identities with a certificate of the hub can be here, so this is enough."""
 
 
 class IdentityBudgets:

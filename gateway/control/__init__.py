@@ -1,6 +1,6 @@
 """Control of one car of any family. Pure: time is an argument.
 
-Read `controller` first: it takes commands. `refusals` and `holds_and_leases` decide which sender may command,
-`command_queue` holds what waits for the car, `command_log` the records. `driver` is what the driver of a family must
-say and do.
+Read `controller` first: it handles commands. `refusals` and `holds_and_leases` decide which sender may command the car.
+`command_queue` holds the commands that wait for the car, `command_log` their records. `driver` defines what the driver
+of a family must do.
 """

@@ -1,4 +1,4 @@
-"""Estimates charge and level of a battery from measured voltages, and the reaction to a level.
+"""Estimates charge and level of a battery from measured voltages, and defines the reaction to a level.
 
 A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.measured`).
 """
@@ -10,22 +10,22 @@ from schemas.battery_levels import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
 SAG_V: Final = 0.4
-"""Maximum voltage drop by motors under load; an estimate, not measured."""
+"""Maximum drop of the voltage while motors run. An estimate, not measured."""
 LOAD_RECOVERY_S: Final = 5.0
-"""Maximum time that the voltage rises after a load; an estimate, not measured."""
+"""Maximum time for which the voltage rises after a load. An estimate, not measured."""
 CHARGE_ERROR: Final = 0.15
-"""Error of the charge without a load: a Li-ion cell's curve is flat in the middle, and the estimate is linear."""
+"""Error of the charge without a load. The estimate is linear, but the curve of a Li-ion cell is flat in the middle."""
 HYSTERESIS_V: Final = 0.15
-"""Minimum voltage above a threshold that ends the lower level."""
+"""How far the voltage must rise above a threshold to end the lower level."""
 LEVEL_DEBOUNCE_S: Final = 5.0
-"""Minimum time that all readings must show another level before the level changes. Mode 0 sends one a second."""
+"""Time for which all readings must show another level before the level changes. In mode 0 there is one a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryPolicy:
-    """The threshold of each level, V at rest of two cells, and the reaction to it.
+    """The threshold of each level (V at rest, for two cells), and the reaction to each level.
 
-    By default no level stops the car: a brownout resets the car, which stops it too.
+    By default no level stops the car. If the voltage gets too low, the car resets, which stops it too.
     """
 
     low: BatteryAction = BatteryAction.WARN
@@ -40,7 +40,7 @@ class BatteryPolicy:
         return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK
 
     def of_cells(self, cells: int) -> "BatteryPolicy":
-        """Return the policy for so many cells: thresholds are given for two."""
+        """Return the policy for this number of cells, by scaling the thresholds, which are for two cells."""
         return replace(self, low_v=self.low_v * cells / 2, critical_v=self.critical_v * cells / 2)
 
     def action(self, level: BatteryLevel | None) -> BatteryAction | None:
@@ -79,7 +79,7 @@ class Battery:
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
-            # The first reading decides nothing: motors may have run until now, or the reading may be corrupted.
+            # Conclude nothing from the first reading: motors may have run until now, or the reading may be corrupted.
             self.level = BatteryLevel.OK
         shown = self.level
         if _LEVEL_RANK[worse] > _LEVEL_RANK[shown]:
@@ -93,7 +93,8 @@ class Battery:
         ):
             self._other, self._since = shown, now
         else:
-            # Readings on both sides of `critical` are all at least `low`: take the level nearer to the current one.
+            # The readings may have shown different levels on this side of the current one, such as low and critical.
+            # Take the one that is nearer to the current level, because all of them show at least that.
             self._other = min(
                 self._other, shown, key=lambda each: abs(_LEVEL_RANK[each] - _LEVEL_RANK[self.level or each])
             )
@@ -114,7 +115,7 @@ class Battery:
 
     @property
     def words(self) -> str:
-        """Return the level in words, or an empty text if no voltage was measured."""
+        """Return a text with level, voltage and charge. Empty if no voltage was measured."""
         if self.level is None or self.voltage_v is None:
             return ""
         share, error = charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
@@ -138,7 +139,8 @@ def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
 def charge(voltage_v: float, *, loaded: bool, cells: int = 2) -> tuple[float, float]:
     """Return the charge and its error (half width), 0..1 each.
 
-    The charge is linear between empty and full. Under a load it uses the middle of the possible voltages at rest.
+    The charge is linear between empty and full. Under a load, it is that of the middle of the possible voltages at
+    rest.
     """
     low_v, high_v = (each * 2 / cells for each in rest_v(voltage_v, loaded=loaded))
     share = ((low_v + high_v) / 2 - EMPTY_V) / (FULL_V - EMPTY_V)

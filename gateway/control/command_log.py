@@ -1,4 +1,4 @@
-"""Records the transitions of commands, and log records, until the loop publishes them."""
+"""Collects records of commands, and log records, until the loop publishes them."""
 
 from collections import OrderedDict, deque
 from collections.abc import Hashable
@@ -20,7 +20,7 @@ class Pending:
     command: Command
     received_at: float
     frames: deque[Any] = field(default_factory=deque)
-    """What is left of them. A `Later` is one with a delay before it."""
+    """The frames that are not written yet. A `Later` is a frame with a delay before it."""
     sent: bool = False
     count: int = 1
     """Number of merged commands of a stream."""
@@ -31,7 +31,7 @@ class Pending:
 
     @property
     def waits_since(self) -> float:
-        """Return since when it waits for the car, also in the future."""
+        """Return since when it waits for the car. If its next frame has a delay, this is in the future."""
         return max(self.received_at, self.due_at)
 
     @property
@@ -41,12 +41,12 @@ class Pending:
 
     @property
     def is_delayed(self) -> bool:
-        """Return True if a delay stands before its next frame: nothing else needs to wait for it."""
+        """Return True if there is a delay before its next frame. Other commands need not wait for such a command."""
         return bool(self.frames) and isinstance(self.frames[0], Later)
 
     @property
     def lasts(self) -> bool:
-        """Return True if a delay stands before one of its frames."""
+        """Return True if there is a delay before one of its frames."""
         return any(isinstance(each, Later) for each in self.frames)
 
     def begin_delay(self, now: float) -> None:
@@ -55,7 +55,7 @@ class Pending:
 
 
 class CommandLog:
-    """Records each transition. For a stream, it records start, end, and the first rejection for each reason."""
+    """Records each transition. Of a stream, it records the start, the end, and the first rejection for each reason."""
 
     def __init__(self) -> None:
         self._records: list[Record] = []

@@ -1,6 +1,6 @@
 """Holds the commands in progress of one car: the held motion, the pending mode, and the queue of one-shots.
 
-Each command ends with a record. `Executor` decides when a frame is written.
+The end of each command is recorded. The driver decides when a frame is written.
 """
 
 from collections import deque
@@ -23,13 +23,13 @@ class HeldMotion:
     motion: Motion
     pending: Pending
     expires_at: float
-    """When it ends. While it waits for the car: when it is given up, unless a stream renews it."""
+    """When it ends. While it still waits for the car: when it is given up, unless a stream renews it."""
     duration_s: float = 0.0
-    """How long it lasts from its frame on; 0 of a stream, whose samples are valid for a time from their arrival."""
+    """Time from its frame to its end. It is 0 for a stream, because the time of a sample counts from its arrival."""
     began_at: float | None = None
-    """When its frame was written, or None if it waits."""
+    """When its frame was written, or None if it still waits."""
     range_cm: float | None = None
-    """The distance before it was written, if one is known."""
+    """The distance before its frame was written, if it is known."""
 
     @property
     def sender(self) -> Sender:
@@ -42,7 +42,7 @@ class HeldMotion:
         return self.expires_at + (self.duration_s if self.began_at is None else 0.0)
 
     def begin(self, now: float, range_cm: float | None) -> None:
-        """Count the duration from now: the frame is written."""
+        """Record that the frame is written, so that the duration counts from now."""
         self.began_at, self.range_cm = now, range_cm
         if self.duration_s:
             self.expires_at = now + self.duration_s
@@ -74,7 +74,7 @@ class CommandQueue:
     def expire(self, now: float) -> None:
         """Expire the commands that have waited too long for a busy car.
 
-        An action whose frames go out does not expire, however many there are: each of them waits anew.
+        An action with many frames does not expire while they are written: the time counts anew for each frame.
         """
         words = f"the car was busy for {MAX_QUEUE_TIME_S:g} s"
         for pending in [each for each in self.one_shots if now >= each.waits_since + MAX_QUEUE_TIME_S]:
@@ -85,7 +85,7 @@ class CommandQueue:
     # ------------------------------------------------------------------ actions on parts of the car
 
     def add_part(self, pending: Pending, frames: Iterable[Any], part: Hashable, now: float) -> None:
-        """Queue an action on a part of the car. End what lasts on that part."""
+        """Queue an action on a part of the car. End an action on the same part that is still going on."""
         words = f"another {pending.command.verb} by {pending.command.sender.text_name}"
         for other in [each for each in self.one_shots if each.lasts and each.part == part]:
             self._end_part(other, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
@@ -96,7 +96,7 @@ class CommandQueue:
 
     @property
     def turns(self) -> Iterator[Pending]:
-        """Yield the actions of which one may write next: each is written before the next one, but for delays."""
+        """Yield the actions whose frame may be written next: an action may overtake only those with a delay."""
         for pending in self.one_shots:
             yield pending
             if not pending.is_delayed:
@@ -113,11 +113,14 @@ class CommandQueue:
 
     @property
     def has_undelayed(self) -> bool:
-        """Return True if an action waits for the car alone."""
+        """Return True if an action waits only for the car, and for no delay."""
         return any(not each.is_delayed for each in self.one_shots)
 
     def on_part_written(self, pending: Pending, now: float) -> None:
-        """Count the next frame of an action as written. One that lasts is recorded as sent when it begins."""
+        """Remove the frame of an action that was written. Record the action as sent.
+
+        An action with delays is recorded as sent at its first frame, every other one at its last.
+        """
         pending.frames.popleft()
         pending.begin_delay(now)
         if pending.lasts or not pending.frames:
@@ -126,7 +129,7 @@ class CommandQueue:
             self._remove(pending)
 
     def end_lasting(self, words: str, now: float) -> None:
-        """End the actions that last: another command took their place."""
+        """End the actions that still have delayed frames, because another command takes their place."""
         for pending in [each for each in self.one_shots if each.lasts]:
             self._end_part(pending, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
 

@@ -1,4 +1,4 @@
-"""The commands that control takes, after parsing and range checks, and their answers. Values only."""
+"""The commands that control handles, after parsing and range checks, and their answers. Values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +11,15 @@ from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, Speed
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Hold a motion for `duration_s` seconds from the arrival of the command. `Motion.STOP` releases it."""
+    """Hold a motion for `duration_s` seconds from its frame on; in a stream, from the arrival of each sample.
+
+    `Motion.STOP` ends the motion that is held.
+    """
 
     motion: Motion
     duration_s: float = 0.5
     continues: bool = False
-    """True to prolong this motion of the same sender while it lasts. False to begin it, too."""
+    """True: only prolong this motion while the same sender holds it. False: begin it if it is not held."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +31,9 @@ class SetMode:
 
 @dataclass(frozen=True, slots=True)
 class PartAction:
-    """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue of a car in mode 0.
+    """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue, and needs mode 0.
 
-    With `needs_lease`, only the driver of a car may do it. It moves a part of the car, or changes how the car moves.
+    `needs_lease` is True if it moves a part of the car, or changes how the car moves. Then its sender needs the lease.
     """
 
     needs_lease: ClassVar[bool] = True
@@ -56,7 +59,7 @@ class SetLight(PartAction):
 
 @dataclass(frozen=True, slots=True)
 class Signal(PartAction):
-    """Give the signal of a verb, such as a beep, once or for `duration_s` seconds. Its row has `signal` set."""
+    """Give the signal of a verb, such as a beep, once or for `duration_s` seconds (see `CommandType.signal`)."""
 
     verb: Verb
     duration_s: float = 0.0
@@ -72,7 +75,7 @@ class MoveServo(PartAction):
 
 @dataclass(frozen=True, slots=True)
 class AimServo(PartAction):
-    """Turn the front servo to an angle, 0..180 degrees, as the car counts them."""
+    """Turn the front servo to an angle, 0..180 degrees, in the direction in which the car counts them."""
 
     deg: int
 
@@ -93,7 +96,7 @@ class ChangeSpeed(PartAction):
 
 @dataclass(frozen=True, slots=True)
 class Fan(PartAction):
-    """Toggle the fan, or bring it to a state. For that its current state must be known."""
+    """Toggle the fan, or switch it on or off. To switch it, its current state must be known."""
 
     on: bool | None = None
 
@@ -113,7 +116,7 @@ class EmergencyStop:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the e-stops with these ids, or without ids the hold. With `all`, end both, as far as the sender may."""
+    """End the e-stops with these ids; without ids, the hold; with `all`, both. End only what the sender may end."""
 
     ids: tuple[str, ...] = ()
     all: bool = False
@@ -133,7 +136,7 @@ class Unpause:
 
 @dataclass(frozen=True, slots=True)
 class Lend:
-    """Let only this person, of all persons and scripts, drive the car for `duration_s` seconds."""
+    """Lend the car to a person for `duration_s` seconds: meanwhile no other person, except leads, may drive it."""
 
     to: str
     duration_s: float
@@ -166,7 +169,7 @@ PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
     Verb.LEASE: TakeLease,
     Verb.FIND: Find,
 }
-"""Actions by verb whose fields are flags of the message, and need no rule of their own."""
+"""Actions, by verb, whose fields are flags of the message. They need no parsing rules."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,16 +181,16 @@ class Command:
     sender: Sender
     what: Action
     age_s: float | None = None
-    """Seconds from sending to arrival, or None if the command has no time, which counts as fresh."""
+    """Seconds from sending to arrival. None if the command has no time; then it counts as fresh."""
     ttl_s: float = 2.0
     take: bool = False
-    """True if a person takes the car from another person."""
+    """True if a person wants to take the car from another person."""
     note: str = ""
-    """The error in a stop that is carried out all the same."""
+    """The error in an invalid stop, which is carried out nevertheless."""
     asked_ns: int = 0
-    """Wall clock, ns since the epoch."""
+    """When the command arrived, by the wall clock, ns since the epoch."""
     streamed: bool = False
-    """True for one of a stream of publications: nobody waits for an answer, and repetitions share one record."""
+    """True for a sample of a stream: it gets no answer, and repetitions share one record."""
 
 
 @dataclass(frozen=True, slots=True)

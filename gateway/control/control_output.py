@@ -39,11 +39,11 @@ Record = CommandRecord | LogRecord
 
 @dataclass(frozen=True, slots=True)
 class Later:
-    """A frame of an action that lasts, as a driver gives it. Other commands go out in the delay before it."""
+    """A frame of an action, with a delay before it. Other commands can be sent during the delay."""
 
     frame: Any
     after_s: float
-    """Seconds from the frame before it, or from the command."""
+    """Delay after the frame before it, or after the command if it is the first, s."""
 
 
 def frame_of(given: Any) -> Any:

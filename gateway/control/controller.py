@@ -1,7 +1,7 @@
-"""Controls one car: takes the commands, decides who may command the car, and keeps the records.
+"""Controls one car: handles the commands, decides who may command the car, and keeps the records.
 
-No I/O, no threads, no clock: time is an argument, in seconds of one monotonic clock. What concerns bytes and frames the
-loop asks of the `driver` (gateway/control/driver.py says how).
+No I/O, no threads, no clock: time is an argument, in seconds of one monotonic clock. For bytes and frames, the loop
+calls the `driver` directly (see gateway/control/driver.py).
 """
 
 from collections.abc import Callable, Iterable
@@ -42,14 +42,15 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""How much longer than announced, and than its own duration, a drive waits for the car before it expires."""
+"""A drive waits for the car as long as announced, or for its own duration if that is longer, and so much longer, before
+it expires."""
 
 
 class Controller(Generic[D_co]):
-    """One car's control. See the module's docstring for how it is driven.
+    """The control of one car. See the docstring of the module for its time.
 
-    It takes the commands and decides who may command the car. Its `driver` knows the car: what it takes, how it is
-    stopped, and what may be claimed of it. They share the queue of commands and the log.
+    It handles the commands and decides who may command the car. Its `driver` knows the car: what it can do, how it is
+    stopped, and what may be claimed about it. The two share the queue of commands and the log.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Controller(Generic[D_co]):
         now: float = 0.0,
         now_ns: int = 0,
     ) -> None:
-        """Take over the state from before a restart. `now_ns` is the wall clock at `now`."""
+        """Restore the state from before a restart (`persisted`). `now_ns` is the wall clock at `now`."""
         self.car = car
         self.people = people
         self.safety = Safety.restore(persisted or PersistedSafety(), now, now_ns)
@@ -73,7 +74,7 @@ class Controller(Generic[D_co]):
         self._queue = CommandQueue(self._log, self._senders, self.safety)
         self.driver = driver(Desk(car, self._log, self._queue, battery_policy or BatteryPolicy(), speed_max))
         self._mover = ""
-        """The person who moved the car last, by a drive or a mode."""
+        """The person whose drive or mode was the last to move the car."""
         self._slept_at = float("-inf")
         """When the last sleep of the computer was noticed."""
         self.was_open = False
@@ -92,7 +93,7 @@ class Controller(Generic[D_co]):
 
     @property
     def asked(self) -> Mode | None:
-        """Return the commanded mode, also one that still waits, or None if unknown."""
+        """Return the commanded mode, even if it still waits. None if unknown."""
         pending = self._queue.mode_change
         if pending is not None and isinstance(pending.command.what, SetMode):
             return pending.command.what.mode
@@ -110,12 +111,12 @@ class Controller(Generic[D_co]):
     # ------------------------------------------------------------------ link, frames, readings, time
 
     def link_up(self, now: float) -> None:
-        """Bring the car to a known state: the link is open."""
+        """Begin to bring the car to a known state, because its link is open."""
         self.was_open = True
         self.driver.link_up(now)
 
     def waits_for(self, now: float) -> str:
-        """Return what a command would wait for now, in words, or an empty text if the car is ready."""
+        """Describe what a command would have to wait for now. Empty if the car is ready."""
         model = self.driver.model
         if not model.link_open:
             return f"its link: {model.link_reason}"
@@ -128,22 +129,22 @@ class Controller(Generic[D_co]):
         return f"{what}, for {left_s:.1f} s at most"
 
     def is_free(self, now: float) -> bool:
-        """Return True if a command of somebody who may command the car would be sent now."""
+        """Return True if a command would be sent now, from somebody who may command the car."""
         return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
-        """Return how long a drive or a mode would wait for its frame at most, as far as that is known, s."""
+        """Return the longest time that a drive or a mode would wait for its frame, as far as that is known, s."""
         busy_s = self._busy_s(now)
         return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
     def tick(self, now: float) -> None:
-        """Check for silence. Call it a few times a second."""
+        """Check for silence and for the end of a loan. Call it a few times a second."""
         if self.safety.loan is not None and self.safety.loan_at(now) is None:
             self._end_loan(f"the loan of {self.car} to {self.safety.loan.to} is over", now)
         self.driver.tick(now)
 
     def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
-        """Stop the car first after a sleep of the computer, and end the lease. `counted`: `now` went on meanwhile."""
+        """Stop the car after a sleep of the computer, and end the lease. `counted`: `now` has counted the sleep."""
         self._slept_at = now
         self.safety.lease = None
         if counted:
@@ -155,12 +156,12 @@ class Controller(Generic[D_co]):
     # ------------------------------------------------------------------ commands
 
     def command(self, command: Command, now: float) -> Answer:
-        """Refuse a command with a reason, or begin to carry it out. Record each of its transitions."""
+        """Refuse a command with a reason, or begin to carry it out. Record its transitions."""
         command = replace(command, sender=self.people.ranked(command.sender))
         pending, what = Pending(command, now), command.what
         if self._log.has_accepted(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} was accepted before. Use a new id."
-            if not command.streamed:  # the record under this id belongs to the first command
+            if not command.streamed:  # the records with this id belong to the first command, so only log this one
                 self._log.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
                 return Answer(Phase.REJECTED, Reason.DUPLICATE, words)
             return self._reject(pending, Reason.DUPLICATE, words, now)
@@ -168,7 +169,8 @@ class Controller(Generic[D_co]):
             self._log.record(pending, Phase.ASKED, now)
         if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
-        # Track a drive even if it is refused: after a stop the end of a lease must not start it.
+        # Track the drives of a stream even if they are refused: after a stop, the stream must not drive the car as soon
+        # as somebody else's lease ends.
         halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
         refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what)))
         if refusal is not None:
@@ -179,7 +181,7 @@ class Controller(Generic[D_co]):
         if lapsed := self._lapsed(command):
             return self._reject(pending, Reason.LAPSED, lapsed, now)
         busy = self._too_busy(command, now)
-        if busy:  # before the lease and the hold: a refused command changes neither
+        if busy:  # check this before the lease and the hold are changed: a refused command changes neither
             return self._reject(pending, Reason.EXPIRED, busy, now)
         if isinstance(what, Pause):
             return self._stop(pending, now)
@@ -187,7 +189,7 @@ class Controller(Generic[D_co]):
         if refusals.needs(what).lease:
             self._grant_lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
-        if moves and command.sender.kind is not Rank.COORDINATOR:  # a release ends no hold
+        if moves and command.sender.kind is not Rank.COORDINATOR:  # a drive with motion stop ends no hold
             self._end_hold(command.sender, now)
         if moves:
             self._mover = command.sender.person
@@ -301,7 +303,7 @@ class Controller(Generic[D_co]):
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
     def _not_stopped(self, later: str) -> str:
-        """Return what a stop that cannot be sent means for the car, and what happens to it later."""
+        """Describe what it means for the car that a stop cannot be sent, and what will happen to the car later."""
         car, ending = self.car, self.driver.shutting_down
         if self.driver.model.link_open:
             return f"NOT CONFIRMED: the gateway of {car} is shutting down and stops {car} itself. Look at the car."
@@ -315,7 +317,7 @@ class Controller(Generic[D_co]):
         return self._senders.may_drive(command.sender.name, now, streamed=command.streamed, release=release)
 
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
-        """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
+        """End e-stops, the hold, or both, as far as the sender may. Answer which of them stay."""
         sender, safety, authority = pending.command.sender, self.safety, self.authority_at(now)
         if not resume.ids and self.driver.model.doubted:  # a person says that the car is fine
             self.driver.end_doubt(now)
@@ -334,7 +336,7 @@ class Controller(Generic[D_co]):
             self._end_hold(sender, now)
         if safety.estops:
             if not resume.ids and not ended:
-                parts.clear()  # the end of the hold alone lets nobody drive
+                parts.clear()  # do not report the end of the hold: nobody can drive while an e-stop is in force
             parts.append(self._still_estopped(sender, now))
         elif safety.hold is not None:
             ends = self.people.may_end(sender, safety.hold.by, safety.hold.rank)
@@ -353,7 +355,7 @@ class Controller(Generic[D_co]):
             words = f"{self.car} is paused with the whole fleet by {name_of(pause.by)}{f': {why}' if why else ''}"
             self._log.log(Level.WARNING, "paused", words, now)
         if pause.id in self.safety.ended_pauses:
-            return "this pause has ended already, and the car only stops"
+            return "this pause has ended already, so the car only stops"
         return "the pause lasts until `fleet unpause`"
 
     def _unpause(self, pending: Pending, now: float) -> Answer:
@@ -382,26 +384,26 @@ class Controller(Generic[D_co]):
         return self._done(pending, f"the loan to {loan.to} has ended", now)
 
     def _end_loan(self, words: str, now: float) -> None:
-        """End the loan, and stop a car that the borrower drives."""
+        """End the loan. Stop the car if the borrower was the last to move it."""
         loan, self.safety.loan = self.safety.loan, None
         self._log.log(Level.INFO, "loan_ended", f"{self.car}: {words}", now)
         if loan is not None and self._mover == loan.to:
             self._clear_for(words, now)
 
     def _clear_for(self, words: str, now: float) -> None:
-        """End the lease of the driver, and stop the car unless it is at rest: somebody else drives it from now on."""
+        """End the lease, and stop the car unless it is at rest, because from now on somebody else may drive it."""
         self.safety.lease = None
         waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
         if waiting or not self.driver.model.at_rest:
             self._halt(words, now)
 
     def _halt(self, words: str, now: float) -> None:
-        """End what the car does or waits to do, and stop it."""
+        """Drop all commands of the car, and stop it."""
         self.driver.halt(words, now)
         self.driver.stop_if_open(now)
 
     def _still_estopped(self, sender: Sender, now: float) -> str:
-        """Return which e-stops are in force, with their ids if there are several, and who can release them."""
+        """Describe the e-stops in force, with their ids if there are several, and whether the sender can end them."""
         estops = self.safety.estops
         several = len(estops) > 1
         each = [
@@ -416,7 +418,7 @@ class Controller(Generic[D_co]):
         return f"{words}. Release {them} with `fleet resume {self.car} --estops`"
 
     def _grant_lease(self, command: Command, now: float) -> None:
-        """Grant the lease for the duration of the command. Log if it was taken from another sender."""
+        """Grant the lease for the duration of the command. Log it if the lease was taken from another sender."""
         sender, before = command.sender, self.safety.lease_at(now)
         match command.what:
             case Drive(duration_s=duration_s):
@@ -451,13 +453,13 @@ class Controller(Generic[D_co]):
         return self._done(pending, f"{self.car} is free", now)
 
     def _busy_s(self, now: float) -> float:
-        """Return how long a motion would wait for the car, as far as that is known, s."""
+        """Return how long a motion would have to wait for the car, as far as that is known, s."""
         return max(self.driver.free_at(now) - now, 0.0)
 
     def _too_busy(self, command: Command, now: float) -> str:
-        """Return why a sample of a stream would expire before its frame could go out, or an empty text if it would not.
+        """Return why a sample of a stream would expire before its frame could be written. Empty if it would not.
 
-        Any other drive waits, and counts its duration from its frame on.
+        A drive that is no sample of a stream waits instead, and its duration counts from when its frame is written.
         """
         what = command.what
         if not command.streamed or not isinstance(what, Drive) or what.motion is Motion.STOP:
@@ -465,19 +467,20 @@ class Controller(Generic[D_co]):
         busy_s = self._busy_s(now)
         if what.duration_s > busy_s:
             return ""
-        return f"{self.car} is busy for another {busy_s:.1f} s. The next samples of this stream drive it then."
+        return f"{self.car} is busy for another {busy_s:.1f} s. After that, the next samples of this stream drive it."
 
     def _lapsed(self, command: Command) -> str:
-        """Return a text if the drive that this one continues is over. Empty if it goes on, or if this may begin one.
+        """Return an error if this command only continues a drive, and that drive is over. Else return an empty text.
 
-        A hub that stood still delivers the newest samples of a press when it goes on. The car has stopped meanwhile.
+        Suppose the hub stood still while somebody held a key, and the car has stopped. When the hub continues, it
+        delivers the newest samples of that press, which must not start the car again.
         """
         what, held = command.what, self._queue.held
         if not isinstance(what, Drive) or not what.continues or what.motion is Motion.STOP:
             return ""
         if held is not None and held.motion is what.motion and held.sender == command.sender:
             return ""
-        return f"{self.car} has stopped since: no drive came for too long. Press again."
+        return f"{self.car} has stopped, because no drive arrived for too long. Press again."
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._queue.held
@@ -494,14 +497,17 @@ class Controller(Generic[D_co]):
         return self._queued(pending, now, self._wait(pending, now))
 
     def _times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
-        """Return when a drive expires that waits for its frame, and the duration that counts from that frame."""
+        """Return when a drive expires if its frame is not written, and its duration from that frame on.
+
+        For a sample of a stream, the duration counts from now, and the second value is 0.
+        """
         if pending.command.streamed:
             return now + duration_s, 0.0
         wait_s = max(self._busy_s(now), duration_s) + START_MARGIN_S
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:
-        """Return how long a drive or a mode waits for its frame, in words, or an empty text if it does not."""
+        """Describe how long a drive or a mode waits for its frame. Empty if it need not wait."""
         command = pending.command
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""
@@ -513,7 +519,7 @@ class Controller(Generic[D_co]):
         return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
-        """Extend a held motion without another frame: its sender has sent the same drive again."""
+        """Extend a held motion without another frame, because its sender has sent the same drive again."""
         if held.pending.sent:
             held.expires_at = now + duration_s
         else:
@@ -568,7 +574,7 @@ class Controller(Generic[D_co]):
     # ------------------------------------------------------------------ answers
 
     def _done(self, pending: Pending, words: str, now: float, reason: Reason | None = None) -> Answer:
-        """Answer what needed no frame. `reason` is why the car is still not usable."""
+        """Answer a command that needed no frame. `reason` says why the car still cannot be used."""
         if not pending.command.streamed:
             self._log.record_sent(pending, now, words, reason)
         return Answer(Phase.SENT, reason, words)
@@ -593,7 +599,7 @@ class Controller(Generic[D_co]):
             self.safety.hold = None
 
     def authority_at(self, now: float) -> Authority:
-        """Return the authority of the car now."""
+        """Return the facts that decide now who may do what with the car."""
         safety = self.safety
         return Authority(
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)

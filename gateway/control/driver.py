@@ -1,15 +1,15 @@
-"""The seam between a gateway and a family of cars: what every family's driver says and does. Pure, time is an argument.
+"""The interface between a gateway and a family of cars, which every driver implements. Pure: time is an argument.
 
-A gateway has one driver for its car. The driver turns bytes into events and readings, actions into frames or a refusal.
-It decides when a frame may be written, how the car is stopped, and what may be claimed of it afterwards. Everything
-else is the gateway's: who may command the car, the queue, the records, the link, the bus.
+A gateway has one driver for its car. The driver turns bytes into events and readings, and actions into frames or a
+refusal. It decides when a frame may be written, how the car is stopped, and what may be claimed about it afterwards.
+Everything else is the task of the gateway: who may command the car, the queue, the records, the link, the bus.
 
 The two meet in three places. `Desk` is what the gateway shares with its driver: the queue of commands and the log.
 `DriverClaims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls `poll`,
 writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more than one
 frame in flight.
 
-Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` leads through a whole driver.
+Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` explains a whole driver step by step.
 """
 
 from abc import ABC, abstractmethod
@@ -41,23 +41,23 @@ from schemas.words import (
 )
 
 STALL_S: Final = 0.5
-"""Maximum gap of the loop during a held motion. After a longer one it stops the car
+"""Maximum gap of the loop during a held motion. After a longer one the gateway stops the car
 (docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
-"""Report that a drive has waited if its frame goes out later than this."""
+"""Maximum delay of a drive's frame that is not reported to its sender."""
 MOVED_CM: Final = 5.0
-"""Minimum change of the distance that shows a movement: readings at rest differ by up to a centimeter."""
+"""Minimum change of the distance that counts as a movement. At rest, readings differ by up to a centimeter."""
 
 
 # ---------------------------------------------------------------------- bytes of a car
 
 
 class Event(Protocol):
-    """One thing that a decoder found in the bytes. `at` is when its last byte arrived."""
+    """An item that a decoder found in the bytes: a reading, an echo, or bytes that are neither."""
 
     @property
     def raw(self) -> bytes:
-        """The bytes."""
+        """The bytes of the item."""
 
     @property
     def at(self) -> float:
@@ -66,7 +66,7 @@ class Event(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """Bytes equal to a frame that we sent shortly before. `at` is the time of the last byte."""
+    """Bytes that equal a frame which we sent shortly before. `at` is the time of the last byte."""
 
     raw: bytes
     at: float
@@ -84,9 +84,9 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A whole line of text between frames with its line end, such as a debug print. It is not damage.
+    """A whole line of text between frames, such as a debug print, with its line end. It does not count as damage.
 
-    `at` is the time of the last byte of the junk that it came with.
+    `at` is the time of the last byte of the unreadable bytes in which it was found.
     """
 
     raw: bytes
@@ -94,14 +94,14 @@ class TextLine:
 
 
 Fields = Mapping[str, Any]
-"""Values by the field of a message, in its units. A tuple fills a repeated field."""
+"""Values by field of a message, in the field's unit. A tuple fills a repeated field."""
 
 
-# ---------------------------------------------------------------------- what is claimed of a car
+# ---------------------------------------------------------------------- claims about a car
 
 
 class ModeClaims(Protocol):
-    """The mode that was commanded, and what readings say about it."""
+    """The mode that was commanded, and the mode that the readings show."""
 
     @property
     def asked(self) -> Mode | None:
@@ -117,28 +117,28 @@ class ModeClaims(Protocol):
 
     @property
     def evidence(self) -> str:
-        """What the verdict rests on, for a person."""
+        """The evidence for the verdict, as a text for a person."""
 
     @property
     def evidence_at(self) -> float | None:
-        """When the evidence came."""
+        """The time of the evidence."""
 
     @property
     def since(self) -> float | None:
-        """Since when `asked` and `verdict` are what they are."""
+        """When `asked` or `verdict` last changed."""
 
     @property
     def candidates(self) -> tuple[Mode, ...]:
-        """The modes that the last reading may come from."""
+        """The modes in which the car could have sent the last reading."""
 
     @property
     def is_left(self) -> bool:
-        """True if the readings show that the car left the commanded mode."""
+        """True if the readings show that the car is no longer in the commanded mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The estimated state of what the gateway has set. None if it is not known, or if the car has no such part."""
+    """The estimated state of the parts that the gateway sets. None if unknown, or if the car has no such part."""
 
     speed: float = 0.0
     """Share of full speed, 0..1."""
@@ -148,7 +148,7 @@ class Outputs:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What was found out about the car itself, for `state/health`."""
+    """The findings about the car itself, for `state/health`."""
 
     platform_evidence: tuple[str, ...] = ()
     platform_contradictions: tuple[str, ...] = ()
@@ -157,7 +157,7 @@ class Findings:
 
 
 class DriverClaims(Protocol):
-    """What may be said of the car now. A gateway publishes it, and refuses or delays commands by it."""
+    """What may be claimed about the car now. The gateway publishes it, and refuses or delays commands because of it."""
 
     name: str
     link_open: bool
@@ -168,19 +168,19 @@ class DriverClaims(Protocol):
 
     @property
     def profile(self) -> CarProfile:
-        """What the car can do, as far as it is known now."""
+        """The profile of the car, as far as it is known now."""
 
     @property
     def mode(self) -> ModeClaims:
-        """What is known of its mode."""
+        """The claims about its mode."""
 
     @property
     def known(self) -> bool:
-        """True if the car takes frames as meant: its first stop is over, and no write has failed since."""
+        """True if the car reads frames as they are meant: its first stop is over, and no write has failed since."""
 
     @property
     def at_rest(self) -> bool:
-        """True if the car stands in mode 0 after a stop, whatever that claim rests on."""
+        """True if the car stands still in mode 0 after a stop, whatever the evidence for that is."""
 
     @property
     def is_heard(self) -> bool:
@@ -188,11 +188,11 @@ class DriverClaims(Protocol):
 
     @property
     def motors(self) -> Motors:
-        """What is claimed of the motors."""
+        """The claim about the motors."""
 
     @property
     def basis(self) -> Basis | None:
-        """What the claim that the motors are off rests on, or None if they are not."""
+        """The evidence for the claim that the motors are off, or None if there is no such claim."""
 
     @property
     def motion(self) -> Motion | None:
@@ -204,7 +204,7 @@ class DriverClaims(Protocol):
 
     @property
     def range_cm(self) -> float | None:
-        """The last distance measured, or None if the car measures none."""
+        """The last measured distance, or None if the car measures none."""
 
     @property
     def shows(self) -> Shows:
@@ -212,7 +212,7 @@ class DriverClaims(Protocol):
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:
-        """The same, with the reason in words."""
+        """The value of `shows`, with the reason in words."""
 
     @property
     def doubted(self) -> bool:
@@ -220,25 +220,28 @@ class DriverClaims(Protocol):
 
     @property
     def findings(self) -> Findings:
-        """What was found out about the car."""
+        """The findings about the car."""
 
     @property
     def silence_limit_s(self) -> float | None:
-        """The longest normal silence now, or None if silence says nothing."""
+        """The longest normal silence now, or None if every silence is normal."""
 
     @property
     def why_quiet(self) -> str:
-        """Why a silence is normal now, for a person."""
+        """Why a silence is normal now, as a text for a person."""
 
     def unheard_s(self, now: float) -> float:
-        """Return for how long the car has sent nothing."""
+        """Return how long the car has been silent, s."""
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words what shows that a drive moved the car, or an empty text if nothing does."""
+        """Describe the reading that shows that a drive moved the car. Empty if none does.
+
+        `range_cm` is the distance before the drive, which began at `since`.
+        """
 
 
 def describe_way(before_cm: float | None, now_cm: float | None) -> str:
-    """Return in words how the distance has changed in a drive, or an empty text if it shows no movement."""
+    """Describe how the distance has changed during a drive. Empty if it shows no movement."""
     if before_cm is None or now_cm is None or abs(now_cm - before_cm) < MOVED_CM:
         return ""
     return f"its distance changed from {before_cm / 100:.2f} m to {now_cm / 100:.2f} m"
@@ -254,7 +257,7 @@ def learn_trust(model: DriverClaims, log: CommandLog, event: TrustEvent, now: fl
 
 
 def log_unstopped(log: CommandLog, car: str, why: str, now: float) -> None:
-    """Log that the gateway ends without a stop of its car."""
+    """Log that the gateway ends although its car may not be stopped."""
     log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
 
 
@@ -263,7 +266,7 @@ def log_unstopped(log: CommandLog, car: str, why: str, now: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Desk:
-    """What a gateway shares with its driver. Commands lie in `queue`; the driver takes them when the car can."""
+    """The objects that a gateway shares with its driver. Commands wait in `queue` until the driver can send them."""
 
     car: str
     log: CommandLog
@@ -274,7 +277,7 @@ class Desk:
 
 
 class Driver(ABC):
-    """One car of one family. See the module's docstring for how it is driven."""
+    """One car of one family. See the docstring of the module for the order of the calls."""
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
@@ -286,11 +289,11 @@ class Driver(ABC):
     @property
     @abstractmethod
     def model(self) -> DriverClaims:
-        """What is claimed of the car."""
+        """The claims about the car."""
 
     @property
     def lost_frames(self) -> int:
-        """Return the number of stop frames that did not arrive, by the car's reports."""
+        """Return the number of stop frames that did not arrive, as the car's reports show."""
         return 0
 
     # ------------------------------------------------------------------ bytes in
@@ -300,43 +303,43 @@ class Driver(ABC):
         """Return the events in the bytes."""
 
     def flush(self, now: float) -> list[Event]:
-        """Return the events that a silence has ended: none where only bytes end a frame."""
+        """Return the events whose frame was ended by a silence. There are none if only bytes can end a frame."""
         del now
         return []
 
     def flush_at(self) -> float:
-        """Return when `flush` has something to do if no byte comes before; inf if never."""
+        """Return when `flush` has something to do if no byte arrives earlier; inf if never."""
         return float("inf")
 
     @abstractmethod
     def drop_bytes(self) -> list[Event]:
-        """Forget the unfinished frame, and return what it was: the link is lost, or bytes were discarded."""
+        """Forget the unfinished frame, as the link is lost or bytes were discarded. Return the events of its bytes."""
 
     def sends(self, data: bytes, now: float) -> None:
-        """Remember the bytes of a frame that is written now, if the link or the car may echo them."""
+        """Remember the bytes of a frame that is about to be written, if the link or the car may echo them."""
         del data, now
 
     @abstractmethod
     def measured(self, event: Event) -> Mapping[str, Fields]:
-        """Return the measured values of an event by topic. What was not measured is left out."""
+        """Return the measured values of an event by topic. Leave out fields that were not measured."""
 
     @abstractmethod
     def verdict(self, event: Event) -> str:
-        """Return what kind of bytes these are, for `frame/rx`."""
+        """Return the kind of an event's bytes, for `frame/rx`."""
 
     @abstractmethod
     def on_event(self, event: Event, now: float) -> None:
-        """Update the state with an event, after its measurements are published."""
+        """Update the state with an event. Its measurements are published already."""
 
     # ------------------------------------------------------------------ the link, and time
 
     @abstractmethod
     def link_up(self, now: float) -> None:
-        """Bring the car to a known state: the link is open."""
+        """Begin to bring the car to a known state, because the link is open."""
 
     @abstractmethod
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail all commands: the link is down. After WRITE_FAILED the car may have a part of a frame."""
+        """Fail all commands, because the link is down. After WRITE_FAILED the car may have got a part of a frame."""
 
     @abstractmethod
     def tick(self, now: float) -> None:
@@ -350,19 +353,19 @@ class Driver(ABC):
             self.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
     def on_sleep(self, slept_s: float, now: float) -> None:
-        """Stop the car first after a sleep of the computer, unless it has shown that it stands. Begin nothing again."""
+        """Drop all commands after a sleep of the computer. Stop the car, unless it has shown that it stands still."""
         model, car = self.model, self.desk.car
         stands = model.at_rest and model.trust.shown and not self.is_stopping
-        then = f"{car} stood before, and stands" if stands else f"{car} is stopped first"
-        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'nothing goes on'}"
+        then = f"{car} stood still before, and still does" if stands else f"{car} is stopped first"
+        words = f"the computer slept for {slept_s:.1f} s: {then if model.link_open else 'all commands have ended'}"
         self._log.log(Level.WARNING, "slept", words, now)
         self.queue.drop(Phase.EXPIRED, Reason.EXPIRED, words, now)
-        self.senders.halt(now)  # a joystick that is still pushed restarts no car
+        self.senders.halt(now)  # a joystick that is still held must not restart the car
         if model.link_open and not stands:
             self.stop_after_sleep(now)
 
     def stop_after_sleep(self, now: float) -> None:
-        """Stop the car. A stop from before the sleep goes on."""
+        """Stop the car. A stop that began before the sleep continues."""
         if not self.shutting_down or self.is_stopping:
             self.stop(FrameOrigin.STOP, now)
 
@@ -374,11 +377,11 @@ class Driver(ABC):
 
     @abstractmethod
     def on_written(self, write: OutgoingFrame, now: float) -> None:
-        """Update the state: the link has taken the frame that `poll` returned."""
+        """Update the state, because the frame that `poll` returned is written."""
 
     @abstractmethod
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
 
     # ------------------------------------------------------------------ commands
 
@@ -388,30 +391,30 @@ class Driver(ABC):
 
     @abstractmethod
     def frames(self, what: Action) -> tuple[Any, ...]:
-        """Return the frames of an action on a part of the car. `poll` returns them again, one at a time.
+        """Return the frames of an action on a part of the car. `poll` returns them later, one at a time.
 
-        One that is a `Later` is due after its delay: so an action lasts, and other commands go out meanwhile.
+        A frame that is a `Later` is due after its delay. Other commands can be sent meanwhile.
         """
 
     def part(self, what: Action) -> Hashable:
-        """Return the part of the car that an action is on. A new one ends what lasts on the same part."""
+        """Return the part of the car on which an action acts. A new action ends a delayed one on the same part."""
         return (type(what), what.verb if isinstance(what, Signal) else "")
 
     @abstractmethod
     def accepts_commands(self, now: float) -> bool:
-        """Return True if a command's frame may be written: no stop runs, or a new command may take its place."""
+        """Return True if a command's frame may be written: no stop is in progress, or a command may replace it."""
 
     @abstractmethod
     def free_at(self, now: float) -> float:
-        """Return when the car can take a motion, as far as that is known."""
+        """Return when a motion can be sent to the car, as far as that is known."""
 
     def wait_words(self, now: float) -> str:
-        """Return what must happen before the car may be driven, for a person. Empty if it may."""
+        """Describe what must happen before the car may be driven. Empty if it may be driven now."""
         del now
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode would wait for its frame at most, s. `busy_s` is the wait of a motion."""
+        """Return the longest time that a mode would wait for its frame, s. `busy_s` is the wait of a motion."""
         del now
         return busy_s
 
@@ -430,7 +433,7 @@ class Driver(ABC):
     @property
     @abstractmethod
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
+        """Return why the car was not stopped at the end of the gateway. Empty if it was stopped."""
 
     @property
     @abstractmethod
@@ -444,7 +447,7 @@ class Driver(ABC):
 
     @abstractmethod
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
-        """Stop the car by all means, for a command if there is one. Joins a stop in progress that is no weaker."""
+        """Stop the car by all means, for a command if there is one. Join a stop in progress that is as strong."""
 
     @abstractmethod
     def end_motion(self, now: float, pending: Pending | None = None) -> None:
@@ -452,15 +455,15 @@ class Driver(ABC):
 
     @abstractmethod
     def resume_motion(self, words: str, now: float) -> None:
-        """End the stop at the end of a drive: the car drives again."""
+        """End a stop that follows the end of a drive, because the car is driven again."""
 
     @abstractmethod
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off if a stop is asked now and its frames arrive, s."""
+        """Return the longest time until the motors are off, s, if a stop is requested now and its frames arrive."""
 
     @abstractmethod
     def shut_down(self, now: float) -> None:
-        """Stop the car for the last time, and reject all later commands: the gateway ends."""
+        """Stop the car for the last time, and reject all later commands, because the gateway ends."""
 
     def stop_if_open(self, now: float) -> None:
         """Stop the car, unless the link is down or the gateway shuts down."""
@@ -468,18 +471,18 @@ class Driver(ABC):
             self.stop(FrameOrigin.STOP, now)
 
     def end_doubt(self, now: float) -> None:
-        """End the doubt about a car that has shown its stops before: a person says that it is fine."""
+        """End the doubt about a car that did not show its last stop, because a person says that it is fine."""
         del now
 
     # ------------------------------------------------------------------ what outlives the gateway
 
     def kept(self) -> Mapping[str, Any]:
-        """Return what was learned of the car, for the next gateway, as JSON can hold it."""
+        """Return what was learned about the car, for its next gateway, as values of JSON."""
         return {}
 
     @property
     def opened_as(self) -> str:
-        """Return what the next gateway must know to stop the car. A change is kept at once."""
+        """Return what the next gateway must know to stop the car. A change is saved at once."""
         return ""
 
     # ------------------------------------------------------------------ the same for every family
@@ -497,15 +500,15 @@ class Driver(ABC):
             self.stop_if_open(now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
-        """Drop all queued commands. Ignore a continuous drive stream until its sender pauses."""
+        """Drop all queued commands. Refuse a running stream of drives until its sender has paused."""
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self.safety.shorten_lease(now)
         self.senders.halt(now, by)
 
     def end_drive(self, words: str, now: float) -> None:
-        """End a held motion that went as requested. It was sent: no reading shows that the car drove all the time.
+        """End a held motion whose time is over. Record it as sent, because no reading shows that the car really drove.
 
-        A changed distance is told. Something else may have moved before the car.
+        If the distance has changed, add that to the record. It is no proof: something in front may have moved.
         """
         held, model = self.queue.held, self.model
         if held is None or held.began_at is None:
@@ -520,11 +523,11 @@ class Driver(ABC):
 
     @property
     def doubt_of_drive(self) -> str:
-        """Return why the car may have ignored a drive, or an empty text if there is no reason to think so."""
+        """Return why the car may have ignored a drive. Empty if there is no such reason."""
         return ""
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
-        """End the held motion with the stop at the end of a drive, unless the car is at rest."""
+        """End the held motion, and stop the car as at the end of a drive, unless it is at rest."""
         if phase is Phase.COMPLETE:
             self.end_drive(words, now)
         else:

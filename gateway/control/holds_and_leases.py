@@ -1,6 +1,6 @@
-"""Holds the hold, e-stops, pauses, loan and lease of one car, which decide who may move it.
+"""Stores the hold, e-stops, pauses, loan and lease of one car, which decide who may move it.
 
-`gateway.safety_state_file` writes `PersistedSafety` to disk, so that all but the lease survive a restart.
+`gateway.safety_state_file` writes `PersistedSafety` to disk, so that all of them except the lease survive a restart.
 """
 
 from collections.abc import Iterable
@@ -12,11 +12,12 @@ from schemas.words import Rank
 
 LEASE_S: Final = 2.0
 """Duration of a lease after the drive (docs/explanation/who-may-drive.md#lease)."""
-# Each e-stop in force is in each `state/safety` and in the state file. 200 a second hung a gateway after four seconds.
+# Each e-stop in force is in each `state/safety` and in the state file. Without a limit, 200 new ones a second made a
+# gateway hang after four seconds.
 MAX_ESTOPS: Final = 32
-"""Maximum e-stops in force of one car, and as many of the whole fleet. A further one only stops the car."""
+"""Maximum e-stops in force for one car, and also for the whole fleet. A further one only stops the car."""
 MAX_ENDED_ESTOPS: Final = 2 * MAX_ESTOPS
-"""Maximum ended e-stops that are remembered and published in `state/safety`: the newest."""
+"""Maximum ended e-stops that are remembered and published in `state/safety`. The oldest are forgotten."""
 MAX_PAUSES: Final = 32
 """Maximum pauses in force. A further one only stops the cars."""
 MAX_ENDED_PAUSES: Final = 2 * MAX_PAUSES
@@ -92,7 +93,7 @@ class Safety:
     # ------------------------------------------------------------------ hold and e-stops
 
     def put_on_hold(self, name: str, at_ns: int, rank: Rank = Rank.PERSON) -> None:
-        """Put the car on hold, and end a lease of the coordinator. The hold of a lead replaces another."""
+        """Put the car on hold, and end a lease of the coordinator. A lead's hold replaces that of somebody else."""
         if self.hold is None or (rank is Rank.LEAD and self.hold.rank is not Rank.LEAD):
             self.hold = Hold(name, at_ns, rank)
         if self.lease is not None and self.lease.holder.kind is Rank.COORDINATOR:
@@ -101,18 +102,18 @@ class Safety:
     def latch(self, estop: Estop) -> Estop:
         """Latch an e-stop and put the car on hold. An e-stop whose id has already ended gets a new id.
 
-        If too many are in force, it is not latched: the car stays stopped until all of them are released.
+        If too many are in force, it is not latched. The car stays stopped anyway, until all of those are released.
         """
         if estop.id in self._ended:
             estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}")
         self.put_on_hold(estop.by, estop.at_ns, estop.rank)
         first = self._estops.get(estop.id)
-        is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # or widened from this car to the fleet
+        is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # new, or extended from the car to all
         if is_new and sum(each.fleet_wide is estop.fleet_wide for each in self.estops) >= MAX_ESTOPS:
             return first or estop
         if first is None:
             self._estops[estop.id] = estop
-        else:  # nobody lowers the rank of another's e-stop
+        else:  # keep the higher rank, so that nobody can lower the rank of somebody else's e-stop
             stronger = max(first, estop, key=lambda each: strength(each.rank))
             self._estops[estop.id] = replace(stronger, fleet_wide=first.fleet_wide or estop.fleet_wide)
         return self._estops[estop.id]
@@ -129,7 +130,7 @@ class Safety:
         known = {*self._estops, *self._ended}
         shared = [each for each in estops if each.fleet_wide]
         latched = [self.latch(each) for each in shared if each.id not in known]
-        for each in shared:  # a gateway without people latches the e-stop of a lead as that of a person
+        for each in shared:  # correct the rank, as a gateway without people latches a lead's e-stop as a person's
             first = self._estops.get(each.id)
             if first is not None and strength(each.rank) > strength(first.rank):
                 self.latch(each)
@@ -138,7 +139,7 @@ class Safety:
     # ------------------------------------------------------------------ pauses
 
     def pause(self, pause: FleetPause) -> bool:
-        """Pause the fleet. Return False if this pause has ended already, or is in force."""
+        """Pause the fleet. Return False if this pause has ended or is in force already, or if too many are in force."""
         if pause.id in self._ended_pauses or (pause.id not in self._pauses and len(self._pauses) >= MAX_PAUSES):
             return False
         first = self._pauses.get(pause.id)
@@ -146,7 +147,7 @@ class Safety:
         return first is None
 
     def end_pauses(self, ids: Iterable[str]) -> list[FleetPause]:
-        """End pauses, also such as are not known yet: they may arrive later. Return those that were in force."""
+        """End pauses, even unknown ones, because they may arrive later. Return those that were in force."""
         named = list(ids)
         _remember(self._ended_pauses, named, MAX_ENDED_PAUSES)
         return [self._pauses.pop(each) for each in named if each in self._pauses]
@@ -165,7 +166,7 @@ class Safety:
         return self.loan if now < self.loan_until else None
 
     def lend(self, loan: Loan, now: float) -> None:
-        """Lend the car, in place of an earlier loan."""
+        """Lend the car. This replaces an earlier loan."""
         self.loan, self.loan_until = loan, now + loan.duration_s
 
     # ------------------------------------------------------------------ lease
@@ -175,11 +176,11 @@ class Safety:
         return self.lease if self.lease is not None and now < self.lease.until else None
 
     def grant(self, sender: Sender, until: float) -> None:
-        """Grant the lease until then, and `LEASE_S` longer."""
+        """Grant the lease until `LEASE_S` after `until`."""
         self.lease = LeaseState(sender, until + LEASE_S)
 
     def shorten_lease(self, now: float) -> None:
-        """Shorten the lease to `LEASE_S`: the holder's motion has ended."""
+        """Shorten the lease to `LEASE_S` from now, because the holder's motion has ended."""
         if self.lease is not None:
             self.lease = replace(self.lease, until=min(self.lease.until, now + LEASE_S))
 
@@ -197,12 +198,12 @@ class Safety:
 
 
 def _remember(ended: dict[str, None], ids: Iterable[str], maximum: int) -> None:
-    """Add ended ids, and forget the oldest of too many."""
+    """Add ended ids, and forget the oldest ones beyond the maximum."""
     ended.update(dict.fromkeys(ids))
     while len(ended) > maximum:
         del ended[next(iter(ended))]
 
 
 def _strength(pause: FleetPause) -> tuple[int, int, str, str]:
-    """Order two reports of one pause, so that gateways agree on the same in whatever order they arrive."""
+    """Order two reports of one pause, so that all gateways choose the same one, whichever arrives first."""
     return strength(pause.rank), -pause.at_ns, pause.by, pause.why

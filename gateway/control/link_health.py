@@ -1,4 +1,4 @@
-"""Rates the link by the car's own bytes, never by a library's claim that it is connected."""
+"""Rates the link by the bytes from the car, and never by a library's claim that it is connected."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -7,9 +7,9 @@ from typing import Final
 from schemas.words import LinkState
 
 AIRTIME_WINDOW_S: Final = 10.0
-"""Period of which `airtime` is the share."""
+"""Period over which `airtime` is measured."""
 STALE_S: Final = 3.0
-"""Maximum silence of an online link in a silent mode."""
+"""Maximum silence of an online link while every silence is normal."""
 
 
 @dataclass(slots=True)
@@ -74,8 +74,9 @@ class LinkHealth:
     def update(self, *, now: float, limit_s: float | None, unheard_s: float, why_quiet: str, is_heard: bool) -> bool:
         """Update the state. Return True on a change.
 
-        `limit_s`: the longest normal silence; None if every silence is normal. `unheard_s`: the time without a reading
-        beyond the blocks of our frames (see `ModeEstimator`). `is_heard` is False if control counts the car as silent.
+        `limit_s` is the longest normal silence, or None if every silence is normal. `unheard_s` is the time without a
+        reading, without the time for which our frames block the car (see `ModeEstimator`). `is_heard` is False if
+        the driver counts the car as silent.
         """
         if self.state is LinkState.LOST:
             return False

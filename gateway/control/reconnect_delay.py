@@ -6,9 +6,10 @@ from schemas.backoff import backoff_s
 
 FIRST_DELAY_S: Final = 0.25
 MAX_RECONNECT_DELAY_S: Final = 1.0
-"""Delay after the first failure, and maximum delay: a car may be driving while its link is down."""
+"""Delay after the first failure, and maximum delay. They are short, because a car may be driving while its link is
+down."""
 PROVEN_S: Final = 3.0
-"""Minimum time after which an open link counts as proven without a reading."""
+"""Time after which an open link counts as proven even without a reading."""
 MAX_LOGGED_CAUSES: Final = 10
 """Maximum different causes that are logged until a link is proven."""
 _OPENED: Final = ""
@@ -20,18 +21,18 @@ def delay_s(failures: int, jitter: float) -> float:
 
 
 class Attempts:
-    """The attempts to open one link; each may reset a car's board.
+    """Counts the attempts to open one link. They must not be frequent, because each may reset a car's board.
 
     A link is proven by a reading, or after `PROVEN_S`. After the loss of a proven link the delay starts from the
-    shortest. A link that is lost earlier counts as a failure. Until a link is proven, each cause is logged once, and so
-    is the opening.
+    shortest. A link that is lost before it is proven counts as a failure. Until a link is proven, each cause of a loss
+    is logged only once, and so is the opening of the link.
     """
 
     def __init__(self) -> None:
         self._failures = 0
         self._logged: set[str] = set()
         self._opened_at: float | None = None
-        """When the link was opened that is not proven yet, or None if there is none."""
+        """When the link was opened, if it is open and not proven yet, else None."""
         self._log_when_proven = False
 
     def on_open(self, now: float) -> bool:
@@ -60,5 +61,5 @@ class Attempts:
         return should_log
 
     def delay_s(self, jitter: float) -> float:
-        """Return the delay before the next attempt, s; `jitter` as for the function `delay_s`."""
+        """Return the delay before the next attempt, s. For `jitter`, see the function `delay_s`."""
         return delay_s(max(1, self._failures), jitter)

@@ -1,6 +1,6 @@
 """Decides whether a command may be carried out now: a table of what each command needs, and a rule for each need.
 
-Pure: takes the context of the car, returns a refusal or None. A stop or e-stop passes in every state.
+Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused.
 """
 
 from dataclasses import dataclass
@@ -28,18 +28,18 @@ from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Rank, Reason
 
 MAX_QUEUED_COMMANDS: Final = 8
-"""Maximum one-shots in the queue; more are refused."""
+"""Maximum one-shots in the queue. Further ones are refused."""
 MAX_AHEAD_S: Final = 5.0
-"""Maximum time by which `asked` may lie in the future. Clocks of computers differ by less if they are set by NTP."""
+"""Maximum time by which `asked` may lie in the future. The clocks of computers that use NTP differ by less."""
 CLOCK_DOUBT_S: Final = 30.0
-"""Minimum lateness of a command that is rather a wrong clock than a slow network."""
+"""Lateness of a command from which on a wrong clock is a more likely cause than a slow network."""
 AFTER_SLEEP_S: Final = 2.0
-"""Time after a sleep of the computer in which a command without `asked` may be from before it."""
+"""Time after a sleep of the computer during which a command without `asked` may be from before the sleep."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandContext:
-    """The state of the car and the gateway that decides about a command."""
+    """The state of car and gateway on which the decision about a command depends."""
 
     car: str
     now: float
@@ -47,15 +47,15 @@ class CommandContext:
     link_reason: str
     closing: bool
     asked: Mode | None
-    """The commanded mode, also one that still waits."""
+    """The commanded mode, even if it still waits."""
     authority: Authority
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
     battery: str
-    """Why the battery allows no new drive, or an empty text if it does."""
+    """Why the battery allows no new drive. Empty if it allows one."""
     queued: int
     unsupported: str | None = None
-    """Why this car cannot do it in any state, by its driver, or None if it can."""
+    """Why this car cannot do it in any state, as its driver says, or None if it can."""
     loan_until: float = 0.0
     """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")
@@ -86,9 +86,9 @@ _ACTS: Final = Needs(manual=True, queue=True)
 _ADJUSTS: Final = Needs(Right.MOVE, manual=True, queue=True)
 
 RELEASE: Final = Needs(Right.MOVE)
-"""Needs of a drive with motion stop, which moves nothing."""
+"""Needs of a drive with motion stop: it moves nothing, so it needs neither battery nor mode 0."""
 CLOSE: Final = Needs(Right.MOVE)
-"""Needs of mode manual, which stops the car."""
+"""Needs of mode manual: it stops the car, so it needs no battery."""
 TABLE: Final[dict[type[Action], Needs]] = {
     Stop: _ANYTIME,
     EmergencyStop: _ANYTIME,
@@ -102,7 +102,7 @@ TABLE: Final[dict[type[Action], Needs]] = {
     SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is not a `PartAction`. Who may end which e-stop and hold: `Authority.may_resume`."""
+"""Needs of each action that is not a `PartAction`. `Authority.may_resume` decides who may end which e-stop and hold."""
 
 Refusal = tuple[Reason, str]
 
@@ -123,11 +123,11 @@ def needs(what: Action) -> Needs:
 
 
 def refuse(command: Command, context: CommandContext) -> Refusal | None:
-    """Return why the command is refused, or None if it is not. The words tell the car, the state, and what to do."""
+    """Return why the command is refused, or None if it is not. The text names the car, the state, and what to do."""
     what, sender = command.what, command.sender
     if isinstance(what, Stop | EmergencyStop):
         return None
-    # A late pause is better than none, as is a late stop.
+    # A late pause is carried out, as a late stop is: it is better than none.
     if not isinstance(what, Pause) and (words := _out_of_time(command, context)) is not None:
         return Reason.STALE, words
     if context.unsupported is not None:
@@ -139,11 +139,14 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
 
 
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
-    """Return why the command's time is too far from now, or None if it is near, or if the command has no time."""
+    """Return why the command is too old, or too far in the future. None if it is not.
+
+    A command without a time is refused only just after a sleep of the computer.
+    """
     age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
     if age_s is None:
         if context.now < context.slept_at + AFTER_SLEEP_S:
-            return "the computer has just slept, and the command may be from before. Send it again, with `asked`."
+            return "the computer has just slept, and the command may be from before. Send it again with `asked`."
         return None
     if age_s < -MAX_AHEAD_S:
         limit = f"maximum {MAX_AHEAD_S:g} s"
@@ -189,7 +192,7 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
         if refusal is not None:
             return refusal
     if needed.manual and context.asked not in (None, Mode.MANUAL):
-        # Where a plan runs, only a stop lasts: the coordinator would open the mode again after a change to manual.
+        # If a plan is running, the coordinator opens the mode again after a change to manual, but not after a stop.
         fix = f"`fleet mode {car} manual` (or `fleet stop {car}` if a plan runs)"
         return (
             Reason.WRONG_MODE,
@@ -213,7 +216,7 @@ _DEEDS: Final = {
 
 
 def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Right | None = None) -> Refusal:
-    """Return the refusal for a person at a terminal: what keeps the sender from it, and what to do."""
+    """Return the refusal for a person at a terminal: what prevents the command, and what to do."""
     return denial.reason, _words(denial, sender, context, right)
 
 
@@ -243,13 +246,13 @@ def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right
         case Bar.ESTOPPED:
             return f"{car} is emergency-stopped ({by}{why}). Release it with `fleet resume {car} --estops`."
         case Bar.LEADS_ESTOP:
-            return f"{car} stays emergency-stopped: {by} did it{why}, and {_only_leads(context)}"
+            return f"{car} stays emergency-stopped: {by} stopped it{why}, and {_only_leads(context)}"
         case Bar.PAUSED:
             by_lead = people.roles is None and any(pause.rank is Rank.LEAD for pause in context.authority.pauses)
             who = "A lead" if people.leads or by_lead else "A person"
             return f"{car} is paused with the whole fleet ({by}{why}). {who} ends it with `fleet unpause`."
         case Bar.LEADS_PAUSE:
-            return f"{car} stays paused: {by} did it, and {_only_leads(context)}"
+            return f"{car} stays paused: {by} paused the fleet, and {_only_leads(context)}"
         case Bar.ON_HOLD if right is Right.RESUME:
             return f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
         case Bar.ON_HOLD:
@@ -267,8 +270,8 @@ def _words(denial: Denial, sender: Sender, context: CommandContext, right: Right
 
 
 def _only_leads(context: CommandContext) -> str:
-    """Return the rule about what a lead began, and who the leads are."""
-    rule, leads = "only a lead ends what a lead began", context.authority.people.leads
+    """Return the rule that only a lead may end what a lead began, and who the leads are."""
+    rule, leads = "only a lead may end what a lead began", context.authority.people.leads
     if leads:
         return f"{rule} ({', '.join(leads)})."
     where = "`people:` of the fleet file, or with `--person NAME:lead`"

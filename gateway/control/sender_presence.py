@@ -6,19 +6,19 @@ from typing import Final
 from schemas.limits import STREAM_PAUSE_S
 
 SENDER_GONE_S: Final = 1.0
-"""Timeout for a lost token. A restarted hub takes all tokens down for half a second."""
+"""Timeout for a lost token. During a restart of the hub, all tokens disappear for half a second."""
 MAX_SENDERS: Final = 256
 """Maximum senders whose last drive is remembered."""
 
 
 @dataclass(slots=True)
 class Senders:
-    """Tokens and drive streams by the sender's name. Times: s, monotonic."""
+    """Tokens and drive streams, by name of the sender. Times: s, monotonic."""
 
     _tokens: dict[str, float | None] = field(default_factory=dict)
     """When each token disappeared. None while it exists."""
     _drives: dict[str, tuple[float, bool]] = field(default_factory=dict)
-    """When the last drive of each sender arrived, and whether it was part of a stream."""
+    """When the last drive of each sender arrived, and True if it was a sample of a stream."""
     _halted: set[str] = field(default_factory=set)
 
     # ------------------------------------------------------------------ tokens
@@ -29,7 +29,7 @@ class Senders:
 
     def on_token_lost(self, name: str, now: float, *, driving: bool) -> None:
         """Record that the sender's token disappeared, but only if that sender is driving."""
-        # The bus merges changes, so the first news of a token may be its end.
+        # The bus merges changes, so a token may disappear without having appeared here.
         if driving:
             self._tokens[name] = now
         else:
@@ -63,17 +63,17 @@ class Senders:
         return name not in self._halted
 
     def halt_streams(self, now: float) -> None:
-        """Require a pause of all streams: what held a joystick down before a loss must not drive the car after it."""
+        """Require a pause of all streams: a joystick that was held before a loss must not drive the car after it."""
         self._halted.update(
             name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_PAUSE_S
         )
 
     def skip(self, slept_s: float) -> None:
-        """Count no sleep of the computer as a pause of a stream. For a clock that goes on in a sleep."""
+        """Count no sleep of the computer as a pause of a stream. Call it if the clock continues during a sleep."""
         self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
 
     def halt(self, now: float, by: str = "") -> None:
-        """Require a pause of all senders that have just driven: the car was stopped."""
+        """Require a pause of all senders that have just driven, because the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may
         # not.
         self._halted.update(

@@ -1,15 +1,16 @@
 """Tracks as one state machine whether the car is known to stand or to move. Pure.
 
 A car acknowledges nothing, so everything that a gateway believes about it is inferred: from the frames that it has
-written, and from what the car reports of its own accord. It is tempting to keep a flag, "is driving", and set it where
+written, and from what the car reports of its own accord. It is tempting to have a flag, "is driving", that is set where
 frames are written. But then a lost frame, a reset, or a second program at the port makes the flag a lie, and somebody
-reaches for a car that "stands". This module is the one place where the belief may change, so that the question "why did
-you say that it stands?" always has an answer: a state, since when, and the evidence.
+reaches for a car that "stands still". This module is the one place where the belief may change, so that the question
+"why did you say that it stands still?" always has an answer: a state, since when, and the evidence.
 
 Two events say that a stop is over, and the difference between them is the point of the whole machine. `STOP_SHOWN`:
 readings of the car prove that it obeyed. `STOP_SENT`: the frames are written, and this car has no way to show more.
-Both lead to `STOPPED`, but with another `basis`, and whoever shows the claim must show the basis, too. A car that could
-have shown its stop and did not is in neither: it is `UNPROVEN`, its motors are unknown, and the stop goes on.
+Both lead to `STOPPED`, but with a different `basis`, and whoever shows the claim must show its basis, too. If a car
+could have shown its stop and did not, neither event happens: the car is `UNPROVEN`, its motors are unknown, and the
+gateway continues to stop it.
 
 Three states are kinds of not knowing, and each ends in its own way. `RECOVERING` follows an opened link or a
 contradiction: only a completed stop ends it, since the car may be in any mode with half a frame in its buffer.
@@ -17,9 +18,9 @@ contradiction: only a completed stop ends it, since the car may be in any mode w
 does, and then the car is stopped first. `UNKNOWN` is the time without a link, in which neither frames nor readings
 count.
 
-Time alone never changes the state. A timeout is an event that somebody else decides on (`SILENT`, `NOT_SHOWN`), with
-what is known about the rhythm of this car; here it is one row more in a table. `TRANSITIONS` has a next state for every
-state and event, so there is no combination that nobody has thought of, and a test walks through all of them.
+Time alone never changes the state. A timeout is an event (`SILENT`, `NOT_SHOWN`), which other modules raise because
+they know the rhythm of this car; here it is one more row of a table. `TRANSITIONS` has a next state for every state and
+event, so no combination is forgotten, and a test walks through all of them.
 """
 
 from dataclasses import dataclass
@@ -63,7 +64,7 @@ _ANY: Final = {
 _SAME: Final = {
     # Without a link no frame and no reading counts.
     _T.UNKNOWN: set(TrustEvent) - {_E.LINK_OPENED},
-    # A stop that begins during recovery joins or replaces it. The car's state stays unknown.
+    # A stop that begins during recovery joins or replaces the recovery. The car's state stays unknown.
     _T.RECOVERING: {_E.STOP_BEGUN, _E.HEARD},
     _T.STOPPING: {_E.STOP_BEGUN, _E.HEARD},
     _T.STOPPED: {_E.HEARD, _E.NOT_SHOWN},
@@ -130,10 +131,10 @@ class TrustState:
 
     @property
     def motors(self) -> Motors:
-        """Return what is claimed of the motors."""
+        """Return the claim about the motors."""
         return _MOTORS[self.state]
 
     @property
     def shown(self) -> bool:
-        """Return True if the car has shown that it stands, and no frame since then could move it."""
+        """Return True if the car has shown that it stands still, and no frame since then could have moved it."""
         return self.basis is Basis.SHOWN

@@ -1,8 +1,8 @@
 """Checks a family of cars: `python -m gateway.drivers.check mypackage.family`. Pure, on virtual time.
 
-It tries what a gateway relies on with every driver, whatever its cars are: bytes of any kind, a stop at once, claims
-only from readings, an end. What is particular about a family it cannot know. Exit code 0: nothing found, 1: faults, 2:
-wrong use.
+It tests what a gateway relies on in every driver: that the driver accepts any bytes, stops the car at once, claims only
+what readings show, and shuts down in time. It cannot test what is special to a family. Exit code 0: no fault found, 1:
+faults found, 2: wrong use.
 """
 
 import json
@@ -51,7 +51,8 @@ TICK_S: Final = 0.2
 FIRST_STOP_S: Final = 1.0
 """Maximum time from a person's stop to its first frame, unless a longer worst case is announced."""
 JOINED_S: Final = 7.0
-"""Maximum age of the last frame of a stop that goes on. A new one joins it, and waits for its next try."""
+"""A new stop joins one that is still going on, and its frame may be the next repeat of that one. This is the maximum
+age of the running stop's last frame."""
 MAX_FRAMES_AT_ONCE: Final = 50
 ACTIONS: Final[tuple[Action, ...]] = (
     Led(1, 2, 3),
@@ -80,7 +81,7 @@ PARTS: Final[Mapping[str, type[Action]]] = {
     "arm": MoveArm,
     "fan": Fan,
 }
-"""The action of a capability, for one of which such a car must have frames."""
+"""The kind of action of each capability. A car with the capability must have frames for at least one such action."""
 PROFILE_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "name": (str,),
     "capabilities": (frozenset,),
@@ -95,7 +96,7 @@ PROFILE_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "dead_man_s": (int, float, type(None)),
     "not_observed": (tuple,),
 }
-"""What the fields of a profile are. Others read them without a look at their types."""
+"""The types of a profile's fields. Other modules use the fields without checking them."""
 PROFILE_WORDS: Final[Mapping[str, frozenset[str]]] = {
     "capabilities": frozenset((*CAPABILITIES, "imu")),
     "modes": frozenset(Mode),
@@ -108,14 +109,14 @@ HOSTILE: Final = (
     *(b"NaN", b"-Infinity", b"1e999", b"-1", b"9" * 400, b"9" * 5000),
     *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
 )
-"""What may stand where a car sends a number: damaged, or from another program."""
+"""Values that may replace a number in a report of a car, if the report is damaged or from another program."""
 WRONG_OPTION: Final = "+no_such_option"
 _NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
 
 class Bench:
-    """A gateway's control with a driver, and a car that says nothing, or one of its own `samples` now and then."""
+    """A gateway's control with a driver, and a car that sends nothing, or all its `samples` at each tick."""
 
     def __init__(self, family: Family, platform: str, samples: Sequence[bytes] = ()) -> None:
         self._samples = samples
@@ -127,7 +128,7 @@ class Bench:
         self._number = 0
         self._tick_at = 0.0
         self._due_at = 0.0
-        """When a gateway would ask for a frame again if nothing happened before."""
+        """When a gateway would next ask for a frame, if nothing wakes it earlier."""
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
@@ -143,7 +144,8 @@ class Bench:
             said += driver.flush(self.now)
             for event in said:
                 driver.on_event(event, self.now)
-            # As `gateway.wake` does: events and ticks wake the writer only if it has work, or will have earlier.
+            # As in `gateway.wake`: events and ticks wake the writer only if there are records, or if its next frame is
+            # now due earlier than planned.
             is_early = (said or ticked) and (self.control.has_records or driver.next_at(self.now) < self._due_at)
             if is_early or self.now >= self._due_at:
                 self.write()
@@ -152,12 +154,15 @@ class Bench:
         """Write what is due."""
         driver = self.control.driver
         for count in range(MAX_FRAMES_AT_ONCE + 1):
-            named_at = driver.setup_at() if isinstance(driver, PlainDriver) else self.now
+            setup_due_at = driver.setup_at() if isinstance(driver, PlainDriver) else self.now
             write = driver.poll(self.now)
             if write is None:
                 break
-            if write.why is FrameOrigin.SETUP and named_at > self.now:
-                self.faults.append("setup_frame has a frame before setup_at: a gateway would write it late or never")
+            if write.why is FrameOrigin.SETUP and setup_due_at > self.now:
+                self.faults.append(
+                    "setup_frame returns a frame earlier than setup_at says: a gateway asks only then, so it would "
+                    "write the frame late or never"
+                )
             if not _is(write.data, bytes):
                 self.faults.append(f"a frame ({write.why}) is {_kind(write.data)}, not bytes: {write.data!r}")
             elif not write.data:
@@ -182,7 +187,7 @@ class Bench:
         return command.id
 
     def stop_frames(self, since: float = 0.0) -> list[float]:
-        """Return when frames of stops were written. What sets a car up, or asks it, is none."""
+        """Return when frames of stops were written. Frames that set a car up or query it do not count."""
         return [at for at, _, why in self.sent if at >= since and why in STOP_ORIGINS]
 
     def last(self, command_id: str) -> CommandRecord | None:
@@ -198,28 +203,28 @@ def _connected(family: Family, platform: str, samples: Sequence[bytes] = ()) -> 
 
 
 def check_names(family: Family, platform: str) -> Iterator[str]:
-    """Check that a fleet file can name the platform, and that a wrong name is refused in words."""
+    """Check that a fleet file can name the platform, and that a wrong option is refused with a ValueError."""
     if platform != normalize_name(platform) or "+" in platform or not platform:
-        yield f"{platform!r} cannot be named in a fleet file: write it in small letters, without +"
+        yield f"{platform!r} cannot be named in a fleet file: write it in lower case, without +"
     if platform == AUTO or (
         platform in built_in_platforms() and getattr(family, "__name__", "") not in BUILT_IN.values()
     ):
-        yield f"{platform} is a platform of ours: no fleet file would find this one"
+        yield f"{platform} is the name of a built-in platform, so no fleet file could name this one"
     known = {each.name.partition("+")[0] for each in family.profiles()}
     if not known or known - set(family.PLATFORMS):
-        yield f"profiles() has {', '.join(sorted(known)) or 'none'}, and PLATFORMS {', '.join(family.PLATFORMS)}"
+        yield f"profiles() has {', '.join(sorted(known)) or 'none'}, but PLATFORMS has {', '.join(family.PLATFORMS)}"
     try:
         family.profile_of(f"{platform}{WRONG_OPTION}")
     except ValueError:
         return
-    except Exception as error:  # noqa: BLE001 - whatever else it raises
+    except Exception as error:  # noqa: BLE001 - every other exception is a fault
         yield f"profile_of('{platform}{WRONG_OPTION}') raises {type(error).__name__}, not ValueError"
     else:
-        yield f"profile_of('{platform}{WRONG_OPTION}') takes an option that cannot exist"
+        yield f"profile_of('{platform}{WRONG_OPTION}') accepts an option that does not exist"
 
 
 def check_profile(family: Family, platform: str) -> Iterator[str]:
-    """Check that a profile is a value, and names only what there is."""
+    """Check a profile: its types and words, that it is equal for the same name, and what it measures and lacks."""
     profile = family.profile_of(platform)
     for field, types in PROFILE_TYPES.items():
         value: Any = getattr(profile, field)
@@ -230,43 +235,43 @@ def check_profile(family: Family, platform: str) -> Iterator[str]:
             yield f"{field} has unknown words: {', '.join(sorted(map(str, others)))}"
     for field in ("cells", "baud", "dead_man_s"):
         if (number := getattr(profile, field)) is not None and not 0 < number < math.inf:
-            yield f"{field} is {number}"
+            yield f"{field} is {number}: it must be a finite number above 0"
     if profile != family.profile_of(platform) or hash(profile) != hash(family.profile_of(platform)):
-        yield "profile_of returns another value each time"
+        yield "profile_of returns profiles that are not equal, or have no equal hash"
     if profile.name.partition("+")[0] != platform:
-        yield f"the profile is named {profile.name}"
+        yield f"the profile is named {profile.name}, which is another platform"
     if Mode.MANUAL not in profile.modes:
-        yield "it lacks mode manual"
+        yield "the profile lacks mode manual"
     topics = {each.removeprefix("sensor/") for each in TOPICS if each.startswith("sensor/")}
     for mode in profile.modes:
         if unknown := profile.measurable(mode) - topics:
-            yield f"it measures {', '.join(sorted(unknown))}, which are not topics"
+            yield f"it measures {', '.join(sorted(unknown))}, which are no sensor topics"
     for word in CAPABILITIES:
         if word not in profile.capabilities and not profile.why_lacking(word):
-            yield f"why_lacking({word!r}) says nothing, and it is not a capability"
+            yield f"the car has no capability {word!r}, but why_lacking gives no reason"
 
 
 def check_bytes(family: Family, platform: str) -> Iterator[str]:
-    """Check that any bytes are taken, and that what they are does not depend on their pieces."""
-    moments = random.Random(1)  # noqa: S311 - no secret
+    """Check that the driver accepts any bytes, and makes the same events of them if they come in pieces."""
+    rng = random.Random(1)  # noqa: S311 - no secret
     bench = _connected(family, platform)
     sent = b"".join(data for _, data, _ in bench.sent) or b"\0"
     for _ in range(300):
-        data = moments.choice((moments.randbytes(moments.randrange(200)), sent[moments.randrange(len(sent)) :], b"\n"))
+        data = rng.choice((rng.randbytes(rng.randrange(200)), sent[rng.randrange(len(sent)) :], b"\n"))
         whole, pieces = (family.driver_of(platform, {}) for _ in range(2))
-        events = [Controller("red", each).driver for each in (whole, pieces)]
-        cut = moments.randrange(len(data) + 1)
-        one = [event.raw for event in events[0].feed(data, 1.0)]
-        two = [event.raw for piece in (data[:cut], data[cut:]) for event in events[1].feed(piece, 1.0)]
+        drivers = [Controller("red", each).driver for each in (whole, pieces)]
+        cut = rng.randrange(len(data) + 1)
+        one = [event.raw for event in drivers[0].feed(data, 1.0)]
+        two = [event.raw for piece in (data[:cut], data[cut:]) for event in drivers[1].feed(piece, 1.0)]
         if one != two:
-            yield f"{data!r} makes other events if it comes in two pieces"
+            yield f"{data!r} is decoded to other events if it comes in two pieces"
             return
         yield from _take(bench, data)
         bench.run(0.1)
 
 
 def _take(bench: Bench, data: bytes) -> Iterator[str]:
-    """Let the driver take bytes, as a gateway does. Yield what is wrong with the events that it makes of them."""
+    """Feed the driver with bytes, as a gateway does. Yield the faults of the events that it makes of them."""
     driver = bench.control.driver
     for event in driver.feed(data, bench.now):
         if not _is(event.raw, bytes) or not _is(event.at, float):
@@ -279,7 +284,7 @@ def _take(bench: Bench, data: bytes) -> Iterator[str]:
 
 
 def _faults_of_values(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what keeps measured values from being published."""
+    """Yield the faults of measured values that keep them from being published."""
     if topic not in TOPICS:
         yield f"{topic} is not a topic"
         return
@@ -312,11 +317,11 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
     """Check that there is a frame for each motion at each speed, and that a stop is not among them."""
     driver = _connected(family, platform).control.driver
     if not isinstance(driver, PlainDriver):
-        return  # its frames are its own; `check_drive` sees what it writes
+        return  # such a driver has no motion_frame; `check_drive` looks at the frames that it writes
     if driver.STOP_FRAMES < 1:
-        yield f"STOP_FRAMES is {driver.STOP_FRAMES}: a stop has at least one frame"
+        yield f"STOP_FRAMES is {driver.STOP_FRAMES}: a stop needs at least one frame"
     if not hasattr(driver, "STOPS_WITHIN_S"):
-        yield "STOPS_WITHIN_S is missing: the time in which a car that got its stop has stopped"
+        yield "STOPS_WITHIN_S is missing: the time within which a car stops after it has received its stop"
     stops = {driver.stop_frame(index) for index in range(driver.STOP_FRAMES)} | {driver.motion_frame(Motion.STOP)}
     frames: dict[tuple[float, Motion], bytes] = {}
     for speed, motion in product((SPEED_STEP, 0.5, 1.0), Motion):
@@ -329,40 +334,40 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
         if not frame or b"" in stops:
             yield f"the frame of {motion}, or of a stop, is empty"
         if motion is not Motion.STOP and frame in stops:
-            yield f"the frame of {motion} at {speed:.0%} is one of the stop"
+            yield f"the frame of {motion} at {speed:.0%} is also a frame of a stop"
     for one, other in OPPOSITES:
         if (1.0, one) in frames and frames[1.0, one] == frames.get((1.0, other)):
             yield f"the frames of {one} and {other} are the same"
     slow, fast = frames.get((SPEED_STEP, Motion.FORWARD)), frames.get((1.0, Motion.FORWARD))
     if "speed" in driver.model.profile.capabilities and slow is not None and slow == fast:
-        yield "it has the capability speed, and motion_frame is the same at every self.model.speed"
+        yield "it has the capability speed, but motion_frame returns the same frame at every self.model.speed"
 
 
 def check_samples(family: Family, platform: str) -> Iterator[str]:
-    """Check what is measured, by `SAMPLES` of the module: bytes of a real car.
+    """Check with `SAMPLES` of the module (bytes of a real car) that each measured value has a known topic and field.
 
-    Nothing may be measured in its `UNMEASURED`, such as acknowledgements and values that stand for none.
+    Nothing may be measured in the bytes of `UNMEASURED`, such as acknowledgements and values that mean "no value".
     """
     driver = _connected(family, platform).control.driver
     for sample in getattr(family, "UNMEASURED", ()):
         for event in (*driver.feed(sample, 100.0), *driver.flush(110.0)):
             for topic in driver.measured(event):
-                yield f"{topic} is measured in {sample!r}"
+                yield f"{topic} is measured in {sample!r}, which is listed in UNMEASURED"
     profile = family.profile_of(platform)
     measurable = {topic for mode in profile.modes for topic in profile.measurable(mode)}
     for sample in getattr(family, "SAMPLES", ()):
         events = [*driver.feed(sample, 200.0), *driver.flush(210.0)]
         found = [each for event in events for each in driver.measured(event).items()]
         if not found:
-            yield f"nothing is measured in {sample!r}"
+            yield f"nothing is measured in {sample!r}, which is listed in SAMPLES"
         for topic, fields in found:
             yield from _faults_of_values(topic, fields)
             if topic in TOPICS and topic.removeprefix("sensor/") not in measurable:
-                yield f"{topic} is measured, and the profile does not say so"
+                yield f"{topic} is measured, but the profile does not list it"
 
 
 def check_hostile(family: Family, platform: str) -> Iterator[str]:
-    """Check that `SAMPLES` with other values in the place of their numbers are taken, and publish nothing odd."""
+    """Check that the driver accepts `SAMPLES` with `HOSTILE` values for numbers, and measures nothing invalid."""
     bench = _connected(family, platform)
     for sample in getattr(family, "SAMPLES", ()):
         for number in re.finditer(rb"-?\d+(\.\d+)?", sample):
@@ -373,8 +378,8 @@ def check_hostile(family: Family, platform: str) -> Iterator[str]:
 def check_rest(family: Family, platform: str) -> Iterator[str]:
     """Check that a car which moves never counts as one that has shown its stop.
 
-    `MOVING` of the module are bytes of a car that moves. It is asked for where `SAMPLES` show a stop: then perhaps any
-    report does.
+    `MOVING` of the module has bytes of a car that moves. It is required if `SAMPLES` show a stop, because then perhaps
+    any report of such a car would show one.
     """
     standing = _connected(family, platform, getattr(family, "SAMPLES", ()))
     standing.ask(Stop())
@@ -393,7 +398,7 @@ def check_rest(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_stop(family: Family, platform: str) -> Iterator[str]:
-    """Check that a person's stop goes out in time at any moment, and never counts as shown without a reading."""
+    """Check that a person's stop is sent in time at any moment, and never counts as shown without a reading."""
     for wait_s in (0.0, 0.05, 0.6, 3.0, 30.0):
         bench = Bench(family, platform)
         bench.control.link_up(bench.now)
@@ -402,17 +407,18 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
         stop = bench.ask(Stop())
         bench.run(30.0)
         announced_s = max((each.worst_case_s for each in bench.records if each.command.id == stop), default=0.0)
-        # It may join a stop that goes on: then the frames of that one count.
+        # It may join a stop that is still going on. Then that stop's frames count.
         from_s, until_s = asked_at - JOINED_S, asked_at + max(FIRST_STOP_S, announced_s)
         if not any(at <= until_s for at in bench.stop_frames(from_s)):
-            yield f"no frame of a stop within {until_s - asked_at:g} s, {wait_s:g} s after the link was opened"
+            limit_s = until_s - asked_at
+            yield f"a stop asked for {wait_s:g} s after the link was opened had no frame within {limit_s:g} s"
         last = bench.last(stop)
         if last is None or last.phase not in (Phase.SENT, Phase.FAILED):
-            yield f"a stop that nothing shows ends as {last.phase if last else 'nothing'}, not as sent or failed"
+            yield f"a stop that no reading shows ends as {last.phase if last else 'nothing'}, not as sent or failed"
 
 
 def check_drive(family: Family, platform: str) -> Iterator[str]:
-    """Check that a drive goes out or fails, ends with a stop, and is repeated for a dead-man."""
+    """Check that a drive is sent or fails, ends with a stop, and is repeated in time for the car's dead-man timer."""
     bench = _connected(family, platform, getattr(family, "SAMPLES", ()))
     began, before = bench.now, len(bench.sent)
     dead_man_s = family.profile_of(platform).dead_man_s
@@ -426,16 +432,16 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
     if not moved:
         if getattr(family, "SAMPLES", ()):
             waits = bench.control.driver.wait_words(bench.now)
-            yield f"a drive never goes out while the car sends its SAMPLES{': it waits for ' if waits else ''}{waits}"
+            yield f"a drive is never sent while the car sends its SAMPLES{': it waits for ' if waits else ''}{waits}"
         return
     frames = bench.sent[before:]
-    driven = (FrameOrigin.COMMAND, FrameOrigin.REPEAT)
-    during = [at for at, _, why in frames if at <= began + lasts_s and why in driven]
+    drive_origins = (FrameOrigin.COMMAND, FrameOrigin.REPEAT)
+    during = [at for at, _, why in frames if at <= began + lasts_s and why in drive_origins]
     stopped = [at for at in bench.stop_frames() if during and at > during[0]]
     ended = min(stopped, default=began + lasts_s)
     gaps = [b - a for a, b in pairwise((*during, min(ended, began + lasts_s)))]
     if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
-        yield f"a held motion is not repeated within half of its dead-man of {dead_man_s:g} s"
+        yield f"a held motion is not repeated within half of the car's dead-man time, {dead_man_s:g} s"
     if during and not stopped:
         yield "the end of a drive sends no stop"
     if bench.control.driver.model.motors is Motors.ON:
@@ -450,24 +456,24 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
     for what in ACTIONS:
         refusal = driver.refusal(what)
         if refusal is not None and not refusal:
-            yield f"{what} is refused without a word"
+            yield f"{what} is refused without a reason"
         if refusal is None and not isinstance(what, SetMode | Find) and not driver.frames(what):
-            yield f"{what} is accepted, and has no frames"
+            yield f"{what} is accepted, but has no frames"
         if isinstance(what, SetMode) and (refusal is None) != (what.mode in driver.model.profile.modes):
-            yield f"{what} is {'accepted' if refusal is None else 'refused'}, unlike its profile says"
+            yield f"{what} is {'accepted' if refusal is None else 'refused'}, contrary to the profile"
 
 
 def check_capabilities(family: Family, platform: str) -> Iterator[str]:
-    """Check that what a profile says the car can do has frames."""
+    """Check that there are frames for each capability of `PARTS` that the profile lists."""
     driver = _connected(family, platform).control.driver
     for word, kind in PARTS.items():
         able = [what for what in ACTIONS if isinstance(what, kind) and driver.refusal(what) is None]
         if word in driver.model.profile.capabilities and not any(driver.frames(what) for what in able):
-            yield f"it has the capability {word}, and frames for none of its actions"
+            yield f"it has the capability {word}, but no frames for any of its actions"
 
 
 def check_loss(family: Family, platform: str) -> Iterator[str]:
-    """Check that a lost link ends what waits, and that a stop goes first when it is back."""
+    """Check that a lost link ends a waiting stop and all frames, and that a stop is written when the link is back."""
     bench = _connected(family, platform)
     yield from _check_dropped(family, bench)
     stop = bench.ask(Stop())
@@ -480,7 +486,7 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
         yield "frames are written without a link"
     last = bench.last(stop)
     if last is None or last.phase in (Phase.ASKED, Phase.QUEUED):
-        yield "a stop stays open when its link is lost"
+        yield "a stop still waits after its link was lost"
     if bench.control.driver.model.motors is Motors.OFF:
         yield "the motors count as off without a link"
     bench.control.link_up(bench.now)
@@ -490,7 +496,7 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
 
 
 def _check_dropped(family: Family, bench: Bench) -> Iterator[str]:
-    """Check that the bytes of an unfinished frame are forgotten with the link, and do not spoil the next frame."""
+    """Check that a lost link makes the driver forget the bytes of an unfinished frame, so that the next one is read."""
     driver = bench.control.driver
     samples: Sequence[bytes] = getattr(family, "SAMPLES", ())
     for sample in (*samples, b"x"):
@@ -506,16 +512,16 @@ def _check_dropped(family: Family, bench: Bench) -> Iterator[str]:
         if not any(
             driver.measured(event) for event in (*driver.feed(sample, bench.now), *driver.flush(bench.now + 10))
         ):
-            yield f"{sample!r} is not read after drop_bytes: it did not forget the unfinished frame"
+            yield f"{sample!r} is not read after drop_bytes, which did not forget the unfinished frame"
 
 
 def check_kept(family: Family, platform: str) -> Iterator[str]:
-    """Check that what is kept of a car is JSON, and that its next gateway takes it."""
+    """Check that the result of `kept` survives JSON, and that the driver of the next gateway accepts it."""
     kept = _connected(family, platform, getattr(family, "SAMPLES", ())).control.driver.kept()
     again = json.loads(json.dumps(kept))
     Controller("red", family.driver_of(platform, again))
     if again != kept:
-        yield f"kept() is not the same when it is read again from JSON: {kept!r}"
+        yield f"kept() changes when it is written as JSON and read again: {kept!r}"
 
 
 def check_end(family: Family, platform: str) -> Iterator[str]:
@@ -527,7 +533,7 @@ def check_end(family: Family, platform: str) -> Iterator[str]:
     if not bench.control.driver.finished:
         yield f"it has not ended {SHUTDOWN_S:g} s after it was told to"
     if not bench.stop_frames(ended_at):
-        yield "it ends without a stop of a car that has shown nothing"
+        yield "it ends without stopping the car, though the car has not shown that it stands still"
 
 
 CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
@@ -574,7 +580,7 @@ def _caught(faults: Iterator[str]) -> Iterator[str]:
     """Yield the faults, and an exception of the driver as one more."""
     try:
         yield from faults
-    except Exception as error:  # noqa: BLE001 - it is what the driver's author asked for
+    except Exception as error:  # noqa: BLE001 - an exception of the driver is a fault to report
         last = traceback.extract_tb(error.__traceback__)[-1]
         yield f"raises {type(error).__name__}: {error} ({last.filename}:{last.lineno}, in {last.name})"
 

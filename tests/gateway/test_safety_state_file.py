@@ -53,13 +53,13 @@ def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
     of_fleet = PersistedSafety(None, (everybody,), ("e0",), (pause,), ("p0",))
     assert simulated.load(NOW) == of_fleet
     words = f"the hold of mia and the e-stop of mia and the loan to bob belong to the car at {LINK}, not to the one at"
-    assert simulated.not_taken == f"{words} {OTHER}"
+    assert simulated.other_link_words == f"{words} {OTHER}"
     simulated.save(PersistedSafety(Hold("bob", NOW)))
     back = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     assert back.load(NOW) == PersistedSafety(Hold("mia", NOW - 5), (own,), loan=loan), "kept; the fleet's have ended"
-    assert back.not_taken.startswith("the hold of bob ")
-    assert OTHER in back.not_taken
-    assert back.not_taken.endswith(LINK)
+    assert back.other_link_words.startswith("the hold of bob ")
+    assert OTHER in back.other_link_words
+    assert back.other_link_words.endswith(LINK)
     back.save(PersistedSafety())
     assert SafetyStateFile(tmp_path, "fleet", "red", OTHER).load(NOW) == PersistedSafety(Hold("bob", NOW))
 
@@ -71,11 +71,11 @@ def test_links_of_a_car_are_bounded(tmp_path: Path) -> None:
         store.save(PersistedSafety(Hold("mia", NOW)))
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     assert store.load(NOW) == PersistedSafety()
-    assert f" {MAX_OTHER_LINKS - 1} more " in store.not_taken
+    assert f" {MAX_OTHER_LINKS - 1} more " in store.other_link_words
     assert len(json.loads(store.path.read_text())["others"]) == MAX_OTHER_LINKS
     SafetyStateFile(tmp_path / "new", "fleet", "red", LINK).save(PersistedSafety())
     again = SafetyStateFile(tmp_path / "new", "fleet", "red", OTHER)
-    assert (again.load(NOW), again.not_taken) == (PersistedSafety(), "")
+    assert (again.load(NOW), again.other_link_words) == (PersistedSafety(), "")
 
 
 def test_irrelevant_link_options_do_not_tell_cars_apart() -> None:

@@ -63,7 +63,7 @@ def test_hub_begins_again_after_panic() -> None:
             assert hub.wait(20.0) == 0
             assert hub.stderr is not None
             told = hub.stderr.read()
-            assert "begins again" in told
+            assert "restarts" in told
             assert "said by the second" in told, "its stderr is that of the first"
         finally:
             hub.kill()
