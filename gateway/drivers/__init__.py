@@ -1,8 +1,8 @@
 """The families of cars: finds the driver and the profile of a platform by its name in the fleet file.
 
-A family is a module with `PLATFORMS`, `profile_of` and `driver_of` (see `Family`). Ours are the rows of `BUILT_IN`.
-Others come with their own package, by the entry point group `zenoh_car_fleet.drivers`, whose value names the module
-(docs/how-to/write-a-driver.md). No family is imported before one of its cars is named.
+A family is a module with the names of `Family`, such as `PLATFORMS` and `driver_of`. Our own families are the rows of
+`BUILT_IN`. Other packages add families with the entry point group `zenoh_car_fleet.drivers`, whose value names the
+module (docs/how-to/write-a-driver.md). A family is only imported when one of its cars is named.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -33,16 +33,16 @@ class Family(Protocol):
     """A family of cars: a module with these names."""
 
     PLATFORMS: tuple[str, ...]
-    """The names that `platform:` of the fleet file may have, without options."""
+    """The names, without options, with which `platform:` in the fleet file selects this family."""
 
     def profile_of(self, name: str) -> CarProfile:
-        """Return what cars of a platform (with its options) can do. Raises ValueError for a wrong name."""
+        """Return the profile of a platform's name, which may have options. Raises ValueError for a wrong name."""
 
     def profiles(self) -> tuple[CarProfile, ...]:
-        """Return the profile of each platform that is known, with all parts that such a car may have."""
+        """Return the profile of each platform, with all parts that such a car may have."""
 
     def driver_of(self, name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
-        """Return the driver of a car. `kept` is what `Driver.kept` has returned, empty if nothing was kept."""
+        """Return a function that makes a car's driver. `kept`: the saved result of `Driver.kept`, or empty."""
 
 
 def check_platform(text: str) -> str:
@@ -50,29 +50,29 @@ def check_platform(text: str) -> str:
     name = normalize_name(text)
     try:
         if kind_of(name) in (AUTO, *Platform):
-            parse_option(name)  # without the import of its family, a gateway joins the bus 13 ms sooner
+            parse_option(name)  # this needs no import of the family, so a gateway joins the bus 13 ms sooner
         else:
             profile_of(name)
     except ValueError as error:
-        raise ValueError(f"{error} Leave it out to find out {', '.join(AUTO_PLATFORMS)}.") from None
+        raise ValueError(f"{error} Without it, a gateway recognizes {', '.join(AUTO_PLATFORMS)}.") from None
     return name
 
 
 def profile_of(name: str) -> CarProfile:
-    """Return what cars of this platform can do. Raises ValueError for a wrong name, and for `auto`."""
+    """Return the profile of this platform. Raises ValueError for a wrong name, and for `auto`."""
     name = normalize_name(name)
     return _family_of(kind_of(name)).profile_of(name)
 
 
 def profiles_of(name: str) -> tuple[CarProfile, ...]:
-    """Return what a car of this platform may be: one profile, or for `auto` each that can be found out."""
+    """Return the possible profiles of a car: one, or for `auto` those of all platforms that a gateway can recognize."""
     name = normalize_name(name)
     kind, plus, options = name.partition("+")
     return tuple(profile_of(f"{each}{plus}{options}") for each in (AUTO_PLATFORMS if kind == AUTO else (kind,)))
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
-    """Return the driver of a car of this platform, or of `auto`. Raises ValueError for a wrong name."""
+    """Return a function that makes the driver of a platform, or of `auto`. Raises ValueError for a wrong name."""
     name = normalize_name(name)
     kind = kind_of(name)
     return _family_of(AUTO_PLATFORMS[0] if kind == AUTO else kind).driver_of(name, kept)
@@ -120,7 +120,7 @@ def _find(kind: str) -> tuple[str, Family]:
     found = next(((name, family) for name, family in _families() if kind in family.PLATFORMS), None)
     if found is None:
         hint = did_you_mean(kind, platforms()) or f"There are {', '.join(platforms())}."
-        failed = "".join(f" The driver {name} is not there: {why}." for name, why in broken.items())
+        failed = "".join(f" The driver {name} is missing: {why}." for name, why in broken.items())
         raise ValueError(f'Unknown platform "{kind[:40]}". {hint}{failed}')
     return found
 
@@ -138,7 +138,7 @@ def _load(module: str) -> Family:
 
 @cache
 def _installed() -> tuple[tuple[str, Family], ...]:
-    # The metadata of all installed packages takes some 10 ms, and few cars need it.
+    # Import it only here: reading the metadata of all installed packages takes some 10 ms, and few cars need it.
     from importlib.metadata import entry_points
 
     found = []

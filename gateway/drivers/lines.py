@@ -1,15 +1,16 @@
-"""Splits the bytes of a car that sends lines. Pure, linear and bounded, for any bytes in any pieces."""
+"""Splits the bytes of a car that sends lines. Pure. Its work and memory are bounded, whatever bytes arrive."""
 
 from typing import Final
 
 MAX_LINE: Final = 1024
-"""Maximum bytes of a line, without its end. Longer ones come in pieces of this length."""
+"""Maximum bytes of a line, without its end. A longer line is returned in pieces of this length."""
 
 
 class LineSplitter:
-    """The lines of one connection, so that a new link never completes an old line.
+    """Splits the lines of one connection. Make a new one for a new link, which must not complete an old line.
 
-    end: what ends one. Any other than a line end stays a part of it, such as the `}` of an object.
+    `end` is the bytes that end a line. If it is not a line end but, for example, the `}` of an object, it stays a part
+    of the line.
     """
 
     def __init__(self, max_line: int = MAX_LINE, *, end: bytes = b"\n") -> None:
@@ -18,7 +19,7 @@ class LineSplitter:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that end in these bytes, without CR and LF. Empty ones are left out."""
+        """Return the lines that end in these bytes, without CR and LF. Leave out empty lines."""
         found: list[bytes] = []
         *whole, rest = data.split(self._end)
         for piece in whole:

@@ -1,16 +1,16 @@
-"""A driver to build on, for families of cars that need no theory of their own. Pure.
+"""The base class of simple drivers, for families of cars that need no theory of their own. Pure.
 
-Such a car takes a motion until it gets another one, or until its dead-man stops it. Its stop is one sequence of frames.
-It has no modes. A family says with class attributes and a few methods what its frames are, and what its readings show;
-everything that waits, repeats, fails and is recorded is here (docs/how-to/write-a-driver.md).
+Such a car continues a motion until it gets another one, or until its dead-man timer stops it. Its stop is one sequence
+of frames. It has no modes. A family defines its frames, and what its readings show, with class attributes and a few
+methods. Waiting, repeating, failing and recording are done here (docs/how-to/write-a-driver.md).
 
-*What is claimed.* A stop ends as `sent` when its frames are written and the time is over in which a car that got them
-has stopped. A family whose readings show more calls `show_rest`: then the stop ends as `shown`. If its cars could show
-a stop (`can_show`) and do not in time, the stop counts as not confirmed, and goes on.
+*Claims.* A stop ends as `sent` when its frames are written and the time has passed within which a car that received
+them has stopped. A family whose readings show more calls `show_rest`; then the stop ends as `shown`. If its cars could
+show a stop (`can_show`) but do not in time, the stop counts as not confirmed, and the driver continues to send it.
 
-*What makes a motion safe.* Where a car has a dead-man, a held motion is sent again well before that ends, so that a
-lost frame stops nobody, and a lost link stops the car. Where it has none, a stop that nothing shows is sent again every
-few seconds: its frames may have been lost.
+*Safe motions.* If a car has a dead-man timer, a held motion is sent again well before that time is over. So one lost
+frame does not stop the car, but a lost link does. If it has none, a stop that no reading shows is sent again every few
+seconds, because its frames may have been lost.
 """
 
 from abc import abstractmethod
@@ -65,7 +65,7 @@ SPEED_STEP: Final = 0.1
 _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
 
 
-# ---------------------------------------------------------------------- what a car can do, and what is claimed
+# ---------------------------------------------------------------------- the profile, and the claims
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +80,15 @@ class PlainProfile:
     lights: frozenset[Light] = frozenset()
     servos: frozenset[ServoAction] = frozenset()
     cells: int = 2
-    """Number of cells of its battery, by which its level is judged."""
+    """Number of cells of its battery. The level of the battery depends on it."""
     baud: int = 115200
     """Rate of its serial port."""
     dead_man_s: float | None = None
-    """The time after which it stops because no *motion* came. Then stops that nothing shows are not repeated. A car
-    that only watches its link (a heartbeat, a closed connection) drives on while the link lives: None."""
+    """Time after which it stops because no *motion* arrived; then stops that no reading shows are not repeated. None if
+    there is no such time. A car that only watches its link (a heartbeat, a closed connection) has none, because it
+    drives on while the link is alive."""
     not_observed: tuple[str, ...] = ()
-    """What was read or assumed and not seen on a car, for a person."""
+    """Facts that were read or assumed, but not seen on a car, as sentences."""
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})
     silent_modes: frozenset[Mode] = frozenset()
 
@@ -102,18 +103,18 @@ class PlainProfile:
         return bool(self.measures)
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return everything that such a car can measure in this mode."""
+        """Return the names of all readings that such a car can send in this mode."""
         return self.measures if mode in self.modes else frozenset()
 
     def why_lacking(self, capability: str) -> str | None:
-        """Return why the car lacks a capability, for a person."""
+        """Return a sentence on why the car lacks a capability. None if it has it, or if there is no such capability."""
         known = capability in self.capabilities or capability not in CAPABILITIES
         return None if known else f"{self.name} cars have no {capability}"
 
 
 @dataclass(slots=True)
 class PlainMode:
-    """The mode of a car that has one mode."""
+    """The claims about the mode of a car that has only one."""
 
     asked: Mode | None = Mode.MANUAL
     inferred: Mode | None = None
@@ -127,7 +128,7 @@ class PlainMode:
 
 @dataclass(slots=True)
 class PlainModel:
-    """What is claimed of a car. Times: s, monotonic."""
+    """The claims about a car. Times: s, monotonic."""
 
     name: str
     profile: CarProfile
@@ -140,13 +141,13 @@ class PlainModel:
     range_cm: float | None = None
     range_at: float = float("-inf")
     turned_at: float = float("-inf")
-    """When its wheels were last seen to turn, if they are measured."""
+    """When a reading last showed that its wheels turned. Stays -inf if wheels are not measured."""
     sent_motion: Motion = Motion.STOP
-    """The last motion written."""
+    """The motion whose frame was written last."""
     speed: float = 0.5
     """Share of full speed, 0..1."""
     heard_at: float | None = None
-    """When the last reading came."""
+    """When the last reading arrived."""
     link_since: float = float("-inf")
     shows: Shows = Shows.NO
     shows_words: str = "the readings of such a car do not show a stop"
@@ -161,7 +162,7 @@ class PlainModel:
 
     @property
     def at_rest(self) -> bool:
-        """True if the car stands after a stop."""
+        """True if the car stands still after a stop."""
         return self.trust.state is CarTrust.STOPPED
 
     @property
@@ -171,12 +172,12 @@ class PlainModel:
 
     @property
     def motors(self) -> Motors:
-        """What is claimed of the motors."""
+        """The claim about the motors."""
         return self.trust.motors
 
     @property
     def basis(self) -> Basis | None:
-        """What the claim that the motors are off rests on."""
+        """The evidence for the claim that the motors are off."""
         return self.trust.basis
 
     @property
@@ -195,11 +196,11 @@ class PlainModel:
         return self.shows, self.shows_words
 
     def unheard_s(self, now: float) -> float:
-        """Return for how long the car has sent no reading on this link."""
+        """Return how long the car has sent no reading on this link, s."""
         return now - max(self.link_since, self.link_since if self.heard_at is None else self.heard_at)
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words what shows that a drive moved the car since it began, or an empty text if no reading does."""
+        """Describe the reading since `since` that shows that a drive moved the car. Empty if none does."""
         if self.turned_at > since:
             return "its wheels turned"
         return "" if self.range_at < since else describe_way(range_cm, self.range_cm)
@@ -215,36 +216,36 @@ class PlainStop:
     why: FrameOrigin
     began_at: float
     next_at: float
-    """When its next frame is due, or its next try."""
+    """When its next frame, or its next try, is due."""
     commands: list[Pending]
     is_soft: bool
     index: int = 0
-    """Number of frames of this try that are written."""
+    """Number of this try's frames that are written."""
     last_at: float = float("-inf")
-    """When the last frame of the first whole try was written; -inf before."""
+    """When the first try's last frame was written; -inf before."""
     is_late: bool = False
-    """True if the car did not show it in time. The stop goes on."""
+    """True if the car did not show it in time. The driver continues to send it."""
 
 
 class PlainDriver(Driver):
-    """One car of a plain family. A family gives the class attributes and the abstract methods."""
+    """One car of a plain family, which sets the class attributes and defines the abstract methods."""
 
     STOP_FRAMES: ClassVar[int] = 1
-    """Number of frames of a stop. Each try sends all of them."""
+    """Number of frames of a stop. Each try of a stop sends all of them."""
     STOP_GAP_S: ClassVar[float] = 0.1
     """Time between two frames of a stop."""
     PART_GAP_S: ClassVar[float] = 0.25
     """Time between the frames of one action, such as a blink."""
     STOPS_WITHIN_S: ClassVar[float]
-    """Time after the last frame of a stop in which a car that got it has stopped."""
+    """Time after the last frame of a stop within which a car that received it has stopped."""
     RETRY_S: ClassVar[float] = 2.0
-    """Time from one try of a stop that the car could show to the next."""
+    """Time from the last frame of a try to the next try, while the stop is not over."""
     EVIDENCE_S: ClassVar[float] = 5.0
-    """Time after the last frame in which a car that can show its stop has shown it."""
+    """Time after the last frame within which a car that can show its stop shows it."""
     RESEND_S: ClassVar[float | None] = None
-    """Interval at which a held motion is sent again: well under the dead-man. None if it is sent only once."""
+    """Interval at which a held motion is sent again. It must be well under the dead-man time. None: send it once."""
     SILENCE_S: ClassVar[float | None] = None
-    """The longest normal silence, or None if silence says nothing."""
+    """The longest normal silence, or None if every silence is normal."""
 
     def __init__(self, desk: Desk, profile: CarProfile) -> None:
         super().__init__(desk)
@@ -261,20 +262,20 @@ class PlainDriver(Driver):
         self._ends_at = float("inf")
         self._not_stopped = ""
 
-    # ------------------------------------------------------------------ what a family says
+    # ------------------------------------------------------------------ for a family to define
 
     @abstractmethod
     def motion_frame(self, motion: Motion) -> bytes:
-        """Return the frame of each of the seven motions, at `self.model.speed`. `left` is a curve, `spin_left` none."""
+        """Return the frame of a motion at `self.model.speed`. LEFT is a curve, SPIN_LEFT turns on the spot."""
 
     def stop_frame(self, index: int) -> bytes:
-        """Return one frame of a stop, by its place. The last one is also sent alone, as a repetition of the stop."""
+        """Return the frame of a stop at this place. The last one is also sent alone, to repeat the stop."""
         del index
         return self.motion_frame(Motion.STOP)
 
     @abstractmethod
     def part_frames(self, what: Action) -> tuple[bytes | Later, ...] | None:
-        """Return the frames of an action on a part of the car (`Later` if it lasts). None if the car cannot do it."""
+        """Return the frames of an action on a part of the car; `Later` delays one. None if the car cannot do it."""
 
     @property
     def can_show(self) -> bool:
@@ -283,11 +284,11 @@ class PlainDriver(Driver):
 
     @property
     def hears(self) -> bool:
-        """Return False while the car cannot take frames, as in a boot: then no stop ends as `sent`."""
+        """Return False while the car cannot receive frames, as during its boot. Then no stop ends as `sent`."""
         return True
 
     def setup_frame(self, now: float) -> bytes | None:
-        """Return the next frame that prepares the car, asks it, or keeps its link alive, if one is due."""
+        """Return the next frame that sets the car up, queries it, or keeps its link alive, if one is due."""
         del now
         return None
 
@@ -296,20 +297,20 @@ class PlainDriver(Driver):
         return float("inf")
 
     def on_reading(self, event: Event, now: float) -> None:
-        """Take an event that is a reading: any but `Rejected`, `TextLine` and `Echo`. It counts as a sign of life."""
+        """Handle a reading: any event but `Rejected`, `TextLine` and `Echo`. It shows that the car is alive."""
 
     def on_stop_written(self, data: bytes, now: float) -> None:
-        """Note that a frame of a stop was written."""
+        """Handle that a frame of a stop was written."""
 
-    # ------------------------------------------------------------------ the seam
+    # ------------------------------------------------------------------ the interface of `Driver`
 
     @property
     def model(self) -> PlainModel:
-        """What is claimed of the car."""
+        """The claims about the car."""
         return self._model
 
     def verdict(self, event: Event) -> str:
-        """Return what kind of bytes these are."""
+        """Return the kind of an event's bytes."""
         match event:
             case Echo():
                 return FrameVerdict.ECHO
@@ -335,7 +336,7 @@ class PlainDriver(Driver):
     # ------------------------------------------------------------------ the link, and time
 
     def link_up(self, now: float) -> None:
-        """Stop the car: the link is open."""
+        """Begin to stop the car, because its link is open."""
         model = self._model
         model.link_open, model.link_since, model.heard_at = True, now, None
         self.senders.halt_streams(now)
@@ -343,7 +344,7 @@ class PlainDriver(Driver):
         self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail all commands: the link is down."""
+        """Fail all commands, because the link is down."""
         model = self._model
         model.link_open, model.link_reason, self._renew_at = False, reason, float("inf")
         self._learn(TrustEvent.LINK_LOST, now, reason)
@@ -374,13 +375,13 @@ class PlainDriver(Driver):
         self._begin_again(words, TrustEvent.SILENT, now)
 
     def _begin_again(self, words: str, event: TrustEvent, now: float) -> None:
-        """Drop what waits, and bring the car to a known state."""
+        """Drop all commands, and bring the car to a known state."""
         self.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self.senders.halt_streams(now)
         self._learn(event, now, words)
         if self._stop is None or self._stop.is_soft:
             self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
-        else:  # the frames of the running one may be lost
+        else:  # the frames of the running stop may be lost
             self.repeat_stop(now)
 
     def repeat_stop(self, now: float) -> None:
@@ -389,7 +390,7 @@ class PlainDriver(Driver):
             self._stop.index, self._stop.next_at, self._stop.last_at = 0, now, float("-inf")
 
     def recover(self, words: str, now: float) -> None:
-        """Bring the car to a known state: it does what nobody commanded."""
+        """Bring the car to a known state, because it does something that nobody commanded."""
         self._begin_again(words, TrustEvent.DOUBTED, now)
 
     # ------------------------------------------------------------------ frames out
@@ -453,7 +454,7 @@ class PlainDriver(Driver):
         if now < self._part_at or (pending := self.queue.next_part(now)) is None:
             return None
         data, held = pending.next_frame, self.queue.held
-        if isinstance(pending.command.what, ChangeSpeed):  # the motion at its arrival may be over
+        if isinstance(pending.command.what, ChangeSpeed):  # send the present motion: that at its arrival may be over
             is_driven = held is not None and held.pending.sent and self._stop is None
             data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
         return self._write(data, FrameOrigin.COMMAND, pending)
@@ -470,7 +471,7 @@ class PlainDriver(Driver):
         return OutgoingFrame(data, data, why, by)
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
-        """Update the state: the link has taken the frame."""
+        """Update the state, because the frame is written."""
         source, self._source = self._source, None
         match source:
             case PlainStop():
@@ -502,13 +503,13 @@ class PlainDriver(Driver):
         self.on_stop_written(data, now)
 
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
         if not self._model.link_open:
             return float("inf")
         times = [*self.queue.deadlines(), self.setup_at()]
         stop, held = self._stop, self.queue.held
         if stop is not None:
-            later = [self._ends_at]  # what is over by now was looked at by the last poll
+            later = [self._ends_at]  # the last poll has handled the times that are over by now
             if stop.index >= self.STOP_FRAMES:
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
             times += [stop.next_at, *(each for each in later if each > now)]
@@ -548,13 +549,13 @@ class PlainDriver(Driver):
                 return None
 
     def frames(self, what: Action) -> tuple[bytes | Later, ...]:
-        """Return the frames of an action on a part of the car. One that is not a frame still takes its turn."""
+        """Return the frames of an action on a part of the car. A change of speed has a placeholder."""
         if isinstance(what, ChangeSpeed):
-            return (self.motion_frame(Motion.STOP),)  # its place; what is written is the motion of that moment
+            return (self.motion_frame(Motion.STOP),)  # a placeholder: when its turn comes, the present motion is sent
         return self.part_frames(what) or ()
 
     def _apply(self, what: Action, now: float) -> None:
-        """Note the effect of a written action. Another speed counts at once for a car that drives."""
+        """Note the effect of a written action. Send the held motion again at once with a new speed."""
         if isinstance(what, ChangeSpeed):
             self._model.speed = min(1.0, max(SPEED_STEP, self._model.speed + _STEPS[what.step]))
             self._resend_at = now
@@ -567,7 +568,7 @@ class PlainDriver(Driver):
         return stop is None or (stop.is_soft and stop.index > 0) or now >= self._gives_way_at(stop)
 
     def _gives_way_at(self, stop: PlainStop) -> float:
-        """Return when a newer command may take the place of a stop: all frames are out, and the car has stopped."""
+        """Return when a newer command may replace a stop: its frames are all written, and the car has stopped."""
         return stop.last_at + self.STOPS_WITHIN_S if stop.last_at > float("-inf") else float("inf")
 
     def _has_new_motion(self, stop: PlainStop) -> bool:
@@ -576,7 +577,7 @@ class PlainDriver(Driver):
         return is_new and held is not None and (held.pending.received_at >= stop.began_at or stop.is_soft)
 
     def free_at(self, now: float) -> float:
-        """Return when the car can take a motion, as far as that is known."""
+        """Return when a motion can be sent to the car, as far as that is known."""
         stop = self._stop
         if stop is None or (stop.is_soft and stop.index > 0):
             return now
@@ -601,7 +602,7 @@ class PlainDriver(Driver):
 
     @property
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
+        """Return why the car was not stopped at the end of the gateway. Empty if it was stopped."""
         return self._not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
@@ -613,7 +614,7 @@ class PlainDriver(Driver):
         self._begin(FrameOrigin.STOP, now, [pending] if pending is not None else [], is_soft=True)
 
     def resume_motion(self, words: str, now: float) -> None:
-        """End the stop at the end of a drive: the car drives again."""
+        """End a stop that follows the end of a drive, because the car is driven again."""
         if self._stop is not None and self._stop.is_soft:
             self._give_way(self._stop, now, words)
 
@@ -629,7 +630,7 @@ class PlainDriver(Driver):
         if running is not None and (is_soft or not running.is_soft):
             running.commands.extend(commands)
             running.why = why if why is FrameOrigin.SHUTDOWN else running.why
-            if running.last_at > float("-inf") and commands:  # its frames are out: send them again for this command
+            if running.last_at > float("-inf") and commands:  # all its frames are written: repeat them for this command
                 running.index, running.next_at, running.last_at = 0, now, float("-inf")
                 running.began_at, running.is_late = now, False
             return
@@ -637,7 +638,7 @@ class PlainDriver(Driver):
         self._learn(TrustEvent.STOP_BEGUN, now, f"stop ({why})")
 
     def show_rest(self, words: str, now: float) -> None:
-        """End the running stop: the readings have shown that the car stands."""
+        """End the running stop, because the readings have shown that the car stands still."""
         if self._stop is not None and self._stop.last_at > float("-inf"):
             self._finish(self._stop, Basis.SHOWN, words, now)
         elif self._model.at_rest and not self._model.trust.shown:
@@ -657,7 +658,7 @@ class PlainDriver(Driver):
                 self._log.record(pending, phase, now, words=told, evidence=evidence, basis=basis)
 
     def _fail_late(self, stop: PlainStop, now: float) -> None:
-        """Fail the commands of a stop that the car could have shown. The stop goes on."""
+        """Fail the commands of a stop that the car could have shown. Continue the stop."""
         model = self._model
         stop.is_late = True
         words = f"NOT CONFIRMED: {model.name} has not shown the stop. Look at the car. The gateway keeps stopping it."
@@ -668,7 +669,7 @@ class PlainDriver(Driver):
         self._log.log(Level.ERROR, "not_shown", words, now)
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off if a stop is asked now and its frames arrive."""
+        """Return the longest time until the motors are off, if a stop is requested now and its frames arrive."""
         stop = self._stop
         if stop is not None and stop.last_at > float("-inf"):
             return max(0.0, self._gives_way_at(stop) - now)

@@ -1,11 +1,11 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
-`base` has the interfaces, `errors` what goes wrong. `serial`, `tcp` and `ble` implement them, two of them with the
-buffer of `buffered_link`; `ble_adapters` has the turns of several gateways at one adapter. `usb` finds the port of a
-USB device, `serial_ports` and `ble_devices` list what is there, `url` accepts a link from the command line. `baud`
-doubts the baud rate of bytes without a frame.
+`base` has the interfaces, `link_errors` the exceptions. `serial`, `tcp` and `ble` implement the interfaces; `tcp` and
+`ble` use the buffer of `buffered_link`. `ble_adapters` lets several gateways take turns at one Bluetooth adapter. `usb`
+finds the port of a USB device, `serial_ports` and `ble_devices` list ports and devices, `url` parses a link of the
+command line. `baud` finds out whether the baud rate may be wrong.
 
-A kind of link is a URL in `schemas.links`, and a module with its `KIND` here. The two meet by the scheme.
+A kind of link is a class of URLs in `schemas.links`, and a module with a `KIND` here that is named like its scheme.
 """
 
 from importlib import import_module
@@ -35,18 +35,18 @@ __all__ = [
 
 
 def kind_of(scheme: str) -> LinkKind[Any]:
-    """Return what opens and lists the links of this scheme. Raises ImportError if a module that it needs is missing.
+    """Return the kind of link with this scheme. Raises ImportError if a package that it needs is missing.
 
-    Its module is imported when it is needed, so a gateway starts faster.
+    Its module is imported only now, so that a gateway starts faster.
     """
     kind: LinkKind[Any] = import_module(f"gateway.link.{scheme}").KIND
     return kind
 
 
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
-    """Open the link within this time. The message of CannotOpen tells what is wrong and what to do.
+    """Open the link within this time. Raises CannotOpen, with a message that says what is wrong and what to do.
 
-    Connections through one Bluetooth adapter take turns. With `first`, the car may be moving, so it goes first.
+    Gateways connect one after the other through a Bluetooth adapter. `first`: this car may be moving, so it goes first.
     """
     kind = kind_of(url.scheme)
     return await kind.open(url, kind.open_timeout_s if timeout_s is None else timeout_s, first=first)

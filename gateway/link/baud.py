@@ -11,12 +11,12 @@ from typing import Final
 from schemas.links import LinkUrl
 
 MIN_BYTES: Final = 200
-"""Minimum bytes without a frame before a baud rate is doubted; a report of a car has 46."""
+"""Minimum bytes without a frame before the baud rate is doubted. A report of a car has 46."""
 _MIN_RUN_SHARE: Final = 0.5
-"""Minimum share of bytes with at most two runs of equal bits. In arbitrary bytes it is 0.06, in a report 0. If the
-port is four times as fast as the car or more, it is 0.69 to 1."""
+"""Share of bytes with at most two runs of equal bits from which on the baud rate counts as wrong. It is 0.06 in
+arbitrary bytes, 0 in a report, and 0.69 to 1 if the port is at least four times as fast as the car."""
 _MAX_TEXT_SHARE: Final = 0.8
-"""Maximum share of printable bytes: it is 1 at the right baud rate, and at most 0.56 at a wrong one."""
+"""Share of printable bytes above which the baud rate counts as right. It is 1 at the right rate, else at most 0.56."""
 _TEXT: Final = frozenset({*range(0x20, 0x7F), *b"\r\n\t"})
 _RUNS: Final = frozenset(
     byte for byte in range(256) if sum((byte >> bit & 1) != (byte >> (bit + 1) & 1) for bit in range(7)) <= 1
@@ -26,7 +26,7 @@ _RUNS: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class BaudDoubt:
-    """Why the baud rate may be wrong. `cause` is how it is counted, `wrong_baud` or `no_frames`."""
+    """Why the baud rate may be wrong. `cause` is the word under which it is counted: `wrong_baud` or `no_frames`."""
 
     cause: str
     words: str
@@ -38,10 +38,10 @@ class BaudWatch:
     def __init__(self, url: LinkUrl) -> None:
         self._url = url
         self._counts: dict[int, int] | None = {}
-        """How often each byte came. None after the first frame, or after the judgment."""
+        """How often each byte arrived. None after the first frame, or after a result."""
 
     def on_bytes(self, data: bytes) -> BaudDoubt | None:
-        """Count bytes. Return a doubt once if many bytes have no frame, else None."""
+        """Count bytes. If there are many without a frame, return a doubt, once. Else return None."""
         if self._counts is None:
             return None
         for byte in data:
@@ -56,7 +56,7 @@ class BaudWatch:
         return BaudDoubt("wrong_baud" if looks_so else "no_frames", self._words(total, looks_so=looks_so))
 
     def on_frame(self) -> None:
-        """Stop watching: the baud rate is right."""
+        """Stop watching, because a frame shows that the baud rate is right."""
         self._counts = None
 
     def _words(self, total: int, *, looks_so: bool) -> str:

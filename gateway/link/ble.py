@@ -1,8 +1,8 @@
 """A car's Bluetooth LE module through bleak: finds the device and its characteristics, and writes frames in pieces.
 
-The link is lost when the system reports a disconnect or when a write fails; the caller judges a silent car. bleak's
-`is_connected` is not used, as it stays true when the system's Bluetooth service dies.
-bleak's clean-up has no timeout, so its calls run in a task that is cancelled until it ends.
+The link is lost when the system reports a disconnect, or when a write fails. Whether a silent car is lost is for the
+caller to judge. bleak's `is_connected` is not used, because it stays true when the system's Bluetooth service dies.
+bleak's clean-up has no timeout, so its calls run in a task that is cancelled again and again until it ends.
 """
 
 import asyncio
@@ -34,20 +34,20 @@ T = TypeVar("T")
 _Devices = dict[str | None, BLEDevice]
 """One device as each adapter knows it. None stands for the system's choice of an adapter."""
 
-# A piece takes 11 ms (90 writes/s, measured). A frame that takes longer than this is too old to be a command.
+# A piece takes 11 ms (90 writes/s, measured). A frame that takes longer than the timeout is too old to be obeyed.
 BLE_WRITE_TIMEOUT_S: Final = 1.0
 """Timeout for a whole frame."""
-# BlueZ ends a connection 2 s after the request, so that pending data still goes out.
+# BlueZ ends a connection 2 s after the request, so that pending data can still be sent.
 DISCONNECT_TIMEOUT_S: Final = 4.0
 # All modules leave the factory with the same name.
 NAMESAKE_SCAN_S: Final = 2.0
-"""Time to scan for another device of the same name."""
+"""Time of the scan for another device with the same name."""
 OTHER_ADAPTERS_S: Final = 1.0
-"""Time to scan on for the other adapters that see the device, too."""
-# Connecting takes 1.1 s, and 4 s for the fourth car. A module that does not answer keeps the others waiting.
+"""Time for which the scan goes on after one adapter has found the device, as others may find it too."""
+# Connecting takes 1.1 s, for the fourth car 4 s. Other gateways wait meanwhile, also for a module that does not answer.
 CONNECT_TIMEOUT_S: Final = 10.0
 TURN_TIMEOUT_S: Final = 60.0
-"""Timeout for a turn and the connect, with eight cars before this one."""
+"""Timeout for waiting for the turn and connecting. It is long enough if eight cars are before this one."""
 _CANCEL_RETRY_S: Final = 0.5
 _MIN_PIECE: Final = 20  # at the minimum MTU of 23
 _MAX_LISTED: Final = 5
@@ -64,12 +64,12 @@ _NORDIC: Final = "6e40000{}-b5a3-f393-e0a9-e50e24dcca9e"
 _FFE: Final = (_uuid(0xFFE1), _uuid(0xFFE2), _uuid(0xFFE4), _uuid(0xFFE9))
 _UARTS: Final = (
     ((_uuid(0xFFE0), _uuid(0xFFE5)), _FFE, _FFE),
-    # Some clones can write to FFF1, too, and pass on only what was written to FFF2.
+    # Some clones accept writes to FFF1, too, but pass on only what was written to FFF2.
     ((_uuid(0xFFF0),), (_uuid(0xFFF1),), (_uuid(0xFFF2),)),
     ((_NORDIC.format(1),), (_NORDIC.format(3),), (_NORDIC.format(2),)),
 )
-"""docs/reference/protocol.md#framing: the services of a UART over BLE, and their characteristics in order of
-preference, from the car and to it."""
+"""The services of a UART over BLE; its characteristics from the car, in order of preference; and those to the car
+(docs/reference/protocol.md#framing)."""
 UART_SERVICES: Final = tuple(service for services, _, _ in _UARTS for service in services)
 
 
@@ -92,7 +92,7 @@ class BleLink(BufferedLink):
     # ------------------------------------------------------------------ opening
 
     async def open(self, timeout_s: float) -> None:
-        """Find the device, connect when it is this gateway's turn, and subscribe. Raises CannotOpen on a timeout."""
+        """Find the device, connect when it is this gateway's turn, and subscribe. Raises CannotOpen."""
         began = time.monotonic()
         try:
             found = await _within(timeout_s, self._search())
@@ -111,11 +111,11 @@ class BleLink(BufferedLink):
             ) from None
 
     async def _search(self) -> _Devices:
-        """Return the device as each adapter knows it; an empty result if the link is open already."""
+        """Return the device as each adapter knows it. Empty if an existing connection was taken over."""
         connections = await ble_adapters.list_connections()
         adapters = self._allowed(list(connections))
-        # A killed gateway leaves its module connected, and a scan does not find connected modules. It may be connected
-        # to another adapter than it is now allowed to.
+        # A killed gateway leaves its module connected, and a scan does not find connected modules. So look at the
+        # connected ones, on all adapters: the module may be connected to an adapter that is no longer allowed.
         connected = [(name, each) for name in connections or adapters for each in await _connected(name)]
         known = {each.address: {name: each} for name, each in connected if self._is_wanted(each.address, each.name)}
         if known and self._url.name is None:
@@ -127,7 +127,7 @@ class BleLink(BufferedLink):
         return {} if address in known and await self._take_over(known[address]) else found
 
     async def _take_over(self, devices: _Devices) -> bool:
-        """Use the connection that a killed gateway has left. Return False if there is none any more."""
+        """Use the connection that a killed gateway has left. Return False if it does not work any more."""
         ((adapter, device),) = devices.items()
         try:
             await self._use(device, adapter)
@@ -139,14 +139,14 @@ class BleLink(BufferedLink):
         return True
 
     def _allowed(self, adapters: list[str]) -> list[str | None]:
-        """Return the usable adapters by name. None means the system's choice. Raises CannotOpen if there is none."""
+        """Return the names of the allowed adapters. None stands for the system's choice. Raises CannotOpen."""
         wanted = self._url.adapter
         if sys.platform != "linux" and wanted not in (None, AUTO_ADAPTER):
             raise CannotOpen(f"{self._url}: this system has one Bluetooth adapter: leave adapter= out")
         if wanted not in (None, AUTO_ADAPTER) and adapters and wanted not in adapters:
             there = ", ".join(adapters)
             raise CannotOpen(f"{self._url}: no Bluetooth adapter {wanted} that is on. There are: {there}")
-        if not adapters:  # unknown: bleak will say why
+        if not adapters:  # the adapters are unknown, and bleak will report why
             return [None if wanted == AUTO_ADAPTER else wanted]
         if wanted == AUTO_ADAPTER:
             return [*adapters]
@@ -156,7 +156,7 @@ class BleLink(BufferedLink):
         return address.upper() == self._url.address if self._url.name is None else self._url.name in names
 
     async def _find(self, known: Mapping[str, _Devices], adapters: Sequence[str | None]) -> _Devices:
-        """Scan until the device advertises; by name, until it is likely the only one. No timeout of its own."""
+        """Scan until the device advertises. If only its name is known, scan on for others of that name. No timeout."""
         loop = asyncio.get_running_loop()
         found, others = {address: dict(devices) for address, devices in known.items()}, dict[str, str]()
         self._stage = _not_found(self._url, others)
@@ -215,14 +215,15 @@ class BleLink(BufferedLink):
                 turn.release()
 
     async def _take_turn(self, turns: dict[str | None, Turn]) -> str | None:
-        """Wait for the turn at one of the adapters; without room at all but one, take that one. Return its name."""
+        """Wait for the turn at an adapter with room, or at the last one that is left. Return its name."""
         self._stage = "other gateways connect through this adapter, and it was not this one's turn"
         connections = await ble_adapters.list_connections()
         while True:
             for adapter in sorted(turns, key=lambda each: connections.get(each or "", 0)):
                 if not turns[adapter].try_take():
                     continue
-                # Nobody else connects now, so the number does not grow. The last adapter may hold more than most do.
+                # Nobody else connects now, so the number does not grow. The last adapter is tried even if it has
+                # ADAPTER_CONNECTIONS, because some can hold more.
                 connections = await ble_adapters.list_connections()
                 if connections.get(adapter or "", 0) >= ADAPTER_CONNECTIONS and await self._free(adapter):
                     connections = await ble_adapters.list_connections()
@@ -242,18 +243,18 @@ class BleLink(BufferedLink):
         )
         try:
             await client.connect()
-            self._client = client  # not earlier: a failed connect cleans up by itself
+            self._client = client  # set it only now, as bleak cleans up after a failed connect
             await self._subscribe(client, device.address)
         except CannotOpen:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, it is not open
+        except Exception as error:  # noqa: BLE001 - a system's Bluetooth stack may raise anything
             raise CannotOpen(f"{self._url}: no connection, {_cause(error)}") from None
         if adapter is not None:
             self._note = ConnectionNote(adapter, device.address)
             self._note.write()
 
     async def _free(self, adapter: str | None) -> bool:
-        """End the connections of killed gateways, which the system keeps. Return True if there were any."""
+        """End the connections that killed gateways have left. Return True if there were any."""
         freed = False
         for note in () if adapter is None else ConnectionNote.all_of(adapter):
             try:
@@ -282,7 +283,7 @@ class BleLink(BufferedLink):
     async def write(self, data: bytes) -> None:
         """Send the frame in pieces, with nothing between them. After LinkLost, some pieces may have been sent.
 
-        A truncated frame ends the link: the car would read the next frame as the rest of it.
+        A truncated frame ends the link, because the car would read the next frame as the rest of this one.
         """
         async with self._writing:
             if self._lost is not None:
@@ -296,7 +297,7 @@ class BleLink(BufferedLink):
                     await asyncio.wait({pieces})
             if not pieces.cancelled() and (error := pieces.exception()) is not None:
                 self._lose(f"{self._url} is gone: {_cause(error)}")
-            if self._lost is not None:  # even if the frame was sent: `read` has reported the loss
+            if self._lost is not None:  # raise even if the frame was sent, because `read` has reported the loss
                 raise LinkLost(self._lost)
 
     async def _write_pieces(self, data: bytes) -> None:
@@ -308,7 +309,7 @@ class BleLink(BufferedLink):
             await self._client.write_gatt_char(self._to_car, data[start : start + size], response)
 
     async def close(self) -> None:
-        """End the connection and wait for that. If it does not end in time, leave it to the system."""
+        """Close the connection, and wait until it is closed. If that takes too long, leave it to the system."""
         self._lose(f"{self._url} was closed")
         if self._closing is None:
             self._closing = asyncio.ensure_future(self._close())
@@ -324,7 +325,7 @@ class BleLink(BufferedLink):
     async def _disconnect(self) -> None:
         client, self._client = self._client, None
         if client is not None:
-            with contextlib.suppress(Exception):  # nobody could do anything about it
+            with contextlib.suppress(Exception):  # nothing can be done about an error here
                 await _within(DISCONNECT_TIMEOUT_S, client.disconnect())
 
     def _lose(self, reason: str) -> LinkLost:
@@ -345,19 +346,19 @@ class BleLink(BufferedLink):
                 self._lose(f"{self._url} sends faster than the gateway reads: {MAX_BUFFERED_BYTES} bytes wait")
 
     def _on_disconnected(self, client: BleakClient) -> None:
-        if client is self._client:  # not a client that we have disconnected
+        if client is self._client:  # else it is a client that we have disconnected
             self._lose(f"{self._url} is gone: the Bluetooth connection ended")
 
 
 class BleKind(LinkKind[BleUrl]):
     """Bluetooth LE."""
 
-    # A module advertises about once a second, and a scan often misses the first one. The fourth car needs 4 s to
-    # connect.
+    # A module advertises about once a second, and a scan often misses the first advertisement. The fourth car needs 4 s
+    # to connect.
     open_timeout_s = 20.0
 
     async def open(self, url: BleUrl, timeout_s: float, *, first: bool) -> Link:
-        """Find a module and connect to it, or raise CannotOpen. With `first`, do so before other gateways."""
+        """Find a module and connect to it, or raise CannotOpen. With `first`, go before other gateways."""
         link = BleLink(url, first=first)
         await link.open(timeout_s)
         return link
@@ -387,7 +388,7 @@ def choose(
 def _preferred(
     found: Iterable[BleakGATTCharacteristic], properties: frozenset[str], order: Sequence[str]
 ) -> BleakGATTCharacteristic | None:
-    """Return the first in the order that has one of the properties. None if there is none."""
+    """Return the most preferred characteristic that has one of the properties. None if none has."""
     fit = [each for each in found if not properties.isdisjoint(each.properties)]
     return min(fit, key=lambda each: order.index(each.uuid) if each.uuid in order else len(order), default=None)
 
@@ -415,7 +416,7 @@ def _scanner(
 
 
 async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
-    """Return the result of the work. Raises TimeoutError on time, even if the work resists cancellation."""
+    """Return the result of the work. After `seconds`, cancel it until it ends, and raise TimeoutError."""
     task = asyncio.ensure_future(work)
     try:
         await asyncio.wait({task}, timeout=seconds)
@@ -432,8 +433,8 @@ async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
 
 def _claim(url: BleUrl, address: str) -> socket.socket | None:
     """Claim the device for this program. Raises Busy if another program has it. Returns None if not on Linux."""
-    # The system shares a connection between programs without an error. An abstract socket is a lock that disappears
-    # with its process, however that ends.
+    # The system lets several programs share a connection without an error, so use a lock. An abstract socket is a lock
+    # that disappears with its process, even if the process is killed.
     if sys.platform != "linux":
         return None
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -456,7 +457,7 @@ def _not_found(url: BleUrl, others: Mapping[str, str]) -> str:
 
 
 def _listed(items: Iterable[str]) -> str:
-    """Return the items as one line. A device chooses its own name: replace what cannot be printed."""
+    """Return the items as one line. Replace unprintable characters, because a device may choose any name."""
     every = list(items)
     more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""
     return printable(", ".join(every[:_MAX_LISTED]), "?") + more

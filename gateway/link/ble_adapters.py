@@ -1,10 +1,10 @@
-"""The Bluetooth adapters of this computer: who connects through one next, and how many connections it has.
+"""The Bluetooth adapters of this computer: which gateway connects through one next, and how many connections it has.
 
-An adapter makes one connection at a time. BlueZ refuses a second one meanwhile (InProgress), which met 40 % of the
-connects of several gateways. So the gateways of one user take turns: each adapter has a lock, a file in the state
-directory, which ends with its holder. A car that may be moving goes first: its gateway waits in a lane of its own, a
-second lock, and the others do not even try while that one is taken. Only connecting takes a turn. A stop is a write on
-an open link, and never waits.
+An adapter can make only one connection at a time. BlueZ refuses a second attempt meanwhile (InProgress): without turns,
+40 % of the attempts of several gateways failed that way. So the gateways of one user take turns: each adapter has a
+lock, a file in the state directory, which is released when its holder ends. A car that may be moving goes first: its
+gateway takes a second lock, its lane, and while that is taken, the other gateways do not even try. Only connecting
+needs a turn. A stop is a write on an open link, and never waits.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ _BLUEZ: Final = "org.bluez"
 
 
 class Turn:
-    """The turn of one gateway to connect through one adapter. With `first`, the car may be moving."""
+    """The turn of one gateway to connect through one adapter. `first`: its car may be moving."""
 
     def __init__(self, adapter: str, *, first: bool, directory: Path | None = None) -> None:
         self._first = first
@@ -36,21 +36,21 @@ class Turn:
         self._lane = FileLock(_directory(directory) / f"{adapter}.first.lock")
 
     def try_take(self) -> bool:
-        """Take the turn if it is this gateway's. Return True if it has it now."""
-        # Of several first ones, one holds the lane for all. An ordinary one takes it only for a moment.
+        """Take the turn if it is free. Return True if this gateway has it now."""
+        # If several cars may be moving, one of their gateways holds the lane for all. Others take it for a moment only.
         try:
             is_free = self._lane.try_take()
             if not (is_free or self._first):
                 return False
             taken = self._turn.try_take()
-        except OSError:  # no place for a lock: better to connect without a turn than never
+        except OSError:  # a lock file cannot be made: it is better to connect without a turn than never
             return True
         if taken or not self._first:
             self._lane.release()
         return taken
 
     def release(self) -> None:
-        """Let the next one connect, and leave the lane."""
+        """Let the next gateway connect, and leave the lane."""
         self._turn.release()
         self._lane.release()
 
@@ -58,7 +58,7 @@ class Turn:
 class ConnectionNote:
     """A file that says which device a gateway has connected through which adapter.
 
-    The system keeps the connection of a gateway that was killed, and nobody else knows whose it is.
+    If a gateway is killed, the system keeps its connection. Only this file shows that it belonged to a gateway.
     """
 
     def __init__(self, adapter: str, address: str, directory: Path | None = None) -> None:
@@ -72,7 +72,7 @@ class ConnectionNote:
         return [cls(adapter, path.name.split(".")[1].replace("_", ":"), directory) for path in found]
 
     def write(self) -> None:
-        """Write the file, if there is a place for it."""
+        """Write the file, if that is possible."""
         with contextlib.suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.touch()
@@ -83,7 +83,7 @@ class ConnectionNote:
             self._path.unlink()
 
     async def disconnect(self) -> None:
-        """End the connection, whose gateway has ended."""
+        """End the connection of a gateway that has ended."""
         await disconnect(self.adapter, self.address)
         self.remove()
 
@@ -97,7 +97,7 @@ async def list_connections() -> dict[str, int]:
     if sys.platform != "linux":
         return {}
     found: dict[str, Any] = {}
-    with contextlib.suppress(Exception):  # whatever D-Bus raises: bleak says it better
+    with contextlib.suppress(Exception):  # whatever D-Bus raises, because bleak reports the fault better
         async with asyncio.timeout(LIST_TIMEOUT_S):
             found = await _managed_objects()
     adapters = {path for path, each in found.items() if _value(each, "Adapter1", "Powered") is True}
@@ -107,7 +107,7 @@ async def list_connections() -> dict[str, int]:
 
 
 async def disconnect(adapter: str, address: str) -> None:
-    """End the connection of an adapter to a device; errors mean that there is none."""
+    """End the connection of an adapter to a device. Ignore errors, as they mean that there is no connection."""
     if sys.platform != "linux":
         return
     path = f"/org/bluez/{adapter}/dev_{address.upper().replace(':', '_')}"

@@ -24,7 +24,7 @@ BLE_START_TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class BleDevice(Device):
-    """An advertising Bluetooth LE device. `uart` is its UART service, which cars' modules have."""
+    """An advertising Bluetooth LE device. `uart` is its UART service, as modules of cars have one."""
 
     address: str
     url: str
@@ -34,30 +34,30 @@ class BleDevice(Device):
     uart: str | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return what is known of it."""
+        """Return the known facts."""
         return asdict(self)
 
     @property
     def heading(self) -> tuple[str, str]:
-        """Its address, name and strength."""
+        """Its address, name and signal strength."""
         return self.address, f"{printable(self.name) or 'no name'}, {self.rssi} dBm"
 
     @property
     def likely(self) -> str:
-        """The service of a UART, if it has one."""
+        """A text with its UART service. Empty if it has none."""
         return "" if self.uart is None else f"it has the Bluetooth service {self.uart}"
 
 
 async def _discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
     """Return the devices that advertise within this time to any adapter, by address. Raises whatever bleak raises."""
-    # With several adapters bleak chooses any of them, and a car may be in the range of one only.
+    # If there are several adapters, bleak would use any one of them, but a car may be in range of only one.
     options: list[BlueZScannerArgs] = [{"adapter": name} for name in await ble_adapters.list_connections()]
     scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
     return {address: each for scan in await asyncio.gather(*scans) for address, each in scan.items()}
 
 
 async def list_devices(seconds: float, uarts: Sequence[str]) -> list[BleDevice]:
-    """Return the devices that advertise within this time: first those with one of these services. Or CannotList."""
+    """Return the devices that advertise within this time, first those with one of these services. Raises CannotList."""
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await _discover(seconds)

@@ -1,6 +1,6 @@
-"""The links whose callbacks buffer bytes: TCP and Bluetooth."""
+"""The base class of links whose callbacks buffer bytes: TCP and Bluetooth."""
 
-# Not in `base`, which `gateway run` imports before it is on the bus: the import of asyncio takes long.
+# This is not in `base`, because `gateway run` imports `base` before it is on the bus, and importing asyncio takes long.
 import asyncio
 from typing import Final
 
@@ -9,7 +9,7 @@ from gateway.link.link_errors import LinkLost
 
 # Over a minute of a car's 960 bytes/s.
 MAX_BUFFERED_BYTES: Final = 64 * 1024
-"""Maximum of unread bytes. Above it, TCP stops reading the socket; Bluetooth, without flow control, ends the link."""
+"""Maximum unread bytes. Beyond it, TCP stops reading the socket. Bluetooth has no flow control, and ends the link."""
 
 
 class BufferedLink(Link):

@@ -1,4 +1,4 @@
-"""What goes wrong with a link. Each message is one line for a person: what, where, what to do."""
+"""The exceptions of links. Each message is one line for a person: what, where, what to do."""
 
 
 class LinkError(Exception):
@@ -6,7 +6,7 @@ class LinkError(Exception):
 
 
 class BadUrl(LinkError):
-    """A URL that is not a link: wrong use."""
+    """The URL is not that of a link. This is wrong use."""
 
 
 class CannotOpen(LinkError):

@@ -1,8 +1,8 @@
 """A serial port through pyserial. One thread finds, opens and closes the port, because these calls can block.
 
-The event loop reads and writes. On Windows it cannot watch a port, so there the thread reads as well.
-A write never waits. A port can buffer far more than one frame. So if a port does not accept a whole frame at once, it
-is stuck, and the link counts as lost.
+The event loop reads and writes. On Windows it cannot watch a port, so the thread reads as well.
+A write never waits. A port can buffer far more than one frame. So a port that does not accept a whole frame at once is
+stuck, and the link counts as lost.
 Every use of the descriptor needs `_lock`, because the thread may close a dead port at any moment. Another car's port
 may get the same descriptor number a moment later.
 """
@@ -29,7 +29,7 @@ from schemas.process.usb_bus import explain_missing_port
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
 """Timeout of pyserial's own write, used on Windows only."""
 MAX_BUFFERED_CHUNKS: Final = 256
-"""Maximum number of buffered chunks. With so many of them, the link stops reading the port."""
+"""Maximum number of buffered chunks. At this number, the link stops reading the port."""
 READ_BYTES: Final = 4096
 CAN_WATCH: Final = os.name == "posix"
 """True if the event loop can watch the port."""
@@ -52,8 +52,8 @@ _RFCOMM_FAR: Final = frozenset(
     {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ETIMEDOUT, errno.EIO, getattr(errno, "EHOSTDOWN", errno.EIO)}
 )
 """Errors when opening the port of a Bluetooth Classic module that is off, out of range or not paired."""
-# A second reader causes at most one empty read for each byte, so at most 500 within the time. A port that is broken
-# returns empty reads without end.
+# A second reader causes at most one empty read for each byte, so at most 500 within the time. A broken port returns
+# empty reads without end.
 _MAX_EMPTY_READS: Final = 2000
 """Number of empty reads within _EMPTY_READS_S after which the port counts as gone."""
 _EMPTY_READS_S: Final = 0.5
@@ -61,7 +61,7 @@ _EMPTY_READS_S: Final = 0.5
 
 _opening: Final[set[str]] = set()
 """URLs whose port a thread is opening now."""
-# After a replug, the same path may lead to another car, which would then get this car's commands.
+# After a replug, the same path may lead to another car. It must not get this car's commands.
 _first_device: Final[dict[str, UsbSerialPort]] = {}
 """The device that was opened first for each URL."""
 # The system does not list pseudo terminals, and `gateway run` starts faster if it does not list the ports.
@@ -90,8 +90,8 @@ class SerialLink(Link):
         self._empty_since = 0.0
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
-        # A daemon thread, because opening or closing a port can block (on a Bluetooth tty). That must not keep the
-        # process from ending.
+        # It is a daemon thread, because opening or closing a port can block (on a Bluetooth tty), and that must not
+        # keep the process from ending.
         self._thread = threading.Thread(target=self._run, name=f"read {url}", daemon=True)
 
     async def open(self, timeout_s: float) -> None:
@@ -110,7 +110,7 @@ class SerialLink(Link):
 
     @property
     def trouble(self) -> str:
-        """The text that another program uses the port, and which program. Empty if none was found."""
+        """A text that says which other program uses the port. Empty if none was found."""
         return self._trouble
 
     def look_for_trouble(self) -> None:
@@ -135,7 +135,7 @@ class SerialLink(Link):
         return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
     async def write(self, data: bytes) -> None:
-        """Write these bytes. Raises LinkLost if the port does not accept all of them: some may have been sent."""
+        """Write these bytes. Raises LinkLost if the port does not accept all of them. Some may have been sent then."""
         if self._lost is not None:
             raise LinkLost(self._lost)
         try:
@@ -194,7 +194,7 @@ class SerialLink(Link):
                 descriptor = self._port.fileno()
                 data = os.read(descriptor, READ_BYTES)
                 if not data:
-                    # Fails with EIO if the port is unplugged. If it succeeds, another program has read the bytes.
+                    # This fails with EIO if the port is unplugged. If it succeeds, another program has read the bytes.
                     termios.tcgetattr(descriptor)
                 self._paused = len(self._chunks) >= MAX_BUFFERED_CHUNKS
                 if self._paused:
@@ -211,7 +211,7 @@ class SerialLink(Link):
             self._on_empty_read()
 
     def _on_empty_read(self) -> None:
-        """Find out which program has read the bytes. The link stays open, because a stop still reaches the car."""
+        """Find out which program has read the bytes. Keep the link open, because a stop still reaches the car."""
         now = self._loop.time()
         if now - self._empty_since > _EMPTY_READS_S:
             self._empty_reads, self._empty_since = 0, now
@@ -250,7 +250,7 @@ class SerialLink(Link):
             port = error
         except Exception as error:  # noqa: BLE001 - whatever a driver raises, the thread must report it
             port = CannotOpen(f"{self._url}: the port cannot be opened ({_cause(error)})")
-        _opening.discard(str(self._url))  # before the report: its receiver may retry at once
+        _opening.discard(str(self._url))  # before the failure is reported, because the caller may retry at once
         if isinstance(port, CannotOpen):
             self._call_on_loop(self._on_open_failed, port)
             return
@@ -274,7 +274,8 @@ class SerialLink(Link):
             with self._lock:
                 self._port = None
             if self._stuck:
-                # Unsent bytes must not reach the car later. Closing would also wait for them, 30 s on a UART.
+                # Discard unsent bytes, which must not reach the car later. Closing would also wait for them, 30 s on a
+                # UART.
                 with contextlib.suppress(*_GONE):
                     port.reset_output_buffer()
             with contextlib.suppress(*_GONE):
@@ -315,7 +316,7 @@ class SerialLink(Link):
     def _on_open_failed(self, error: CannotOpen) -> None:
         if not self._opened.done():
             self._opened.set_exception(error)
-            self._opened.exception()  # counts as retrieved, in case `open` has timed out meanwhile
+            self._opened.exception()  # mark it as retrieved, because `open` may have timed out meanwhile
 
     def _on_opened(self) -> None:
         if not self._opened.done():
@@ -356,7 +357,8 @@ KIND: Final = SerialKind()
 
 def _write_now(port: serial.Serial, data: bytes) -> int:
     """Write as much as the port accepts at once. Return the number of bytes."""
-    # Not with pyserial's write: on a full port, it spins for ever without a write_timeout, or blocks the loop with one.
+    # Do not use pyserial's write: on a full port, it spins for ever without a write_timeout, and with one it blocks the
+    # loop.
     if os.name != "posix":
         return port.write(data) or 0
     try:
@@ -366,7 +368,7 @@ def _write_now(port: serial.Serial, data: bytes) -> int:
 
 
 def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
-    """Return one line for a person: why the port at this path does not open, and what to do."""
+    """Return one line for a person that says why the port at this path does not open, and what to do."""
     code = _code(error)
     which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
     if code in _RFCOMM_FAR and _is_rfcomm(path):
@@ -398,7 +400,7 @@ def _find_holder(path: str) -> str:
         holder = port_lock.find_holder(os.stat(path))  # noqa: PTH116 - a device path
     except (OSError, ValueError):
         holder = None
-    # A terminal program locks a port in another way (TIOCEXCL, or a lock file), which `find_holder` does not see.
+    # A terminal program locks a port in another way (TIOCEXCL, or a lock file), which `find_holder` cannot find.
     return holder or ", ".join(port_lock.find_users(path)) or "another program"
 
 

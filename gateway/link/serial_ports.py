@@ -1,4 +1,4 @@
-"""Lists the serial ports of this computer, each with the URL that stays the same. Opens nothing."""
+"""Lists the serial ports of this computer, each with the URL that stays the same after a replug. Opens nothing."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -34,7 +34,7 @@ def serial_ports() -> list[SerialPort]:
 
 
 def by_id(directory: Path) -> dict[str, str]:
-    """Return by device the name that stays the same after a replug (Linux)."""
+    """Return the names that stay the same after a replug, by device (Linux)."""
     try:
         return {str(name.resolve()): str(name) for name in sorted(directory.iterdir())}
     except OSError:

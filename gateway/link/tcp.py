@@ -1,4 +1,4 @@
-"""A TCP connection to a car or a bridge. Each frame is one write; the link never merges two frames into a segment."""
+"""A TCP connection to a car or a bridge. Each frame is one write. The link never puts two frames into one segment."""
 
 import asyncio
 import contextlib
@@ -19,9 +19,10 @@ from schemas.links import TcpUrl
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
 SAID_WITHIN_S: Final = 3.0
-"""Time in which a bridge that has another client says so, and closes. Later bytes are those of a car."""
+"""Time within which a bridge that already has a client sends a text about that, and closes the connection. Bytes of a
+connection that lasts longer are those of a car."""
 MAX_SAID_BYTES: Final = 120
-"""Maximum bytes of what the other end said before it closed that an error shows."""
+"""Maximum bytes of such a text that an error message quotes."""
 
 _Addresses = list[tuple[int, Any]]
 """(family, socket address), as from getaddrinfo."""
@@ -38,7 +39,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._transport: asyncio.Transport | None = None
         self._ended = asyncio.Event()
         self._first = b""
-        """The first received bytes. A bridge that is in use says so, and closes."""
+        """The first received bytes. They may be the text of a bridge that is in use."""
         self._paused = False
         self._made_at = 0.0
 
@@ -58,18 +59,18 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         if transport is None or self._lost is not None:
             raise LinkLost(self._lost or f"{self._url} is closed")
         if transport.get_write_buffer_size():
-            # The buffered frame would go out together with this one, and a car obeys only the first in a segment.
+            # The buffered frame would be sent together with this one, and a car obeys only the first one in a segment.
             self._lost = f"{self._url} accepts no bytes: the car or its bridge has stopped reading"
             self._came.set()
             transport.abort()
             raise LinkLost(self._lost)
         transport.write(data)
-        if transport.is_closing():  # after a reset, asyncio does not raise but calls connection_lost
+        if transport.is_closing():  # after a reset, asyncio calls connection_lost instead of raising
             await self._ended.wait()
             raise LinkLost(self._lost)
 
     async def close(self) -> None:
-        """Close the connection; cut it if it is not closed after a second."""
+        """Close the connection. If it is not closed after a second, cut it."""
         transport = self._transport
         if transport is None:
             return
@@ -90,7 +91,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._transport = transport
         self._made_at = time.monotonic()
         peer: socket.socket = transport.get_extra_info("socket")
-        # macOS refuses on a connection that is already reset; connection_lost follows.
+        # macOS refuses the options if the connection is already reset. Then connection_lost follows.
         with contextlib.suppress(OSError):
             peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -110,9 +111,9 @@ class TcpLink(asyncio.Protocol, BufferedLink):
             self._transport.pause_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Store the reason."""
+        """Store why the connection ended."""
         why = "the car closed it" if exc is None else _cause(exc)
-        # A car serves one client and rejects the next. A bridge often says why before it closes (ser2net does).
+        # A car serves one client and rejects the next. A bridge, such as ser2net, often says why before it closes.
         is_early = time.monotonic() - self._made_at < SAID_WITHIN_S
         said = _sentence(self._first) if is_early else ""
         if (said or not self._first) and (exc is None or isinstance(exc, ConnectionResetError)):
@@ -160,12 +161,12 @@ KIND: Final = TcpKind()
 
 async def _look_up(url: TcpUrl) -> _Addresses:
     """Return the addresses of the host. Raises the errors of getaddrinfo."""
-    # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. Run it in a daemon thread,
-    # as the process would wait for the loop's own threads. All attempts share one lookup.
+    # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. So run it in a daemon
+    # thread: the process would wait for the loop's own threads before it ends. All attempts share one lookup.
     found = _lookups.get(url)
     if found is None or found.done():
         found = Future()
-        found.set_running_or_notify_cancel()  # a cancelled waiter must not cancel it
+        found.set_running_or_notify_cancel()  # now a waiter that is cancelled does not cancel the lookup
         threading.Thread(target=_resolve, args=(url, found), name=f"look up {url}", daemon=True).start()
         _lookups[url] = found
     return await asyncio.wrap_future(found)

@@ -10,7 +10,7 @@ def parse_url(text: str) -> LinkUrl:
         url = parse_link(text)
     except BadLink as error:
         raise BadUrl(f"link {text[:80]!r}: {error}") from None
-    # Refused here, so that no gateway starts for a link that it can never open.
+    # Refuse it here, so that no gateway starts for a link that it can never open.
     if missing := url.missing():
         raise BadUrl(f"link {text!r} {missing}")
     return url

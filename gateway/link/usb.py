@@ -1,4 +1,4 @@
-"""Finds the serial port of a USB device, which may change each time it is plugged in. Opens nothing."""
+"""Finds the serial port of a USB device. The port may change each time the device is plugged in. Opens nothing."""
 
 import os
 import time
@@ -39,7 +39,7 @@ class UsbSerialPort:
 
 
 def list_usb_ports() -> list[UsbSerialPort]:
-    """Return the USB serial ports of this computer. Slow on some systems. Raises CannotOpen if they are not listed."""
+    """Return the USB serial ports of this computer (slow on some systems). Raises CannotOpen if it lists none."""
     return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in list_ports()]
 
 
@@ -67,7 +67,7 @@ def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
         return fit[0]
     if fit:
         raise CannotOpen(
-            f"{url}: {len(fit)} devices fit, {_named(fit)}: add a serial= that only one has, or give its device path"
+            f"{url}: {len(fit)} devices fit, {_named(fit)}: add the serial= of one of them, or give a device path"
         )
     if url.fits(*CH340, None) and (missing := explain_missing_port()):
         raise CannotOpen(f"{url}: no such serial port. {missing}")
@@ -92,7 +92,7 @@ def check_same_device(
         return
     if now is None and not os.path.exists(path):  # noqa: PTH110 - a device path, not a file to work with
         return  # opening it raises the error
-    found = f"{path}, of which the system says nothing" if now is None else _named([now])
+    found = f"{path}, about which the system says nothing" if now is None else _named([now])
     raise CannotOpen(
         f"{url}: another device is there, {found}; it was {_named([first])}: plug that in again, or restart this "
         "program if it is the right one"

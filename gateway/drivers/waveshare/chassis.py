@@ -9,7 +9,7 @@ from schemas.words import Light
 
 
 class UgvFirmware(StrEnum):
-    """The two programs of these cars. They share the commands, and differ in what makes a command safe."""
+    """The two programs of these cars. They have the same commands, but need different care to be safe."""
 
     GENERAL = "ugv_base_general"
     ROS = "ugv_base_ros"
@@ -22,8 +22,8 @@ class Chassis:
     main: int
     """Its number in the command `T:900`, which sets wheels, direction and the kind of speed control."""
     has_encoders: bool
-    """True if the speed control is closed: the car's `L` and `R` are measured, and commands are m/s. False if a command
-    is a share of full power, 0.5 being all of it, and `L` and `R` are nothing or the command itself."""
+    """True if the car controls its speed with encoders: commands are in m/s, and its `L` and `R` are measured. False if
+    a command is a share of full power (0.5 is full), and its `L` and `R` are nothing or repeat the command."""
 
 
 PLATFORMS: Final[dict[str, dict[UgvFirmware, Chassis]]] = {
@@ -36,22 +36,22 @@ PLATFORMS: Final[dict[str, dict[UgvFirmware, Chassis]]] = {
     "ugv_rover": {UgvFirmware.ROS: Chassis(2, has_encoders=True)},
     "ugv_beast": {UgvFirmware.ROS: Chassis(3, has_encoders=True)},
 }
-"""Products of old and new stock have different firmwares, so a platform may have two."""
+"""Old and new stock of one product may have different firmwares, so a platform may have two."""
 FULL_SPEED: Final = 0.5
-"""The greatest `L` and `R` that a gateway sends: full power with an open loop, and 0.5 m/s with a closed one. Beyond
-2.0 a closed loop keeps its old speed, and counts the command as a sign of life."""
+"""Maximum `L` and `R` that a gateway sends: 0.5 m/s with encoders, full power without. Beyond 2.0, a car with encoders
+keeps its old speed, but the command still resets the dead-man timer."""
 DEAD_MAN_S: Final = 3.0
-"""Dead-man of both firmwares after a reset. A gateway sets a shorter one, which a reset forgets."""
+"""Dead-man time of both firmwares after a reset. A gateway sets a shorter time, but a reset of the car undoes that."""
 CELLS: Final = 3
 _CAPABILITIES: Final = frozenset({"drive", "speed", "light"})
-_NOT_OBSERVED: Final = ("all of it: read in the firmwares' source, tried on no car",)
+_NOT_OBSERVED: Final = ("everything: it was read in the source of the firmwares, and not tried on a car",)
 
 
 def profile_of(name: str) -> PlainProfile:
-    """Return what cars of a platform can do. Raises ValueError for a wrong name."""
+    """Return the profile of a platform. Raises ValueError for a wrong name."""
     kind, plus, options = name.partition("+")
     if plus:
-        raise ValueError(f'Unknown option "+{options[:40]}" of {kind}. It has none.')
+        raise ValueError(f'Unknown option "+{options[:40]}" of {kind}, which has no options.')
     measures = {"battery"}
     for firmware, chassis in PLATFORMS[kind].items():
         measures |= {"attitude"} if firmware is UgvFirmware.GENERAL else {"odometer", "imu"}

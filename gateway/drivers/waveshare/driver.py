@@ -1,36 +1,35 @@
 """Drives one car of Waveshare's UGV family. Pure.
 
-These cars take JSON, one object a line, over a UART. They acknowledge nothing by themselves, but they have two things
-that the first family lacks: a dead-man, and on some chassis encoders. This essay is about what may rest on them.
+These cars accept JSON, one object per line, over a UART. They acknowledge nothing by themselves, but have two things
+that the first family lacks: a dead-man timer, and on some chassis encoders. This essay says what can rest on these two.
 
 *One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
-on one without, and nearly nothing on the factory's first program. Nothing in the command tells them apart. So no motion
-goes out before the car's feedback has told which firmware it has, and before it has received the number of its chassis
-(`T:900`) from us. On one of the firmwares, a reset clears that number. So the text of a boot, or a silence in the
-stream of feedback, takes the permission back, and all starts again.
+on one without, and nearly nothing on the factory's first program. The command looks the same for all three. So no
+motion is sent before the car's feedback has shown its firmware, and before it has received the number of its chassis
+(`T:900`) from us. On one firmware, a reset clears that number. So after the text of a boot, or a silence in the stream
+of feedback, the car may not be driven until its set-up is repeated.
 
-*The dead-man.* Three seconds after the last `T:1` the motors stop. On one firmware `T:13` drives without feeding it,
-and nothing ever stops such a car; `T:136` below zero turns it off. So `T:1` alone drives here, sent again four times
-within the second that we set the dead-man to, and clamped before it is sent: beyond 2.0 the car ignores the numbers and
-takes the line as a sign of life. A list of what may be sent stands below, and nothing else is ever written.
+*The dead-man timer.* Three seconds after the last `T:1` the motors stop. But on one firmware, `T:13` drives without
+this timer, so that nothing ever stops the car, and `T:136` with a negative number turns the timer off. So we drive only
+with `T:1`, set the timer to one second, and send a held motion four times in that time. Its numbers are limited first:
+beyond 2.0, the car ignores them, but the line still resets the timer. Only the commands of `ALLOWED` are ever written.
 
-*What a stop can show.* The car repeats each line that it could parse, if asked to (`T:143`). That is not proof that it
-obeys. But it puts an order into what we read: a feedback after the repeated stop was made after the stop. If its wheel
-speeds are measured, and are zero from then on for a quarter of a second, the car stands. Measured means three things:
-the chassis has encoders, the configuration is ours, and both wheels were seen to turn in a drive of ours since then,
-for an encoder with a loose wire reports zero for ever. Everything else is `sent`, and the dead-man is what it rests on.
+*Evidence of a stop.* If asked to (`T:143`), the car repeats each line that it could parse. That does not prove that it
+obeys. But it gives our readings an order: a feedback that arrives after the repeated stop was made after the stop. If
+its wheel speeds are measured, and are zero from then on for a quarter of a second, the car stands still. Measured means
+three things: the chassis has encoders, we have configured the car, and both wheels were seen to turn in a drive of ours
+since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`; the timer must do.
 
-*What got lost.* A setting that a link swallows would go unnoticed. So the chassis and the dead-man count when the car
-has repeated them, and are sent until then. A car that repeats nothing gets them three times, while its feedback comes
-at the interval that we asked for, or ten times: it is not locked out for what it cannot show.
+*Lost settings.* We would not notice a setting that was lost on the link. So the chassis and the dead-man time are sent
+until the car has repeated them. A car that repeats no line gets them three times if its feedback arrives at the
+interval that we asked for, else ten times. Then it may be driven, although it cannot confirm them.
 
-*The first bytes.* Each boot plays a mission of its owner, and any byte that waits on the UART aborts it. So after the
-link is open we listen for a moment before we write, and wait for the end of a boot. The stop of a person waits for
-nothing.
+*The first bytes.* At each boot, the car plays a mission that its owner may have stored, and any byte on the UART aborts
+it. So after the link is open we listen before we write, and wait for the end of a boot. Only a person's stop does not.
 
-*Who else drives.* The car has a web page with a known password, and takes commands by radio. Both feed the dead-man. So
-wheels that turn while our last command is a stop are noticed, named, and stopped. Without encoders nothing shows that.
-But the page asks as long as it is open, and the car prints each answer here, too: that is named on every chassis.
+*Other programs.* The car has a web page with a known password, and accepts commands by radio. Both reset the dead-man
+timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. Without encoders no
+reading shows that. But an open web page sends queries, whose answers the car prints here, too, so it is always logged.
 """
 
 import json
@@ -60,45 +59,45 @@ STREAM_GAP: Final = 142
 ECHO: Final = 143
 CHASSIS: Final = 900
 ALLOWED: Final = frozenset({DRIVE, PWM, POLL, STREAM, OUTPUTS, DEAD_MAN, STREAM_GAP, ECHO, CHASSIS})
-"""The commands that a gateway sends, by their `T`. Of `PWM` only zero."""
+"""The commands that a gateway sends, by their `T`. `PWM` is sent only with zero."""
 
 DEAD_MAN_MS: Final = 1000
-"""The dead-man that a gateway sets: four times `RESEND_S`."""
+"""The dead-man time that a gateway sets: four times `RESEND_S`."""
 STREAM_MS: Final = 200
-"""Interval of the feedback: 150 bytes so often fit a bridge of 9600 baud, too."""
+"""Interval of the feedback. Each has 150 bytes, so that even a bridge of 9600 baud is fast enough."""
 LISTEN_S: Final = 0.5
-"""Silence after the opening of a link before the first byte of ours. A car that resets then begins to print sooner."""
+"""Time after the opening of a link before we write. A car that resets when it is opened begins to print earlier."""
 LISTEN_MAX_S: Final = 30.0
-"""Maximum time for which a boot is waited for: that of the two Wi-Fi time-outs of 15 s."""
+"""Maximum time for which we wait for the end of a boot. The car's two Wi-Fi timeouts take 15 s each."""
 BOOT_QUIET_S: Final = 2.5
-"""Silence that ends a boot. Its longest pause is that of a search for the IMU, 2.2 s."""
+"""Silence after which a boot counts as over. Its longest pause is 2.2 s, while the car looks for its IMU."""
 PROBE_S: Final = 1.0
-"""Interval of the questions to a car that has not answered."""
+"""Interval of our queries to a car that has not answered yet."""
 SETUP_GAP_S: Final = 0.03
 """Minimum time between two frames of the set-up."""
 CONFIRM_S: Final = 0.3
-"""Time in which a car repeats a setting: the longest turn of its loop, and a slow link."""
+"""Time within which a car repeats a setting: the longest turn of its loop, and the delay of a slow link."""
 SILENT_TRIES: Final = 3
 BLIND_TRIES: Final = 10
-"""Number of times that the settings go to a car that repeats no line: if its feedback comes at the interval that we
-set, so that our lines arrive, and if not even that is shown."""
+"""How often the settings are sent to a car that repeats no line: SILENT_TRIES if its feedback arrives at the interval
+that we set, which shows that our lines arrive, else BLIND_TRIES."""
 ECHO_TRIES: Final = 3
-"""Number of tries of a stop without an echo, after which its echo counts as switched off."""
+"""Number of tries of a stop without an echo after which the car's echo counts as switched off."""
 STANDS_S: Final = 0.25
 STANDS_REPORTS: Final = 3
-"""Minimum time and number of feedbacks with standing wheels that show a stop: two turns of the speed loop."""
+"""Time, and number of feedbacks, for which the wheels must stand still to show a stop: two turns of the speed loop."""
 TURNS_M_S: Final = 0.02
-"""Minimum speed of a wheel that turns: two encoder pulses in a turn of the firmware's loop of some 10 ms."""
+"""Minimum speed of a wheel that counts as turning: two encoder pulses per turn of the firmware's loop (some 10 ms)."""
 UNASKED_REPORTS: Final = 3
-"""Number of feedbacks in a row with turning wheels that show a motion which nobody commanded here."""
+"""Number of feedbacks in a row with turning wheels that count as a motion which nobody here commanded."""
 UNASKED_LOG_S: Final = 30.0
-"""Minimum time between two log records about that. The stops go on meanwhile."""
+"""Minimum time between two log records about such a motion. The car is also stopped in between."""
 ON_ITS_WAY_S: Final = 2.0
-"""Maximum time that a line of ours is on its way to the car, over a slow link."""
+"""Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0
-"""Maximum time that a wheel stands in a drive: by then the speed loop has wound up to full power twice."""
+"""Maximum time for which a wheel may stand still in a drive: twice the speed loop's way to full power."""
 VOLTAGE_S: Final = 1.0
-"""Interval at which an unchanged voltage is published. Each feedback repeats the last one, up to 10 s old."""
+"""Interval at which an unchanged voltage is published. Feedbacks repeat the last measured voltage for up to 10 s."""
 ECHO_S: Final = 2.0
 """Maximum time from a line of ours to its echo."""
 INNER: Final = 0.4
@@ -119,7 +118,7 @@ _OWN: Final = re.compile(rf'\{{"T":({"|".join(map(str, {*ALLOWED, 1005}))})[,}}]
 
 
 class Setup(Enum):
-    """What a car still needs before it may be driven."""
+    """The steps of the set-up, after which a car may be driven."""
 
     LISTEN = auto()
     PROBE = auto()
@@ -140,7 +139,7 @@ class WaveshareDriver(PlainDriver):
     STOP_FRAMES: ClassVar[int] = 3
     STOP_GAP_S: ClassVar[float] = 0.2
     STOPS_WITHIN_S: ClassVar[float] = 0.7
-    """Twice the longest turn of the firmware's loop (two searches for a servo, 0.2 s), and a brake from 0.5 m/s."""
+    """Twice the longest turn of the firmware's loop (0.2 s: two searches for a servo), and braking from 0.5 m/s."""
     RETRY_S: ClassVar[float] = 1.0
     EVIDENCE_S: ClassVar[float] = 4.0
     RESEND_S: ClassVar[float | None] = 0.25
@@ -152,12 +151,12 @@ class WaveshareDriver(PlainDriver):
         self._lines = LineSplitter()
         self._sent: deque[tuple[bytes, float]] = deque(maxlen=64)
         self._number = 0
-        """Number of the last stop frame, which tells its echo from others."""
+        """Number of the last frame of a stop. It is in the frame, so that its echo can be recognized."""
         self._firmware: UgvFirmware | None = None
         self._moved_at = float("-inf")
         """When the last motion was written."""
         self._named_at = float("-inf")
-        """When a motion that nobody commanded, or another program, was last logged."""
+        """When a motion that nobody here commanded, or another program, was last logged."""
         self._answered_at = float("-inf")
         self._forget_car(float("-inf"))
 
@@ -171,28 +170,28 @@ class WaveshareDriver(PlainDriver):
         self._unechoed = 0
         """Number of frames of stops since the last echo."""
         self._nameless = 0
-        """Number of feedbacks of no known firmware."""
+        """Number of feedbacks that fit no known firmware."""
         self._rest_odometer_m: tuple[float, float] | None = None
-        """The way of the wheels when they were first seen to stand."""
+        """The distance of the wheels when they were first seen to stand still."""
         self._frames: deque[bytes] = deque()
         self._unsure: list[bytes] = []
         """The settings that the car has not repeated yet."""
         self._tries = 0
-        """Number of times that they were sent while feedback came."""
+        """How often they were sent while feedback arrived."""
         self._was_heard = self._echoes = False
         self._feedback_at = float("-inf")
         self._in_rhythm = 0
-        """Number of feedbacks in a row that came at the interval that we set."""
+        """Number of feedbacks in a row that arrived at the interval that we set."""
         self._turned = [False, False]
-        """Whether each wheel was seen to turn in a drive of ours since the set-up."""
+        """For each wheel, True if it was seen to turn in a drive of ours since the set-up."""
         self._wanted: set[bytes] = set()
-        """The last lines of the tries of this stop, until one was repeated."""
+        """The last line of each try of this stop, until the car has repeated one of them."""
         self._stands_since: float | None = None
         self._stands = self._unasked = 0
         self._stuck_since: float | None = None
         self._odometer_m: tuple[float, float] | None = None
         self._voltage: tuple[float, float] = (0.0, float("-inf"))
-        """The last published voltage, and when."""
+        """The last published voltage, and the time of its publication."""
 
     # ------------------------------------------------------------------ bytes in
 
@@ -231,7 +230,7 @@ class WaveshareDriver(PlainDriver):
         if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
             topics["sensor/battery"] = {"voltage_v": event.voltage_v}
         if self._setup is not Setup.READY or self._here is None:
-            return topics  # an arm may stand in the place of an angle, another chassis in that of the way
+            return topics  # before that, an angle may be the position of an arm, and the chassis may be another one
         if event.odometer_m is not None:
             topics["sensor/odometer"] = dict(zip(("left_m", "right_m"), event.odometer_m, strict=True))
         if event.attitude_rad is not None:
@@ -242,7 +241,7 @@ class WaveshareDriver(PlainDriver):
         return topics
 
     def _is_new_voltage(self, volts: float, at: float) -> bool:
-        """Return True if a voltage is published: it is new, or the last one was a while ago."""
+        """Return True if a voltage has to be published, because it is new or was last published a while ago."""
         before, measured_at = self._voltage
         if volts == before and at < measured_at + VOLTAGE_S:
             return False
@@ -259,7 +258,7 @@ class WaveshareDriver(PlainDriver):
         """True if the wheel speeds of the feedback are measured: encoders, and a chassis that we have configured."""
         return self._setup is Setup.READY and self._here is not None and self._here.has_encoders
 
-    # ------------------------------------------------------------------ what the car says
+    # ------------------------------------------------------------------ events of the car
 
     def on_event(self, event: Event, now: float) -> None:
         """Update the state with an event."""
@@ -287,7 +286,7 @@ class WaveshareDriver(PlainDriver):
             self._listen_on(now)
 
     def _on_answer(self, event: TextLine, now: float) -> None:
-        """Name who else talks to the car: it answers what nobody here has asked."""
+        """Log that another program talks to the car, if the car answers a query that was not ours."""
         if self._setup is Setup.READY and not _OWN.match(event.raw):
             again, self._answered_at = now < self._answered_at + UNASKED_LOG_S, now
             if again and now >= self._named_at + UNASKED_LOG_S:
@@ -296,30 +295,30 @@ class WaveshareDriver(PlainDriver):
                 self._log.log(Level.WARNING, "other_program", words, now)
 
     def _on_restart(self, why: str, now: float) -> None:
-        """Take the permission to drive back: a reset has forgotten the chassis, the dead-man and the stream."""
+        """Repeat the set-up before the car may be driven: its reset has undone chassis, dead-man time and stream."""
         words = f"{self._model.name} has restarted: {why}. The gateway sets it up again, and stops it first."
         self._log.log(Level.WARNING, "car_restarted", words, now)
         self._forget_car(now + BOOT_QUIET_S)
         self.recover(words, now)
         if now > self._moved_at + ON_ITS_WAY_S:
-            self._wait_for_setup()  # else the car may read a motion of ours when it has started: the stop comes behind
+            self._wait_for_setup()  # else a motion of ours may still be on its way, and the stop must follow it at once
 
     def on_reading(self, event: Event, now: float) -> None:
-        """Take a feedback: the firmware, the wheels, the voltage."""
+        """Update firmware, wheels and voltage with a feedback."""
         if not isinstance(event, Feedback):
             return
         if event.firmware is not None and event.firmware is not self._firmware:
             self._on_firmware(event.firmware, now)
         if self._firmware is None:
             self._on_nameless(event, now)
-        if self._booting and self._setup is Setup.LISTEN:  # its loop runs
+        if self._booting and self._setup is Setup.LISTEN:  # a feedback shows that its loop runs, so the boot is over
             self._booting, self._setup_at = False, now
         self._say_what_it_shows()
         self._was_heard = True
         gap_s, self._feedback_at = event.at - self._feedback_at, event.at
         self._in_rhythm = self._in_rhythm + 1 if 0.8 < 1000 * gap_s / STREAM_MS < 1.5 else 0
         if self._is_reset(event):
-            self._on_restart("the way of its wheels began at zero again", now)
+            self._on_restart("the distance of its wheels began at zero again", now)
             return
         if event.voltage_v is not None:
             self.on_voltage(event.voltage_v, now)
@@ -327,10 +326,10 @@ class WaveshareDriver(PlainDriver):
             self._on_wheels(event, now)
 
     def _on_nameless(self, event: Feedback, now: float) -> None:
-        """Say once why a car is not driven whose feedback tells no firmware."""
+        """Log once that a car is not driven because its feedback does not show its firmware."""
         self._nameless += 1
         if self._nameless == STANDS_REPORTS:
-            words = f"{self._model.name} is not driven: its feedback is of no known firmware: {event.raw[:120]!r}"
+            words = f"{self._model.name} is not driven, as its feedback fits no known firmware: {event.raw[:120]!r}"
             self._log.log(Level.WARNING, "platform_contradicted", words, now)
 
     def _say_what_it_shows(self) -> None:
@@ -340,11 +339,11 @@ class WaveshareDriver(PlainDriver):
         if self._here is None or not self._here.has_encoders:
             words = f"the wheel speeds of {car} are not measured; its dead-man stops it if nothing drives it"
         elif not all(self._turned):
-            words = f"{car} was not driven since its set-up, so nothing shows that its encoders count"
+            words = f"{car} was not driven since its set-up, so nothing shows that its encoders work"
         elif not self._echoes:
-            words = f"{car} does not repeat our lines, so nothing shows when it got the stop"
+            words = f"{car} does not repeat our lines, so nothing shows when it received the stop"
         else:
-            words = f"the wheel speeds of {car} show that it stands"
+            words = f"the wheel speeds of {car} show that it stands still"
         self._model.shows_words = words
 
     def _is_reset(self, event: Feedback) -> bool:
@@ -362,14 +361,14 @@ class WaveshareDriver(PlainDriver):
         model.findings = Findings(evidence, contradictions)
         if here is None:
             fits = ", ".join(each for each, row in PLATFORMS.items() if firmware in row)
-            words = f"{model.name} runs {firmware}, which {name} cars do not: it is not driven. With it: {fits}."
+            words = f"{model.name} runs {firmware}, which {name} cars do not have: it is not driven. With it: {fits}."
             self._log.log(Level.WARNING, "platform_contradicted", words, now)
         model.shows = Shows.UNKNOWN if here is not None and here.has_encoders else Shows.NO
         if self._setup is Setup.PROBE:
             self._setup_at = now
 
     def _on_wheels(self, event: Feedback, now: float) -> None:
-        """Take measured wheel speeds: as evidence of a stop, of encoders, or of a motion that nobody commanded."""
+        """Use measured wheel speeds as evidence of a stop, of working encoders, or of a motion that is not ours."""
         model = self._model
         turning = [abs(speed) >= TURNS_M_S for speed in (event.left_m_s, event.right_m_s)]
         model.turned_at = event.at if any(turning) else model.turned_at
@@ -381,19 +380,19 @@ class WaveshareDriver(PlainDriver):
             self._stands += 1
             if self._stands == 1:
                 self._rest_odometer_m = event.odometer_m
-            if event.odometer_m != self._rest_odometer_m:  # it rolls too slowly for a speed
+            if event.odometer_m != self._rest_odometer_m:  # it rolls, but too slowly for a measured speed
                 self._stands, self._stands_since = 0, event.at
             if self._stands >= STANDS_REPORTS and event.at >= self._stands_since + STANDS_S and all(self._turned):
                 model.shows = Shows.YES
-                self.show_rest(f"{self._stands} feedbacks of standing wheels since it repeated the stop", now)
+                self.show_rest(f"its wheels stood still in {self._stands} feedbacks since it repeated the stop", now)
         elif not stands and self._stands_since is not None:
             self._stands, self._stands_since = 0, event.at
         self._unasked = self._unasked + 1 if any(turning) and model.at_rest else 0
         if self._unasked >= UNASKED_REPORTS:
             self._unasked = 0
             words = (
-                f"{model.name} moves, and nobody here drives it. Its own web page, a remote by radio or a mission may: "
-                "close the page, and change the password of its Wi-Fi. The gateway stops it."
+                f"{model.name} moves, and nobody here drives it. Its own web page, a radio remote or a mission may do "
+                "so: close the page, and change the password of its Wi-Fi. The gateway stops it."
             )
             if now >= self._named_at + UNASKED_LOG_S:
                 self._named_at = now
@@ -401,7 +400,7 @@ class WaveshareDriver(PlainDriver):
             self.recover(words, now)
 
     def _check_stuck(self, turning: list[bool], now: float) -> None:
-        """End a drive in which a wheel stands: the speed control gives it more and more power until it turns."""
+        """End a drive in which a wheel stands still, as the speed control would increase its power until it turns."""
         held, model = self.queue.held, self._model
         drives = model.motors is Motors.ON and held is not None and held.began_at is not None
         if not drives or all(turning):
@@ -412,14 +411,14 @@ class WaveshareDriver(PlainDriver):
             return
         self._stuck_since = None
         sides = " and ".join(side for side, turns in zip(("left", "right"), turning, strict=True) if not turns)
-        words = f"{model.name} is stopped: its {sides} wheel stands in a drive. Is it blocked, or an encoder loose?"
+        words = f"{model.name} is stopped: its {sides} wheel stood still. Is it blocked, or an encoder loose?"
         self._log.log(Level.WARNING, "wheel_stands", words, now)
         self.release(Phase.FAILED, Reason.STUCK, words, now)
 
     # ------------------------------------------------------------------ set-up
 
     def link_up(self, now: float) -> None:
-        """Listen first: the link is open."""
+        """Listen before anything is written, because the link is open now and the car may boot."""
         self._lines = LineSplitter()
         self._firmware = None
         self._forget_car(now + LISTEN_S)
@@ -432,7 +431,7 @@ class WaveshareDriver(PlainDriver):
             self._stop.next_at = max(self._stop.next_at, self._setup_at)
 
     def stop(self, why: FrameOrigin, now: float, pending: Any = None) -> None:
-        """Stop the car by all means. A stop that somebody asked for waits for nothing."""
+        """Stop the car by all means. A stop that somebody asked for does not wait for the end of a boot."""
         super().stop(why, now, pending)
         if self._stop is not None and self._stop.index == 0:
             self._stop.next_at = now
@@ -449,15 +448,15 @@ class WaveshareDriver(PlainDriver):
             self._firmware = None
 
     def wait_words(self, now: float) -> str:
-        """Return what must happen before the car may be driven."""
+        """Describe what must happen before the car may be driven."""
         del now
         if self._setup is Setup.READY:
             return ""
-        return "a feedback that tells its firmware" if self._setup is Setup.PROBE else "its set-up"
+        return "a feedback that shows its firmware" if self._setup is Setup.PROBE else "its set-up"
 
     @property
     def hears(self) -> bool:
-        """Return False while it may boot: what is written then is lost, or waits."""
+        """Return False while it may be booting: lines that are written then are lost or read later."""
         return self._setup is not Setup.LISTEN
 
     def setup_at(self) -> float:
@@ -465,13 +464,13 @@ class WaveshareDriver(PlainDriver):
         return float("inf") if self._setup is Setup.READY else self._setup_at
 
     def setup_frame(self, now: float) -> bytes | None:
-        """Return the next question or setting, if one is due."""
+        """Return the next query or setting, if one is due."""
         if now < self.setup_at():
             return None
         if self._setup is Setup.LISTEN:
             self._setup = Setup.PROBE
             if self._stop is not None and self._stop.last_at < self._setup_at - SETUP_GAP_S:
-                self.repeat_stop(now)  # what was written in a boot may be lost
+                self.repeat_stop(now)  # a stop that was written during a boot may be lost
                 return None
         if self._setup is Setup.PROBE:
             here = self._here
@@ -482,7 +481,7 @@ class WaveshareDriver(PlainDriver):
             self._unsure = [line(CHASSIS, main=here.main, module=0), line(DEAD_MAN, cmd=DEAD_MAN_MS)]
             self._queue_settings()
         if self._frames:
-            # After the last one, time for its echo.
+            # After the last one, leave time for its echo.
             self._setup_at = now + (SETUP_GAP_S if len(self._frames) > 1 else CONFIRM_S)
             return self._frames.popleft()
         self._tries += self._was_heard
@@ -497,7 +496,7 @@ class WaveshareDriver(PlainDriver):
         return None
 
     def _queue_settings(self) -> None:
-        """Queue the settings that the car has not repeated, behind those that let it repeat and report."""
+        """Queue the settings that make the car repeat lines and report, and then those that it has not repeated yet."""
         self._frames.extend((line(ECHO, cmd=1), line(STREAM_GAP, cmd=STREAM_MS), line(STREAM, cmd=1)))
         self._frames.extend(self._unsure)
 
@@ -507,41 +506,41 @@ class WaveshareDriver(PlainDriver):
         """Return why this car cannot do it in any state, or None if it can."""
         if isinstance(what, Drive) and self._firmware is not None and self._here is None:
             name = self._model.profile.name
-            return f"{self.desk.car} runs {self._firmware}, which {name} cars do not. Correct `platform:`."
+            return f"{self.desk.car} runs {self._firmware}, which {name} cars do not have. Correct `platform:`."
         return super().refusal(what)
 
     def motion_frame(self, motion: Motion) -> bytes:
-        """Return the line of a motion. Zero is sent as such; nothing exceeds FULL_SPEED."""
+        """Return the line of a motion. No number in it exceeds FULL_SPEED."""
         speed = min(FULL_SPEED, max(0.0, FULL_SPEED * min(self._model.speed, self.desk.speed_max)))
         left, right = (round(speed * share, 3) for share in _SIDES[motion])
         return line(DRIVE, L=left, R=right)
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
-        """Note a motion that is on its way."""
+        """Update the state, and note when a motion was last sent."""
         super().on_written(write, now)
         if self._model.motors is Motors.ON:
             self._moved_at = now
 
     def _begin(self, why: FrameOrigin, now: float, commands: list[Pending], *, is_soft: bool) -> None:
-        """Begin a stop: what was seen before it shows nothing of it."""
+        """Begin a stop. Forget earlier readings of the wheels, which are no evidence of this stop."""
         self._wanted.clear()
         self._stands_since, self._stands = None, 0
         super()._begin(why, now, commands, is_soft=is_soft)
 
     def stop_frame(self, index: int) -> bytes:
-        """Return a line of a stop: the duty to zero, twice, then the speed. The number marks its echo.
+        """Return a line of a stop: twice power zero, then speed zero. The number marks its echo.
 
-        The speed loop keeps its integral while the duty is set, and would go on with it. It drops it when the wheels
-        stand. So the speed comes last, and not at once.
+        While power is set directly, the speed loop keeps its integral, and would continue with it. It drops the
+        integral when the wheels stand still. So the speed is set last, and not at once.
         """
         self._number += 1
         if index == self.STOP_FRAMES - 1:
             return line(DRIVE, L=0, R=0, n=self._number)
-        # The line end ends a line that a lost link has cut.
+        # The line end before the first one ends a line that a lost link may have truncated.
         return (b"\n" if index == 0 else b"") + line(PWM, L=0, R=0, n=self._number)
 
     def on_stop_written(self, data: bytes, now: float) -> None:
-        """Wait for the echo of the last line of a stop."""
+        """Expect the echo of the last line of a stop."""
         del now
         self._unechoed += 1
         if self._stop is not None and self._stop.index >= self.STOP_FRAMES:
@@ -549,12 +548,12 @@ class WaveshareDriver(PlainDriver):
 
     @property
     def can_show(self) -> bool:
-        """Return True if standing wheels would show a stop now."""
+        """Return True if wheel speeds of zero would show a stop now."""
         is_heard = self._echoes and self._unechoed < ECHO_TRIES * self.STOP_FRAMES
         return self._is_measured and all(self._turned) and is_heard
 
     def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
-        """Return the lines for the lights, which are the two switched outputs."""
+        """Return the lines that switch the lights, which are at the two switched outputs."""
         match what:
             case SetLight(Light.WHITE | Light.OFF as light):
                 return (_light(is_on=light is Light.WHITE),)
@@ -564,7 +563,7 @@ class WaveshareDriver(PlainDriver):
                 return None
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail all commands: the link is down."""
+        """Fail all commands, because the link is down, and forget the car's state."""
         super().link_down(reason, now, cause=cause)
         self._firmware = None
         self._forget_car(now)

@@ -22,7 +22,7 @@ def profiles() -> tuple[PlainProfile, ...]:
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], WaveshareDriver]":
-    """Return the driver of a car. It keeps nothing about the car. Raises ValueError for a wrong platform."""
+    """Return a function that makes a car's driver. `kept` is not used. Raises ValueError for a wrong platform."""
     from gateway.drivers.waveshare.driver import WaveshareDriver
 
     del kept

@@ -1,7 +1,7 @@
-"""Turns one line of such a car into events. Pure; any bytes are allowed.
+"""Turns one line of such a car into events. Pure. Any bytes are allowed.
 
-The firmwares mix JSON with text, and print some JSON without a line end. So a line may hold text, several objects, and
-the beginning of a line that the link has cut. Each becomes an event of its own.
+The firmwares mix JSON with text, and print some JSON without a line end. So a line may contain text, several objects,
+and the beginning of a line that the link has truncated. Each of these becomes an event.
 """
 
 import json
@@ -14,13 +14,13 @@ from gateway.drivers.waveshare.chassis import UgvFirmware
 from schemas.words import Cause
 
 FEEDBACK: Final = 1001
-"""`T` of a feedback."""
+"""Value of `T` in a feedback."""
 MAX_M_S: Final = 5.0
 MAX_V: Final = 13.0
-"""Maximum speed of a wheel, and of the voltage of three cells. A greater number is not a measurement."""
+"""Maximum speed of a wheel, and maximum voltage of three cells. A greater number is not a measurement."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
-"""Fields of an arm. Its places have the names of the yaw, or of the acceleration, and stand in their place."""
+"""Fields that show that the car has an arm, whose positions then stand in the fields of the yaw or the acceleration."""
 _DECODER: Final = json.JSONDecoder()
 
 
@@ -31,10 +31,10 @@ class Feedback:
     raw: bytes
     at: float
     firmware: UgvFirmware | None
-    """None if its fields are those of neither, or of both."""
+    """None if its fields fit neither firmware, or both."""
     left_m_s: float
     right_m_s: float
-    """Speeds of the wheels as the car says them. `Chassis.has_encoders` decides whether they are measured."""
+    """Speeds of the wheels as the car reports them. They are measured only if `Chassis.has_encoders`."""
     voltage_v: float | None
     attitude_rad: tuple[float, float, float] | None
     """Roll, pitch, yaw."""
@@ -58,7 +58,7 @@ def read_line(line: bytes, at: float) -> list[Event]:
         try:
             found, place = _DECODER.raw_decode(text, start)
         except (ValueError, RecursionError):
-            # What follows may be whole: a cut object and the next one can share a line.
+            # A truncated object and a whole one can share a line, so look on after the truncated one.
             place = text.find("{", start + 1)
             place = place if place >= 0 else len(text)
             events.append(Rejected(text[start:place].encode("latin-1"), at, Cause.TRUNCATED))
@@ -91,9 +91,9 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
 
 
 def _firmware(found: dict[str, Any]) -> UgvFirmware | None:
-    """Return which firmware reports like this: one has a temperature, the other the way of its wheels.
+    """Return the firmware that reports like this: GENERAL has a temperature, ROS has the distance of the wheels.
 
-    A relative may lack the one field. Then its angles and volts count, or its gyroscope and hundredths of a volt.
+    A variant may lack that field. Then angles and volts show GENERAL, a gyroscope and hundredths of a volt show ROS.
     """
     volts = _number(found, "v") or 0.0
     is_general = "temp" in found or ({"r", "p", "y"} <= found.keys() and 0.0 < volts <= MAX_V)
@@ -104,7 +104,7 @@ def _firmware(found: dict[str, Any]) -> UgvFirmware | None:
 
 
 def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | None:
-    """Return the voltage. One firmware sends volts, the other hundredths of a volt."""
+    """Return the voltage, V. GENERAL sends volts, ROS hundredths of a volt."""
     value = _number(found, "v")
     if value is None or firmware is None:
         return None

@@ -1,4 +1,4 @@
-"""The estimates of one car: platform, mode, battery, outputs, trust, and evidence of a stop. It decides nothing.
+"""The estimates of one car: platform, mode, battery, outputs, trust, and evidence of a stop. Nothing is decided here.
 
 `Executor` updates it with each written frame, `CarMonitor` with each reading.
 """
@@ -42,17 +42,17 @@ class CarModel:
     evidence: StopEvidence = field(init=False)
     trust: TrustState = field(default_factory=TrustState)
     rest_case: StopCase = cases.SOFT
-    """The case of the stop, if the claim of rest has the basis `sent`."""
+    """The case of the last stop, if the claim that the car is at rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
     """When the last frame that leaves a mode was written, and the latest time at which the car has left the mode."""
     range_cm: float | None = None
-    """The last distance that was measured, and when."""
+    """The last measured distance, and its time."""
     range_at: float = float("-inf")
     cut_write: bool = False
-    """True if a write has failed since the last recovery: the car may keep a string that only a color frame clears."""
+    """True if a write has failed since the last recovery: the car may hold a string that only a color frame clears."""
     missed_stop: bool = False
-    """True if a stop on this link has had its time, and the car, which reported meanwhile, did not show it."""
+    """True if the time for the evidence of a stop on this link has run out, although the car reported meanwhile."""
     link_since: float = float("-inf")
     """When the link was opened."""
     link_open: bool = False
@@ -67,7 +67,7 @@ class CarModel:
         self.believed = StateEstimate(self.profile)
 
     def treat_as(self, profile: Profile) -> None:
-        """Use another platform's profile from now on."""
+        """Use the profile of another platform from now on."""
         self.profile = self.mode.profile = self.pacing.profile = self.evidence.profile = profile
         self.believed = replace(self.believed, profile=profile)
 
@@ -83,7 +83,7 @@ class CarModel:
 
     @property
     def findings(self) -> Findings:
-        """Return what was found out about the car."""
+        """Return the findings about the car."""
         learned = self.learned
         numbers: dict[str, Any] = {
             "blocks_s": {str(kind): block_s for kind, block_s in learned.blocks.items()},
@@ -108,7 +108,7 @@ class CarModel:
 
     @property
     def silence_limit_s(self) -> float | None:
-        """Return the longest normal silence now, or None if silence says nothing."""
+        """Return the longest normal silence now, or None if every silence is normal."""
         return self.mode.silence_limit(fan=bool(self.believed.fan))
 
     @property
@@ -117,12 +117,12 @@ class CarModel:
         return self.mode.why_quiet
 
     def unheard_s(self, now: float) -> float:
-        """Return for how long the car has sent nothing."""
+        """Return how long the car has been silent, without the time for which our frames block it."""
         return self.mode.unheard_s(now)
 
     @property
     def known(self) -> bool:
-        """Return True if the car reads frames as meant."""
+        """Return True if the car reads frames as they are meant."""
         return self.trust.state in KNOWN
 
     @property
@@ -132,17 +132,17 @@ class CarModel:
 
     @property
     def at_rest(self) -> bool:
-        """Return True if the car stands in mode 0 after a stop. The basis may be `shown` or `sent`."""
+        """Return True if the car stands still in mode 0 after a stop. The basis may be `shown` or `sent`."""
         return self.trust.state is CarTrust.STOPPED and self.manual
 
     @property
     def rest_is_sure(self) -> bool:
-        """Return True if the car has shown that it stands, or cannot show it."""
+        """Return True if the car is at rest, and has shown it, or need not or cannot show it."""
         return self.at_rest and (self.trust.shown or self.rest_case.is_sure or not self.can_show)
 
     @property
     def can_show(self) -> bool:
-        """Return True if this car shows a stop, or may: not as its program is known, nor as it was found out."""
+        """Return True unless it is known that this car cannot show a stop, by its program or by its reports."""
         match self.stop_style:
             case StopStyle.GENERAL:
                 return False
@@ -155,8 +155,8 @@ class CarModel:
     def shows_fan(self) -> bool:
         """Return True if a reading shows that the fan is off.
 
-        A car that reports by a timer sends readings with the fan on, too. An arduino that was only detected may be one,
-        until it has shown that its reports wait for its loop.
+        A car that reports by a timer sends readings even with the fan on. A car that was only detected as an arduino
+        may be such a car, until it has shown that its reports wait for its loop.
         """
         is_sure = not self.auto or self.learned.shows is Shows.YES
         return self.profile.kind is Platform.ARDUINO and is_sure and not self.profile.fan_is_level
@@ -173,12 +173,12 @@ class CarModel:
         return stop_in_progress.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
 
     def stop_case(self, *, is_soft: bool) -> StopCase:
-        """Return what a stop rests on now if the car does not show it."""
+        """Return the case that decides when a stop may end although the car has not shown it."""
         return cases.case_of(self.stop_style, self.profile, is_soft=is_soft, can_show=self.can_show)
 
     @property
     def silent_program(self) -> str:
-        """Return what to do about a car that never sent a reading, or an empty text if it has sent one."""
+        """Return a sentence on what to do about a car that never sent a reading. Empty if it has sent one."""
         if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
             return ""
         if self.profile.kind is not Platform.UNKNOWN:
@@ -197,7 +197,7 @@ class CarModel:
 
     @property
     def motors(self) -> Motors:
-        """Return what is claimed of the motors."""
+        """Return the claim about the motors."""
         believed_moving = self.trust.state in (CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.STOPPED)
         if believed_moving and self.mode.verdict is Verdict.CONTRADICTED:
             return Motors.UNKNOWN
@@ -214,12 +214,12 @@ class CarModel:
         return self.believed.motion if self.known and self.manual else None
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
-        """Return in words how the distance has changed since a drive began. Empty if no reading shows that."""
+        """Describe how the distance has changed since a drive began. Empty if no reading shows a change."""
         return "" if self.range_at < since + FLIGHT_S else describe_way(range_cm, self.range_cm)
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:
-        """Return whether the reports of this car show that a stop arrived, and why, in words."""
+        """Return whether the reports of this car show that a stop arrived, with the reason in words."""
         if not self.profile.has_readings:
             return Shows.NO, cases.NO_READINGS.why(self.name)
         if self.stop_style is StopStyle.GENERAL and self.auto and not self.platform.is_settled:
@@ -253,7 +253,7 @@ class CarModel:
 
     @property
     def _clearing(self) -> ColorLed | None:
-        """Return the color that clears a string which begins with `4WD,`, if there is a reason to suspect one."""
+        """Return the color frame that clears a string beginning with `4WD,`, if the car may hold such a string."""
         suspected = self.cut_write or (self.learned.shows is Shows.YES and self.trust.state is CarTrust.UNPROVEN)
         color = self.believed.led
         return color if suspected and self.profile.refusal(color) is None else None
@@ -264,7 +264,7 @@ class CarModel:
         return max(self.pacing.flight_until, self.left_until)
 
     def is_awake(self, now: float) -> bool:
-        """Return True if the car reads a frame at once, because no block runs, known or unknown."""
+        """Return True if the car reads a frame at once, because no block, known or only possible, is running."""
         pacing = self.pacing
         if now <= pacing.awake_until and now >= pacing.block_from - FLIGHT_S / 2:
             return True

@@ -1,4 +1,4 @@
-"""Updates `CarModel` from readings and silence, and stops the car if they require it. Pure."""
+"""Updates `CarModel` with readings and silence, and stops the car if they require it. Pure."""
 
 from typing import Final
 
@@ -40,13 +40,13 @@ class CarMonitor:
     def __init__(self, model: CarModel, executor: Executor, log: CommandLog) -> None:
         self.model = model
         self.lost_frames = 0
-        """Number of `MODE00` frames that did not arrive, by the car's reports."""
+        """Number of `MODE00` frames that did not arrive, as the car's reports show."""
         self._executor = executor
         self._stops = executor.stops
         self._log = log
         self._not_obeyed_logged = False
         self._silent_since: float | None = None
-        """When the last reading before a silence arrived that was dealt with; a command may have come since."""
+        """Time of the last reading before a silence that was handled already. Commands may have arrived since then."""
 
     def link_up(self) -> None:
         """Forget the evidence of the last link."""
@@ -54,14 +54,14 @@ class CarMonitor:
         self._not_obeyed_logged = False
         self._silent_since = None
         model.platform.begin_link()
-        if model.platform.auto:  # another car may have been plugged in
+        if model.platform.auto:  # detect the platform again, because another car may have been plugged in
             opened_as = model.learned.opened_as
             remembered = parse_platform(opened_as) if opened_as else None
             model.platform = PlatformDetector(model.platform.configured, auto=True, remembered=remembered)
             model.treat_as(model.platform.profile)
 
     def link_down(self) -> None:
-        """Forget what the car was before this link if it said nothing after a frame that only such a car takes."""
+        """Forget the platform from before this link, if the car was silent after a frame that only it understands."""
         model = self.model
         is_silent = model.left_at > model.link_since > model.mode.heard_at
         if model.platform.is_remembered and is_silent:
@@ -77,7 +77,7 @@ class CarMonitor:
             self._stops.leave_open_mode(now)
         for words in contradictions:
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
-            if model.platform.doubted:  # the last stop may have been of the wrong kind
+            if model.platform.doubted:  # the last stop may have been of the wrong kind for this car
                 self._on_other_program(now, words)
         if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
             model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
@@ -87,15 +87,16 @@ class CarMonitor:
         model.mode.on_reading(event, counts=settled)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
-        # Somebody may have commanded it in the silence.
+        # Stop the car after a silence, because a command may have been sent during it.
         if self._silent_since is not None or model.trust.state is CarTrust.UNHEARD:
             self._silent_since = None
-            # If a `MODE00` delays the report for longer than expected, the silence leads to the next one, for ever.
+            # Allow such a silence. Otherwise, if a `MODE00` delays the report for longer than expected, each silence
+            # would cause the next `MODE00`, for ever.
             model.mode.allow_silence(silent_s)
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
         if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:
-            words = f"its reports pause after MODE00, which those of {model.profile.name} cars do not"
+            words = f"its reports pause after MODE00, unlike those of {model.profile.name} cars"
             if model.platform.note(words):
                 self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
         if only_candidate(event) is Mode.MANUAL:
@@ -124,33 +125,33 @@ class CarMonitor:
                 model.believed.fan = False
 
     def _log_delivery(self, finding: Finding, now: float) -> None:
-        """Log once that a car which has shown its stops did not get one, and once that it gets them again."""
+        """Log once that a stop did not reach a car that has shown its stops, and once that it reacts again."""
         name = self.model.name
         if finding is Finding.LOST and self.model.learned.shows is Shows.YES:
             self.lost_frames += 1
             if not self._not_obeyed_logged:
                 self._not_obeyed_logged = True
-                words = f"{name} did not get a stop: it does not react as before, while readings arrive."
+                words = f"{name} did not get a stop: readings arrive, but it does not react as before."
                 self._log.log(Level.WARNING, "not_obeyed", f"{words} The gateway stops it again.", now)
         elif finding in (Finding.SHOWN, Finding.SETTLING) and self._not_obeyed_logged:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
     def _on_found_out(self, now: float) -> None:
-        """Handle what the readings have shown about the car itself."""
+        """Handle a finding of the readings about the car itself."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = cases.NO_REACTION.why(name)
             self._log.log(Level.INFO, "cannot_show", f"{words}. It can be used like any other car.", now)
         else:
             words = f"{name} reports every {learned.echo.median_s:.2f} s now: another program, or another car?"
-            self._log.log(Level.WARNING, "rhythm_changed", f"{words} What it showed before is forgotten.", now)
+            self._log.log(Level.WARNING, "rhythm_changed", f"{words} Earlier evidence of stops is forgotten.", now)
             if self.model.platform.auto:
                 self.model.platform.forget()
             self._on_other_program(now, words)
 
     def _on_other_program(self, now: float, words: str) -> None:
-        """Keep no claim that the program before has shown. A car that drives or is in a mode goes on."""
+        """Drop the claims that rest on another program's readings. Do not stop a car that drives or is in a mode."""
         model = self.model
         model.learned.forget_reactions()
         if model.link_open and (model.trust.state in STOP_GOES_ON or model.trust.basis is not None):
@@ -159,13 +160,13 @@ class CarMonitor:
     def _apply_platform(self, now: float) -> None:
         """Use the profile of the detected platform.
 
-        Not during the first frames of a stop: each stop is for one platform. But if the readings show an open mode, at
-        once: general stops do not end it.
+        Wait with that during the first frames of a stop, because each stop is made for one platform. Do not wait if the
+        readings show an open mode, because general stops do not end it.
         """
         model = self.model
         if model.platform.profile is model.profile or not model.link_open:
             return
-        # Named frames with another head reach nobody, and readings with it are not read.
+        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not wait either.
         has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
         may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):
@@ -173,14 +174,14 @@ class CarMonitor:
         before = model.profile.kind
         model.treat_as(model.platform.profile)
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
-        if model.platform.auto:  # a named one was corrected, and its contradiction says so
+        if model.platform.auto:  # else a configured platform was corrected, which its contradiction has reported
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if has_other_head and self._is_idle:  # a drive is obeyed with any head; it is neither cut nor delayed
+        if has_other_head and self._is_idle:  # a drive has frames without a head: neither end nor delay it
             self._stops.recover(now, words)
         elif before not in (Platform.UNKNOWN, model.profile.kind):
             self._on_other_program(now, words)
         elif model.stop_style is StopStyle.MODE_FRAME and not model.trust.shown and self._is_idle:
-            # It can show its stop, and half a named frame may lie in its buffer.
+            # The car can show its stop, so stop it again. Half a named frame may be in its buffer.
             if model.known:
                 self._stops.begin(self._stops.full(now), FrameOrigin.RECOVERY, now)
             else:
@@ -188,20 +189,20 @@ class CarMonitor:
 
     @property
     def _is_idle(self) -> bool:
-        """Return True if nothing that a command began goes on."""
+        """Return True if no command waits, and the car neither drives nor is in a mode."""
         queue = self._executor.queue
         waits = queue.held is not None or queue.mode_change is not None or bool(queue.one_shots)
         return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
 
     def tick(self, now: float) -> None:
-        """Check for silence. Call it a few times a second."""
+        """Check for silence, and for a detected platform. Call it a few times a second."""
         self._apply_platform(now)
         model = self.model
         before = model.mode.verdict
         if model.link_open:
             self._check_silence(now)
         self._log_contradiction(before, now)
-        # Readings contradict the rest: the stop was lost, or somebody else opened a mode.
+        # Readings contradict that the car is at rest: the stop was lost, or somebody else opened a mode.
         if model.trust.state is CarTrust.STOPPED and model.mode.verdict is Verdict.CONTRADICTED and model.link_open:
             self._stops.recover(now, model.mode.evidence)
 
@@ -209,7 +210,7 @@ class CarMonitor:
         model = self.model
         fan = model.believed.fan_may_run
         limit_s = model.mode.silence_limit(fan=fan)
-        # During a stop silence shows nothing of the mode. An expected silence must still restart the clock.
+        # During a stop, silence shows nothing about the mode. But an expected silence must restart the clock even then.
         if self._stops.running is None or limit_s is None:
             model.mode.on_silence(now=now, fan=fan)
         model.mode.fade(now)
@@ -218,7 +219,7 @@ class CarMonitor:
         silent_s = model.mode.unheard_s(now)
         if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
             return
-        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting  # now, or by an earlier gateway
+        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting  # here, or by an earlier gateway
         if not was_heard and (found := model.platform.on_never_heard()):
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {found}", now)
             model.treat_as(model.platform.profile)
@@ -240,7 +241,7 @@ class CarMonitor:
         model.learn(TrustEvent.SILENT, now, words)
 
     def _on_contact(self, now: float) -> None:
-        """Stop the car when it reports again: a stuck link may deliver all frames of that time at once."""
+        """Stop the car when it reports again, as a stuck link may deliver all frames of the silence at once."""
         words = f"{self.model.name} sends readings again. The gateway stops it first."
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
@@ -255,7 +256,7 @@ class CarMonitor:
             self._log.log(Level.WARNING, "mode_contradicted", words, now)
 
     def _record_effect(self, event: Sensors, now: float) -> None:
-        """Record the effect of a mode command: a reading with the shape of the mode, from after its frame."""
+        """Record the effect of a mode command, if this is a reading of that mode from after the command's frame."""
         mode_sent = self._executor.mode_sent
         if mode_sent is None or self.model.mode.verdict is not Verdict.CONFIRMED:
             return

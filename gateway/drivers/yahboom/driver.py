@@ -1,7 +1,8 @@
 """The driver of the cars that speak the `$...#` protocol (docs/reference/protocol.md). Pure.
 
-`CarModel` is what is believed of the car. `CarMonitor` updates it with readings and silence, `Executor` with each
-written frame. `StopExecutor` carries out the stops. Here they become one driver, with the car's bytes and its actions.
+`CarModel` has the estimates of the car. `CarMonitor` updates it with readings and silence, `Executor` with each written
+frame. `StopExecutor` carries out the stops. This module joins them to one driver, which also decodes bytes and encodes
+actions.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,21 +38,21 @@ from schemas.commands import Verb
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
-"""Maximum gap of the loop. After a longer one report times do not count: a normal gap may look like a pause."""
+"""Maximum gap of the loop. After a longer one, times of reports do not count: an interval may look like a pause."""
 
 
 class YahboomDriver(Executor):
     """One car of this protocol."""
 
     def __init__(self, desk: Desk, profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> None:
-        """With `auto`, find out the platform. `profile` is then the unknown one."""
+        """Make the driver of one car. With `auto`, it detects the platform; `profile` is then the unknown one."""
         super().__init__(desk, CarModel(desk.car, profile, auto, desk.log, desk.battery_policy, learned or Learned()))
         self._monitor = CarMonitor(self.model, self, desk.log)
         self._decoder = Decoder(head=profile.dialect.head)
 
     @property
     def lost_frames(self) -> int:
-        """Return the number of `MODE00` that did not arrive, by the car's reports."""
+        """Return the number of `MODE00` frames that did not arrive, as the car's reports show."""
         return self._monitor.lost_frames
 
     # ------------------------------------------------------------------ bytes in
@@ -61,20 +62,20 @@ class YahboomDriver(Executor):
         return [*self._decoder.feed(data, now)]
 
     def flush(self, now: float) -> list[Event]:
-        """Return the events that a silence has ended."""
+        """Return the events whose frame was ended by a silence."""
         return [*self._decoder.tick(now)]
 
     def flush_at(self) -> float:
-        """Return when `flush` has something to do if no byte comes before; inf if never."""
+        """Return when `flush` has something to do if no byte arrives earlier; inf if never."""
         deadline = self._decoder.deadline()
         return float("inf") if deadline is None else deadline
 
     def drop_bytes(self) -> list[Event]:
-        """Forget the unfinished frame, and return what it was."""
+        """Forget the unfinished frame, and return the events of its bytes."""
         return [*self._decoder.end()]
 
     def sends(self, data: bytes, now: float) -> None:
-        """Remember the bytes of a frame that is written now: the link may echo them."""
+        """Remember the bytes of a frame that is about to be written, because the link may echo them."""
         self._decoder.sent(data, now)
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
@@ -82,7 +83,7 @@ class YahboomDriver(Executor):
         return measured(_own(event), self.model.profile, self.model.mode.confirmed)
 
     def verdict(self, event: Event) -> str:
-        """Return what kind of bytes these are."""
+        """Return the kind of an event's bytes."""
         return verdict_of(_own(event))
 
     def on_event(self, event: Event, now: float) -> None:
@@ -93,13 +94,13 @@ class YahboomDriver(Executor):
     # ------------------------------------------------------------------ the link, and time
 
     def link_up(self, now: float) -> None:
-        """Bring the car to a known state: the link is open."""
+        """Begin to bring the car to a known state, because the link is open."""
         self._monitor.link_up()
         self._decoder = Decoder(head=self.model.profile.dialect.head)
         super().link_up(now)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail all commands: the link is down."""
+        """Fail all commands, because the link is down."""
         self.model.cut_write = self.model.cut_write or cause is Reason.WRITE_FAILED
         self._monitor.link_down()
         super().link_down(reason, now, cause=cause)
@@ -109,19 +110,19 @@ class YahboomDriver(Executor):
         self._monitor.tick(now)
 
     def on_stall(self, gap_s: float, now: float) -> None:
-        """Stop a driven car after a gap of the loop. The times of its reports do not count then."""
+        """Stop a driven car after a gap of the loop. Ignore the times of its reports during the gap."""
         if gap_s > STALE_TIMES_S:
             self.model.evidence.reset_times()
         super().on_stall(gap_s, now)
 
     def on_sleep(self, slept_s: float, now: float) -> None:
-        """Stop the car first after a sleep of the computer."""
+        """Stop the car after a sleep of the computer, and do not count that time as a silence of the car."""
         self.model.evidence.reset_times()
         self.model.mode.excuse_silence(now)
         super().on_sleep(slept_s, now)
 
     def stop_after_sleep(self, now: float) -> None:
-        """Stop the car. A stop from before the sleep goes on, with its next try at once."""
+        """Stop the car. Continue a stop that began before the sleep, with its next try at once."""
         self.stops.on_sleep(now)
 
     # ------------------------------------------------------------------ commands
@@ -156,7 +157,7 @@ class YahboomDriver(Executor):
                 return None
 
     def _too_fast(self, step: SpeedStep) -> str | None:
-        """Return why the car must not become as fast as after this step, or None if it may."""
+        """Return why the car must not become as fast as this step would make it, or None if it may."""
         speed, before = self.model.profile.speed, self.model.believed.speed
         after = speed.step(before, step)
         share, maximum = speed.fraction(after), self.desk.speed_max
@@ -166,11 +167,11 @@ class YahboomDriver(Executor):
         return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
-        """Return the frames of an action on a part of the car, without those that the car does not know."""
+        """Return the frames of an action on a part of the car. Leave out those that the car does not understand."""
         return tuple(each for each in self._frames_of(what) if self.model.profile.refusal(frame_of(each)) is None)
 
     def _frames_of(self, what: Action) -> tuple[Frame | Later, ...]:
-        """Return the frames of an action. A general frame gets the current motion when it is written."""
+        """Return the frames of an action. A general frame gets the present motion when it is written."""
         match what:
             case Led(r, g, b):
                 return (ColorLed(r, g, b),)
@@ -195,7 +196,7 @@ class YahboomDriver(Executor):
                 return ()
 
     def _blinks(self) -> tuple[Frame, ...]:
-        """Return the frames of `find`. The last one sets the LED color that the queued commands will leave."""
+        """Return the frames of `find`. The last one restores the LED color, or sets the last one that is queued."""
         frames = [frame_of(each) for act in self.queue.one_shots for each in act.frames]
         waiting = [each for each in frames if isinstance(each, ColorLed)]
         led = waiting[-1] if waiting else self.model.believed.led
@@ -214,12 +215,12 @@ class YahboomDriver(Executor):
     # ------------------------------------------------------------------ what outlives the gateway
 
     def kept(self) -> Mapping[str, Any]:
-        """Return what was learned of the car."""
+        """Return what was learned about the car."""
         return self.model.learned.kept()
 
     @property
     def opened_as(self) -> str:
-        """Return the platform of a car in which a mode may be open."""
+        """Return the platform of the car if a mode may be open in it, else an empty text."""
         return self.model.learned.opened_as
 
 
@@ -228,5 +229,5 @@ def _own(event: Event) -> WireEvent:
 
 
 def yahboom(profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> Callable[[Desk], YahboomDriver]:
-    """Return the driver of such a car, for `Controller`."""
+    """Return a function that makes the driver of such a car, for `Controller`."""
     return lambda desk: YahboomDriver(desk, profile, auto=auto, learned=learned)

@@ -1,6 +1,7 @@
 """Sends frames to one car: one at a time, a stop before everything else. Pure.
 
-`StopExecutor` knows which frames a stop needs, `CommandQueue` what else waits, `Pacing` when a frame may be written.
+`StopExecutor` knows which frames a stop needs, `CommandQueue` has the other waiting commands, and `Pacing` knows when a
+frame may be written.
 """
 
 from typing import Final
@@ -24,8 +25,8 @@ from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
 NO_REPEAT_S: Final = 2 * FLIGHT_S
-"""Do not repeat a motion in the last moment of its drive. A report of the car takes 43 ms, and an stm32 car that sends
-one meanwhile loses the stop behind the repeated motion."""
+"""Time before the end of a drive in which its motion is not repeated. A report of the car takes 43 ms, and if an stm32
+car sends one then, it loses the stop that follows the repeated motion."""
 
 
 class Executor(Driver):
@@ -36,19 +37,19 @@ class Executor(Driver):
         self._model = model
         self.stops = StopExecutor(model, desk.log)
         self.mode_sent: tuple[Pending, float] | None = None
-        """A mode command whose effect was not seen yet, and when its frame was written."""
+        """A mode command whose effect was not seen yet, and the time of its frame."""
         self._source: StopInProgress | HeldMotion | Pending | None = None
-        """The stop, motion or command of the last frame of `poll`. None for a repetition."""
+        """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
 
     @property
     def model(self) -> CarModel:
-        """What is claimed of the car."""
+        """The claims about the car."""
         return self._model
 
     # ------------------------------------------------------------------ the link
 
     def link_up(self, now: float) -> None:
-        """Bring the car to a known state: the link is open."""
+        """Begin to bring the car to a known state, because the link is open."""
         model = self.model
         model.link_open = True
         model.missed_stop = False
@@ -60,14 +61,14 @@ class Executor(Driver):
         self.stops.begin_recovery(FrameOrigin.RECOVERY, now, [])
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail all commands: the link is down, and the state of the car is unknown."""
+        """Fail all commands, because the link is down and the state of the car is unknown."""
         model = self.model
         model.link_open = False
         model.link_reason = reason
         model.believed.repeat = False
         model.learn(TrustEvent.LINK_LOST, now, reason)
         self.mode_sent = self._source = None
-        self.senders.halt_streams(now)  # a press from before the loss does not drive the car after it
+        self.senders.halt_streams(now)  # a press from before the loss must not drive the car after it
         self.stops.link_down(reason, now, cause=cause)
         self.queue.drop(Phase.FAILED, cause, reason, now)
         model.mode.forget()
@@ -76,16 +77,17 @@ class Executor(Driver):
     # ------------------------------------------------------------------ frames out
 
     def accepts_commands(self, now: float) -> bool:
-        """Return True if a command's frame may be written: no stop runs, or a new command may take its place.
+        """Return True if a command's frame may be written: no stop is in progress, or a new command may replace it.
 
-        What the car has not shown delays nothing. Only the first frames of a stop do, through their worst case.
+        Missing evidence of a stop delays no command. Only the stop's first frames do, until their worst case is over.
         """
         running = self.stops.running
         if running is None:
             return True
         if self.stops.shutting_down:
             return False
-        # Each other frame stops the motors as well as the second frame of a soft stop does.
+        # A soft stop may be replaced after its first frame, because the frame of any command stops the car's old motion
+        # as well as the second frame would.
         is_soft = running.sequence.rank == SOFT.rank and running.index > 0
         return is_soft or now >= running.gives_way_at
 
@@ -103,8 +105,8 @@ class Executor(Driver):
             stops.fail_late(running, now)
             if stops.running is not running:
                 return None
-            # A new command goes before the repeats of a stop, but never before its first frames. While it waits for the
-            # car, no repeat may start: each would block the car again.
+            # A new command goes before the repeats of a stop, but never before its first frames. While the command
+            # waits for the car, do not begin a repeat, which would block the car again.
             if not (self._has_new_command(now) and self.accepts_commands(now)):
                 return self._next_step(running, now)
         return self._next_command(now)
@@ -112,7 +114,7 @@ class Executor(Driver):
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
         if not self.stops.is_step_due(running, now):
             return None
-        # A color that clears a string is the last one, even if somebody has set another one during this stop.
+        # The color frame that clears a string uses the last color, even if somebody has set it during this stop.
         frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
         return self._write(frame, running.why, running, running.commands[0] if running.commands else None)
 
@@ -138,18 +140,18 @@ class Executor(Driver):
 
     @property
     def _next_mode(self) -> Pending | None:
-        """Return the mode that goes before the actions on parts of the car, if one waits."""
+        """Return the waiting mode if it goes before the actions on parts of the car, else None."""
         change = self.queue.mode_change
-        # A command that was queued before the mode goes first: in the mode the car would ignore it.
+        # Queued actions go before the mode, because the car would ignore them in the mode.
         stands = self.model.at_rest or self._full_stop_runs
         waits = change is None or (self.queue.has_undelayed and stands) or not self._is_new(change)
         return None if waits else change
 
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
-        """Open a mode, but stop the car first: opening a mode while driving leaves the motors on."""
+        """Open a mode, but stop the car first, because a mode that is opened during a drive leaves the motors on."""
         assert isinstance(pending.command.what, SetMode)
         model = self.model
-        # The full stop before the mode has gone out if it runs and gives way; its evidence would delay the mode.
+        # If a full stop is running here, it gives way, so its frames are written. Do not wait for its evidence.
         if not (model.rest_is_sure or self._full_stop_runs):
             return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now, pending)
         if now < model.pacing.open_at(now, can_show=model.can_show):
@@ -158,7 +160,7 @@ class Executor(Driver):
         return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode would wait for its frame at most, s. `busy_s` is the wait of a motion."""
+        """Return the longest time that a mode would wait for its frame, s. `busy_s` is the wait of a motion."""
         model = self.model
         if model.rest_is_sure and self.stops.running is None:
             return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)
@@ -170,7 +172,7 @@ class Executor(Driver):
 
     @property
     def _full_stop_runs(self) -> bool:
-        """Return True if a stop runs that is more than the end of a drive, and that does not give way at once."""
+        """Return True if a stop is running that is more than the end of a drive, and does not give way at once."""
         running = self.stops.running
         if running is None or running.sequence.rank <= SOFT.rank:
             return False
@@ -184,24 +186,24 @@ class Executor(Driver):
         return any(pending is not None and self._is_new(pending) for pending in waiting)
 
     def _is_new(self, pending: Pending) -> bool:
-        """Return True if a command began after the running stop, or waits for that stop: only then it may go first."""
+        """Return True if a command may go before the rest of the running stop: it is newer, or waits for that stop."""
         running = self.stops.running
         if running is None or not self._full_stop_runs:
             return True
-        # A stop that precedes a mode is there for that mode, and for what was queued before it. So is a mode that goes
-        # before the repeats: the commands that it waits for go with it.
+        # A stop that is sent before a mode is for that mode, and for the commands that were queued before it. If a
+        # newer mode may go before the repeats of a stop, the commands for which it waits may too.
         change = self.queue.mode_change
         newer = change if change is not None and change.received_at >= running.began_at else None
         before = any(mode is not None and pending.received_at <= mode.received_at for mode in (running.before, newer))
         return pending.received_at >= running.began_at or before
 
     def _repeats(self, at: float) -> bool:
-        """Return True if the motion is repeated then: it changed, and its drive does not end just after."""
+        """Return True if the motion is to be repeated at this time: it has changed, and its drive does not end soon."""
         held = self.queue.held
         return self.model.believed.repeat and (held is None or held.ends_at - at > NO_REPEAT_S)
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
-        """Repeat the stop of a car at rest that has not shown it: its frames may have been lost."""
+        """Repeat the stop of a car at rest that has not shown it, because its frames may have been lost."""
         model, renewal = self.model, self.stops.renewal
         if now < renewal.due_at or not model.at_rest or model.trust.shown or self.stops.running is not None:
             return None
@@ -213,7 +215,7 @@ class Executor(Driver):
     def _begin_stop(
         self, sequence: StopSequence, why: FrameOrigin, now: float, before: Pending | None = None
     ) -> OutgoingFrame | None:
-        """Begin a stop, if need be before a command. Return its first frame if that may be written now."""
+        """Begin a stop, which may be for a command (`before`). Return its first frame if that may be written now."""
         self.stops.begin(sequence, why, now)
         assert self.stops.running is not None
         self.stops.running.before = before
@@ -231,12 +233,12 @@ class Executor(Driver):
     # ------------------------------------------------------------------ frames written
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
-        """Update model and queue: the link has taken the frame that `poll` returned."""
+        """Update model and queue, because the frame that `poll` returned is written."""
         source, self._source = self._source, None
         model, frame = self.model, write.frame
         if isinstance(frame, ModeClose):
             if not model.manual:
-                # A turn of the mode that is left may be deaf for longer than the closing takes.
+                # One turn of the mode may ignore frames for longer than it takes to close the mode.
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
                 model.left_at, model.left_until = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
             model.evidence.closed(now, awake=model.is_awake(now))
@@ -299,7 +301,7 @@ class Executor(Driver):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
-        """Withdraw the shown rest: the car may read half of a named frame as a motion.
+        """Withdraw the claim that the car has shown its rest, because it may read half of a named frame as a motion.
 
         See docs/reference/protocol.md#hazards.
         """
@@ -315,7 +317,7 @@ class Executor(Driver):
     # ------------------------------------------------------------------ stops
 
     def shut_down(self, now: float) -> None:
-        """Stop the car and reject all later commands: the gateway ends."""
+        """Stop the car, and reject all later commands, because the gateway ends."""
         if self.stops.shutting_down:
             return
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
@@ -333,7 +335,7 @@ class Executor(Driver):
 
     @property
     def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car, or an empty text if the car is stopped."""
+        """Return why the car was not stopped at the end of the gateway. Empty if it was stopped."""
         return self.stops.not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
@@ -345,7 +347,7 @@ class Executor(Driver):
         self.stops.begin(self.stops.soft(now), FrameOrigin.STOP, now, pending)
 
     def resume_motion(self, words: str, now: float) -> None:
-        """End a soft stop: the car moves again, and the rest of the stop would only jerk it."""
+        """End a soft stop, because the car moves again and the rest of the stop would make it jerk."""
         running = self.stops.running
         if running is None or running.sequence.rank != SOFT.rank:
             return
@@ -354,27 +356,27 @@ class Executor(Driver):
             self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off if a stop is asked now and its frames arrive."""
+        """Return the longest time until the motors are off, if a stop is requested now and its frames arrive."""
         return self.stops.worst_s(now)
 
     def free_at(self, now: float) -> float:
-        """Return when the car can take a motion, as far as that is known."""
+        """Return when a motion can be sent to the car, as far as that is known."""
         return self.stops.free_at(now)
 
     @property
     def doubt_of_drive(self) -> str:
-        """Return why the car may have ignored a drive, or an empty text if there is no reason to think so."""
+        """Return why the car may have ignored a drive. Empty if there is no such reason."""
         model = self.model
         if model.is_deaf and model.missed_stop:
             return "it has not reacted to the last stop"
         if model.profile.kind is Platform.UNKNOWN and model.mode.verdict is not Verdict.CONFIRMED:
-            return "no reading shows its mode, and in some modes it ignores drives. Name its platform to leave them"
+            return "no reading shows its mode, and in some modes it ignores drives. Name its platform to end such modes"
         return ""
 
     # ------------------------------------------------------------------ time
 
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
         if not self.model.link_open:
             return float("inf")
         times = self.queue.deadlines()

@@ -15,7 +15,7 @@ PLATFORMS: Final = tuple(map(str, Platform))
 
 
 def profile_of(name: str) -> Profile:
-    """Return what cars of a platform can do. Raises ValueError for a wrong name."""
+    """Return the profile of a platform. Raises ValueError for a wrong name."""
     return parse_platform(name)
 
 
@@ -25,8 +25,8 @@ def profiles() -> tuple[Profile, ...]:
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], YahboomDriver]":
-    """Return the driver of a car. With `auto` it finds out the platform. Raises ValueError for a wrong platform."""
-    # A program that only asks for a profile needs no driver.
+    """Return a function that makes a car's driver. With `auto`, the driver detects the platform. Raises ValueError."""
+    # Import the driver only here, because a program that only asks for a profile does not need it.
     from gateway.drivers.yahboom.driver import yahboom
     from gateway.drivers.yahboom.estimate.learned import Learned
 

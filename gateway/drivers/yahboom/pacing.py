@@ -1,23 +1,25 @@
 """Decides when the next frame may be written, from the blocks of the last frames and the car's buffer.
 
-The program on the car is one loop. It reads its serial buffer, acts, measures, reports, and begins again, and while it
-acts it reads nothing: a whistle or a servo blocks it for a good part of a second, a ranging without an echo for a whole
-one. What arrives meanwhile lies in a buffer of 64 bytes. When the loop comes back, it takes what is there as ONE
-string, so two frames that waited together are not two commands: one is lost, or, worse, they make a third one that
-nobody sent. Most of the hazards in docs/reference/protocol.md come from that.
+The program on the car is one loop. It reads its serial buffer, acts, measures, reports, and begins again. While it acts
+it reads nothing: a whistle or a servo blocks it for a good part of a second, a ranging without an echo for a whole one.
+Bytes that arrive meanwhile wait in a buffer of 64 bytes. When the loop reads the buffer, it treats all its bytes as ONE
+string. So two frames that waited together are not two commands: one is lost, or, worse, they make a third one that
+nobody sent. Most of the hazards in docs/reference/protocol.md have this cause.
 
-So a frame should be alone in the buffer when the car looks, and the difficulty is that the car does not say when it
-looks. This class keeps two times for the last frame. The *flight* is the time in which it is certainly under way: 60
-ms, or its own block if that is longer. The time by which it is *read* is a worst case: at once if the car is awake, as
-its last report shows; otherwise after the longest ranging; and later by the block of any frame that waited before it. A
-report that was sent after the write shows that the loop came round, and moves that time forward.
+So a frame should be alone in the buffer when the car reads it. The difficulty is that the car does not say when it
+reads. `Pacing` estimates two times for the last frame. Its *flight* is the time during which it is certainly under way:
+60 ms, or its own block if that is longer. The time by which it is *read* is a worst case: at once if the car is awake,
+as its last report shows; otherwise after the longest ranging; and in both cases later by the block of any frame that
+waited before it. A report that was sent after the write shows that the loop has read the buffer, so the time can be set
+to an earlier one.
 
 Callers say how careful they must be (`Gate`). A stop waits only for the flight, because a stop that waits for certainty
-is late; its repetitions make up for what is lost. What opens a mode, or must not be read behind another frame, waits
-until it is alone. Blocks that are merely possible never delay a stop, and always delay what can wait.
+is late, and its repetitions make up for lost frames. A frame that opens a mode, or that must not be read behind another
+frame, waits until it is alone. Blocks that are only possible never delay a stop, but they delay everything that can
+wait.
 
-How long frames block is learned from the car at hand (`Learned`), since programs and boards differ; what is expected is
-only the beginning. The class knows frames and times, no commands: `Executor` decides which frame is written.
+How long frames block is learned from each car (`Learned`), because programs and boards differ. The expected times are
+used only until then. This module knows frames and times, but no commands: `Executor` decides which frame is written.
 """
 
 from enum import IntEnum
@@ -30,19 +32,19 @@ from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from schemas.words import Platform, ServoAction
 
 FLIGHT_S: Final = 0.06
-"""Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""
+"""Minimum time of a frame's flight. A longer block counts instead (docs/reference/protocol.md#pacing)."""
 FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 AWAKE_S: Final = 0.6
-"""Maximum time after a report in which the car reads a frame at once: it ranges again an interval later."""
+"""Maximum time after a report during which the car reads a frame at once. An interval later, it ranges again."""
 LINK_DELAY_S: Final = 0.3
-"""Maximum delay of a report by the link, which shortens that time."""
+"""Maximum delay of a report by the link. It shortens the time in which the car is awake."""
 AWAKE_WAIT_S: Final = 1.25
-"""Maximum wait for a report before a mode is opened: the ranging that the car may be in, and a margin."""
+"""Maximum wait for a report before a mode is opened: one ranging, which may have just begun, and a margin."""
 
 
-# On the STM32 a named frame that arrives while a report is sent lies over a general frame that was not read yet, and
-# can start the car (docs/reference/protocol.md#programs-that-people-have). So leave 20 ms of wire, 60 ms, and one
-# report of 48 ms.
+# On the STM32, a named frame that arrives while a report is sent overwrites the beginning of an unread general frame,
+# and the two together can start the car (docs/reference/protocol.md#programs-that-people-have). So leave time for 20 ms
+# on the wire, 60 ms, and one report of 48 ms.
 NAMED_GAP_S: Final = 0.13
 """Minimum time from any frame to a named one."""
 
@@ -69,7 +71,7 @@ class Pacing:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the link is new."""
+        """Forget everything, because the link is new."""
         self._written_at = self._framed_at = float("-inf")
         self._block_s = 0.0
         self._sure_s = 0.0
@@ -104,14 +106,14 @@ class Pacing:
         return not isinstance(frame, ArmSet)
 
     def on_report(self, at: float) -> None:
-        """Record a report of mode 0: after it the car reads the waiting frames."""
+        """Record a report of mode 0, after which the car reads the waiting frames."""
         self._reported_at = at
         if at >= self._written_at + FLIGHT_S:  # an earlier report was under way when the frame was written
             self._read_by = min(self._read_by, at + self._before_s)
 
     @property
     def _interval_s(self) -> float:
-        """The interval of the reports, without the ranging, as far as it is known."""
+        """The interval of the reports with an echo, as far as it is known."""
         expected_s, no_echo = self.profile.interval_s, self.learned.no_echo
         if no_echo.is_known:  # without an echo a report takes longer by the whole ranging
             expected_s = min(expected_s, no_echo.median_s - self.profile.ranging_s)
@@ -121,11 +123,11 @@ class Pacing:
     def awake_until(self) -> float:
         """Return until when the car reads a frame at once, as its last report shows; -inf if nothing shows it."""
         if not (self.learned.echo.is_known or self.learned.no_echo.is_known):
-            return float("-inf")  # it may range again at once
+            return float("-inf")  # the car may range again at once
         return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
 
     def named_at(self, frame: Frame) -> float:
-        """Return the earliest time for this frame if it is a named one: behind another frame it must not be read."""
+        """Return the earliest time for a named frame, which the car must not read together with the one before it."""
         return float("-inf") if isinstance(frame, General | Reset) else self._framed_at + NAMED_GAP_S
 
     @property
@@ -140,7 +142,7 @@ class Pacing:
 
     @property
     def buffer_until(self) -> float:
-        """Return until when the last frame may be unread, or the next frame may join it in the car's buffer."""
+        """Return until when the last frame may be unread, so that the next one could join it in the car's buffer."""
         # A longer block does not matter: after the car has read the frame, the next one is alone in the buffer.
         return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_INTERVAL_S))
 
@@ -155,7 +157,7 @@ class Pacing:
         return self._read_by + self._block_s
 
     def blocked_at(self, now: float) -> bool:
-        """Return True if the car is certainly busy with our last frame, and not ranging with that frame unread."""
+        """Return True if the car is certainly acting on our last frame, and not still ranging before it reads it."""
         running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
         return running and self._before_s == 0.0 and self.clear_at(now)
 
@@ -169,20 +171,20 @@ class Pacing:
             case Gate.NOTHING:
                 return float("-inf")
             case Gate.FLIGHT:
-                return self._written_at + max(FLIGHT_S, self._sure_s)  # a merely possible block does not delay it
+                return self._written_at + max(FLIGHT_S, self._sure_s)  # a block that is only possible does not count
             case Gate.ALONE:
                 return self.buffer_until
 
     def act_at(self, frame: Frame) -> float:
         """Return the earliest time for the frame of a one-shot."""
         if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
-            return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
+            return max(self.flight_until, self.buffer_until)  # if it is received with another one, the program dies
         return max(self.flight_until, self.named_at(frame))
 
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""
-        # On a car that is awake the block begins at once, and the end of the mode can be shown. A car that cannot show
-        # it need not wait, and no other waits for long.
+        # If the car is awake when the mode is opened, the block begins at once, and the car can later show that it left
+        # the mode. So wait for a report, but not for long, and not on a car that cannot show it.
         alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
         if alone <= self.awake_until or not can_show:
             return alone

@@ -1,4 +1,4 @@
-"""Carries out the stops of one car: sends each again until the car shows it, or cannot show it. Pure.
+"""Carries out the stops of one car: repeats each stop until the car has shown it, or cannot show it. Pure.
 
 `Executor` writes the frames. `CarMonitor` reports what the car's readings show.
 """
@@ -23,7 +23,7 @@ from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 _PROBED: Final = (Finding.REPORT, Finding.PAUSE, Finding.CONTROL)
-"""The reports after which a stop that the car may still show goes on with its next frame."""
+"""Findings after which a stop that the car may still show continues with its next frame, a probe or a control."""
 
 
 class StopExecutor:
@@ -35,7 +35,7 @@ class StopExecutor:
         self.renewal = StopRenewal(model)
         self.shutting_down = False
         self.not_stopped = ""
-        """Why the gateway ends without a stop of the car. Empty if the car is stopped."""
+        """Why the car was not stopped at the end of the gateway. Empty if it was stopped."""
         self._log = log
         self._shutdown_until = float("inf")
 
@@ -50,7 +50,7 @@ class StopExecutor:
         return stop_in_progress.full(self.model.for_stop(now))
 
     def begin(self, sequence: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
-        """Begin a stop, or join the running one if that is no weaker."""
+        """Begin a stop, or join the running one if that is at least as strong."""
         model = self.model
         model.believed.repeat = False
         joining = [pending] if pending is not None else []
@@ -63,20 +63,20 @@ class StopExecutor:
             running.repeats = False
         if why is FrameOrigin.SHUTDOWN:
             running.why = why
-        # A new command need not wait for the next try, but only after this silence the next frame is certain.
+        # A new command need not wait for the next try. But only after this silence the car reads the next frame alone.
         if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
 
     def stop_again(self, now: float) -> None:
-        """Send general stops to a car that had shown that it stands, and is silent now."""
+        """Send general stops to a car that had shown that it stands still, and is silent now."""
         self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
         self.running.at_rest = True
 
     def leave_open_mode(self, now: float) -> None:
-        """Send `MODE00` to a car whose readings show an open mode, and that got only general stops until now."""
+        """Send `MODE00` to a car whose readings show an open mode, if it has only got general stops until now."""
         running = self.running
         got_mode_frame = running is not None and any(
             isinstance(step.frame, ModeClose) for step in running.sequence.steps
@@ -87,14 +87,14 @@ class StopExecutor:
             )
 
     def recover(self, now: float, words: str) -> None:
-        """Bring the car to a known state. Commands that wait for a running stop wait for this one."""
+        """Begin to bring the car to a known state. Commands that wait for a running stop then wait for this one."""
         before = self.running
         why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
         self.model.learn(TrustEvent.DOUBTED, now, words)
         self.begin_recovery(why, now, commands)
 
     def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
-        """Begin the recovery sequence, in place of any running stop."""
+        """Begin the recovery sequence. It replaces any running stop."""
         self._start(stop_in_progress.recovery(self.model.for_stop(now)), why, now, commands)
 
     def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
@@ -118,18 +118,18 @@ class StopExecutor:
         model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
 
     def _case(self, sequence: StopSequence) -> StopCase:
-        """Return what this stop rests on if the car does not show it."""
+        """Return the case that decides when this stop may end although the car has not shown it."""
         return self.model.stop_case(is_soft=sequence.rank == sequences.SOFT.rank)
 
     def change_case(self) -> None:
-        """Judge the running stop by the profile that is in force now."""
+        """Choose the case of the running stop again, by the profile that is in force now."""
         if self.running is not None:
             self.running.case = self._case(self.running.sequence)
 
     # ------------------------------------------------------------------ link, shutdown
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
-        """Fail the commands of the running stop: the link is down."""
+        """Fail the commands of the running stop, because the link is down."""
         self.renewal.suspend()
         running, self.running = self.running, None
         words = (
@@ -156,11 +156,11 @@ class StopExecutor:
         return self.shutting_down and self.running is None
 
     def is_shutdown_over(self, now: float) -> bool:
-        """Return True if the gateway waits no longer for the car to show the stop."""
+        """Return True if the time is over for which a gateway that shuts down waits for evidence of the stop."""
         return self.shutting_down and now >= self._shutdown_until
 
     def give_up(self, running: StopInProgress, now: float) -> None:
-        """End without a stop that the car showed."""
+        """End the last stop although the car has not shown it, because the gateway must end."""
         self.running = None
         self._end_unstopped("has not reacted to the stop", now)
         for pending in running.commands:
@@ -173,7 +173,7 @@ class StopExecutor:
     # ------------------------------------------------------------------ tries
 
     def is_step_due(self, running: StopInProgress, now: float) -> bool:
-        """Return True if the next frame of the stop is due. After the last frame, wait for evidence."""
+        """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
             return False
@@ -184,7 +184,7 @@ class StopExecutor:
         return now >= running.due_at(self.model.pacing)
 
     def _await(self, running: StopInProgress, now: float) -> None:
-        """End a stop that the car cannot show. If the car can show it, and did not in time, send the stop again."""
+        """End a stop that the car cannot show. Send the stop again if the car could show it, but did not in time."""
         case = self._ends_as_sent(running, now)
         if case is cases.SOFT and self.model.is_deaf:
             self._doubt_soft(running, now)
@@ -196,7 +196,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
-        """Return why the stop ends without evidence, or None if the car may still show it."""
+        """Return the case as which the stop ends without evidence, or None if the car may still show it."""
         if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)
@@ -220,7 +220,7 @@ class StopExecutor:
         )
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:
-        """Go on with full stops after a soft one: the car has not reacted to the last full stop."""
+        """Replace a soft stop by full stops, because the car has not reacted to the last full stop."""
         what = (
             "and has not reacted to the last stop" if self.model.missed_stop else "before it could show its last stop"
         )
@@ -229,7 +229,7 @@ class StopExecutor:
             self._log.record(pending, Phase.SENT, now, words=words, basis=Basis.SENT)
         self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
-        self.running.overdue = self.running.repeats = True  # the next drive need not wait for the evidence
+        self.running.overdue = self.running.repeats = True  # so that the next drive need not wait for evidence
         self.model.learn(TrustEvent.NOT_SHOWN, now, words)
 
     def _try_again(self, running: StopInProgress, now: float) -> None:
@@ -241,7 +241,7 @@ class StopExecutor:
         self.model.evidence.tried_again()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
-        """Fail the commands that have waited too long for evidence. The stop goes on."""
+        """Fail the commands that have waited too long for evidence. Continue the stop."""
         car = self.model.name
         is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
         if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
@@ -270,22 +270,22 @@ class StopExecutor:
                 self._log.log(Level.WARNING, "unheard", words, now)
 
     def _is_new(self, running: StopInProgress) -> bool:
-        """Return True if the car reports in mode 0 since the stop, and was never seen to react to a frame."""
+        """Return True if the car has reported in mode 0 since the stop, and was never seen to react to a frame."""
         is_unknown = self.model.learned.shows is Shows.UNKNOWN
         return is_unknown and running.report_at > running.began_at and self.model.is_heard
 
     def _finish_unknown(self, running: StopInProgress, now: float) -> None:
-        """End a stop of a car that reports in mode 0, and that was never seen to react to a frame: as sent."""
+        """End, as sent, the stop of a car that reports in mode 0 and was never seen to react to a frame."""
         self._finish(running, Basis.SENT, cases.NOT_KNOWN.why(self.model.name), now, cases.NOT_KNOWN)
 
     def end_doubt(self, now: float) -> None:
-        """End the doubt of a person about a car that has shown its stops before: a person says that it is fine."""
+        """End the doubt about a car that did not show its last stop, because a person says that it is fine."""
         self.model.learned.forget_reactions()
         if self.running is not None and self.running.overdue and self.model.trust.state is CarTrust.UNPROVEN:
             self._finish_unknown(self.running, now)
 
     def give_way(self, now: float) -> None:
-        """End a stop that the car has not shown yet: a new command takes the place of its repeats."""
+        """End a stop that the car has not shown yet, because a new command replaces its repeats."""
         running, self.running = self.running, None
         words = f"{self.model.name} was commanded again before its readings could show the stop, which was sent"
         for pending in running.commands if running is not None else ():
@@ -295,7 +295,7 @@ class StopExecutor:
     # ------------------------------------------------------------------ evidence
 
     def on_finding(self, finding: Finding, at: float, now: float) -> None:
-        """Apply what a reading of mode 0 shows to the running stop."""
+        """Apply the finding of a reading to the running stop."""
         running = self.running
         if running is None or running.first_at is None:
             return
@@ -303,7 +303,7 @@ class StopExecutor:
         if finding is not Finding.NOTHING and at > running.closed_at + FLIGHT_S and at > running.first_at + FLIGHT_S:
             running.report_at = at
             if at >= running.closed_at + evidence.close_s - EARLY_S > float("-inf"):
-                running.sent_all = True  # it is in mode 0, and reads
+                running.sent_all = True  # the report shows that the car is in mode 0, and reads frames
         match finding:
             case Finding.SHOWN:
                 self._finish(running, Basis.SHOWN, evidence.words, now)
@@ -315,14 +315,15 @@ class StopExecutor:
                 self._handle_loss(running, now)
             case _:
                 pass
-        if finding is Finding.UNJUDGED:  # let the next interval be undisturbed, so that the rhythm can be learned
+        if finding is Finding.UNJUDGED:  # leave the next interval undisturbed, so that the rhythm can be learned
             running.reported_s = stop_in_progress.reported_s(self.model.profile, self.model.learned, slowest=True)
-            if self.model.learned.echo.is_known:  # and it is another one now
+            if self.model.learned.echo.is_known:  # the rhythm was known, but it is another one now
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
                 running.reported_s = max(running.reported_s, next_s)
         if self.running is running and running.frames_sent:
             self._await(running, now)
-        # A probe counts only on a car that is awake, so directly after a report. If it must wait, let it wait for one.
+        # A probe counts only on a car that is awake, so send it directly after a report. If it cannot be sent now, wait
+        # for the next report.
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
         if (
             self.running is running
@@ -336,7 +337,7 @@ class StopExecutor:
             running.begin_try(sequences.control(interval_s) if is_control else sequences.PROBE, now)
 
     def on_contact(self, now: float, words: str) -> None:
-        """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""
+        """Stop a car that reports again after a silence, as the frames of that time may be lost or arrive at once."""
         running = self.running
         if running is None or running.at_rest:
             self.recover(now, words)
@@ -344,7 +345,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def on_sleep(self, now: float) -> None:
-        """Stop the car first after a sleep of the computer. A stop from before goes on, with its next try at once."""
+        """Stop the car after a sleep of the computer. Continue an earlier stop, with its next try at once."""
         running = self.running
         if running is not None and running.sequence.rank > sequences.SOFT.rank and not running.at_rest:
             if running.frames_sent:
@@ -353,7 +354,10 @@ class StopExecutor:
             self.begin(self.full(now), FrameOrigin.STOP, now)
 
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
-        """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""
+        """Send the stop again at once, because the reports have continued without a pause.
+
+        The case decides, because the reports of a Raspberry Pi always continue.
+        """
         running.probes += 1
         if (
             running.case.repeats_lost
@@ -362,14 +366,14 @@ class StopExecutor:
         ):
             self._try_again(running, now)
             if running.sequence.is_recovery:
-                # The reports of a car that blocks may come by a timer. Then the block of the last frame may run still,
-                # and a `#` that arrives before its end is read as one string with the `MODE00` after it.
+                # The car may report by a timer although frames block it. Then the block of the last frame may not be
+                # over. A `#` that arrives before its end would be read as one string with the `MODE00` after it.
                 running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(
         self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = cases.MANUAL
     ) -> None:
-        """End the stop: the car showed it, or cannot show it."""
+        """End the stop, because the car has shown it, or cannot show it."""
         model, shown = self.model, basis is Basis.SHOWN
         self.running = None
         recovered = model.trust.state in STOP_GOES_ON and not model.known
@@ -419,7 +423,7 @@ class StopExecutor:
         return stop_in_progress.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
 
     def free_at(self, now: float) -> float:
-        """Return when the car can take a motion, as far as that is known."""
+        """Return when a motion can be sent to the car, as far as that is known."""
         running, ready_at = self.running, self.model.ready_at
         if running is None or running.is_soft:
             return ready_at

@@ -15,16 +15,16 @@ CLEARING_RENEWALS: Final = 4
 
 
 class StopRenewal:
-    """The schedule of renewals, and the frame of the next one."""
+    """The schedule of the renewals, and their frames."""
 
     def __init__(self, model: CarModel) -> None:
         self.left_mode = False
-        """True if the last stop left a mode, in which a general stop is ignored."""
+        """True if the last stop had to end a mode. A car that is still in the mode ignores general stops."""
         self._model = model
         self._count = 0
         self._next_at = float("inf")
         self._general_stop_follows = False
-        """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop follows alone."""
+        """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop must follow."""
 
     def suspend(self) -> None:
         """Send no more renewals until the next `schedule`."""
@@ -50,12 +50,13 @@ class StopRenewal:
         """Return when the next frame of a renewal is due; inf if never."""
         if self._general_stop_follows:
             return self._model.pacing.written_at + REPEAT_INTERVAL_S
-        # In one string behind a servo frame `MODE00` would open a mode: its digits are read out of that frame.
+        # If the car read `MODE00` in one string with a servo frame before it, it would take the digits of the servo
+        # frame, and open a mode.
         return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
 
     @property
     def is_full_stop(self) -> bool:
-        """Return True if the whole stop is sent again: the car may still be in the mode that it should leave."""
+        """Return True if the whole stop must be sent again, because the car may still be in the mode."""
         return not self._general_stop_follows and self._model.rest_case.renews_whole and self.left_mode
 
     def next_frame(self, now: float) -> Frame:
@@ -71,8 +72,8 @@ class StopRenewal:
     def _clears(self) -> bool:
         """Return True if the next renewal is a `MODE00`.
 
-        A general stop does nothing to a car that keeps half a named frame (docs/reference/protocol.md#hazards).
-        `MODE00` clears it.
+        A car that holds half a named frame ignores a general stop (docs/reference/protocol.md#hazards). `MODE00` clears
+        that half.
         """
         model = self._model
         if model.profile.refusal(ModeClose()) is not None:

@@ -1,19 +1,20 @@
 """Learns one car's habits from its readings: its rhythm, its delays, and whether it can show that a stop arrived. Pure.
 
-Cars of one protocol run different programs (docs/reference/protocol.md#programs-that-people-have). One reports by its
-loop, another every second by a timer; for one `MODE00` blocks a second, for another it does not block at all. So no
-number of one program judges another. A car is compared with itself.
+Cars of one protocol run different programs (docs/reference/protocol.md#programs-that-people-have). One program reports
+once per turn of its loop, another every second by a timer. One is blocked by `MODE00` for a second, another not at all.
+So a car must not be judged by the numbers of another program. It is compared with its own earlier behavior.
 
-A *rhythm* is the interval of undisturbed reports: the last few of them, their median and their spread. A report that
-the link lost or held makes a wrong interval, so an interval enters the rhythm only if it fits the others. Three in a
-row that fit each other, and not the rhythm, are a new rhythm: the car runs another program, or another car came.
+A *rhythm* is the interval of undisturbed reports: the last few intervals, their median and their spread. If the link
+loses or holds a report, the interval is wrong, so an interval is added to the rhythm only if it fits the others. If
+three in a row fit each other but not the rhythm, they are a new rhythm: the car runs another program, or it is another
+car.
 
-A *delay* is by how much a report comes later than the rhythm after one frame that may block. A car that blocks
-acknowledges each such frame by its delay; one that reports by a timer never does.
+A *delay* is how much later than the rhythm a report comes after one frame that may block. A car that blocks
+acknowledges each such frame with its delay. A car that reports by a timer never does.
 
-"It cannot show a stop" is a finding, not a first impression. It takes `UNREACTED` blocking frames without any delay,
-and none with one. It ends as it began: by `REACTED` delays of just the block of a frame. Nothing is sent just to
-learn. `Learned.kept` and `Learned.restore` carry all of it over a restart.
+The finding that a car cannot show a stop needs more than a first impression: `UNREACTED` blocking frames without any
+delay, and none with a delay. It is withdrawn after `REACTED` delays that are as long as the block of a frame. No frame
+is sent only to learn. `Learned.kept` and `Learned.restore` preserve all of this over a restart.
 """
 
 from collections import deque
@@ -28,28 +29,28 @@ from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Reject, Sens
 from schemas.words import Blocking, Mode, Shows
 
 KEPT_INTERVALS: Final = 9
-"""Number of intervals of a rhythm."""
+"""Maximum number of intervals of a rhythm. The newest count."""
 SAME_S: Final = 0.18
-"""Maximum difference of intervals that belong to one rhythm: cars spread them by up to 0.08 s each way."""
+"""Maximum difference of intervals that belong to one rhythm. Those of one car differ by up to 0.08 s each way."""
 FIRM_INTERVALS: Final = 4
 """Number of intervals from which their spread counts as known."""
 FIRST_TOLERANCE_S: Final = 0.12
-"""Tolerance until then."""
+"""Tolerance until the spread is known."""
 LINK_TOLERANCE_S: Final = 0.05
 """Tolerance for the link and the machine, in addition to the spread."""
 CHANGED_INTERVALS: Final = 3
-"""Number of consecutive intervals that are a new rhythm."""
+"""Number of consecutive intervals that make a new rhythm."""
 AGREEING_DELAYS: Final = 3
-"""Number of consecutive delays that agree and so are the block of a frame."""
+"""Number of consecutive equal delays that count as the block of a frame."""
 ALWAYS: Final = 5
-"""Minimum number of values out of range that are a finding, if none was in range."""
+"""Number of values out of range that make a finding, if no value was in range."""
 UNREACTED: Final = 4
-"""Number of undisturbed blocking frames without a reaction that make a car one that cannot show a stop."""
+"""Number of undisturbed blocking frames without a reaction after which a car counts as one that cannot show a stop."""
 REACTED: Final = 3
-"""Number of consecutive reactions that end that finding."""
+"""Number of consecutive reactions that withdraw that finding."""
 MAX_LEARNED_S: Final = 10.0
-"""Maximum interval or block: three times those of the slowest car. A longer gap is the link's or the loop's. As the
-first interval it would be the rhythm, and each stop would wait that long for a report before it is sent again."""
+"""Maximum interval or block: three times those of the slowest car. A longer gap comes from the link or our loop. If it
+became the rhythm, as the first interval does, each stop would wait that long for a report before it is sent again."""
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:
@@ -75,7 +76,7 @@ class Rhythm:
     _others: deque[float] = field(default_factory=lambda: deque(maxlen=CHANGED_INTERVALS))
     """The last consecutive intervals that do not fit."""
     median_s: float = 0.0
-    """The median; 0 if no interval is known. It is asked for at every report and tick, and changes with an interval."""
+    """The median, or 0 if no interval is known. It is stored, because it is used at every report and tick."""
 
     @property
     def is_known(self) -> bool:
@@ -89,7 +90,7 @@ class Rhythm:
 
     @property
     def is_changing(self) -> bool:
-        """Return True if the last undisturbed interval did not fit: another rhythm may begin."""
+        """Return True if the last undisturbed interval did not fit, so that another rhythm may begin."""
         return bool(self._others)
 
     @property
@@ -99,7 +100,7 @@ class Rhythm:
 
     @property
     def seen_tolerance_s(self) -> float:
-        """Return the maximum difference of an interval from the median, as far as the intervals show it."""
+        """Return the maximum difference of an interval from the median, as the intervals until now show it."""
         return self.spread_s + LINK_TOLERANCE_S
 
     @property
@@ -118,7 +119,7 @@ class Rhythm:
             self._others.clear()
             return False
         self._others.append(interval_s)
-        first = len(self.intervals) < 2  # nothing has confirmed the first interval yet
+        first = len(self.intervals) < 2  # the first interval is not confirmed by another one yet
         needed = 2 if first else CHANGED_INTERVALS
         latest = list(self._others)[-needed:]
         if len(latest) < needed or max(latest) - min(latest) > SAME_S:
@@ -134,7 +135,7 @@ class Rhythm:
         self.median_s = median(self.intervals) if self.intervals else 0.0
 
     def is_multiple(self, delay_s: float, tolerance_s: float) -> bool:
-        """Return True if a delay is a whole number of intervals, as if the link had lost that many reports."""
+        """Return True if a delay is a whole number of intervals, so that lost reports may have caused it."""
         if not self.is_known or delay_s < self.median_s / 2:
             return False
         count = max(1, round(delay_s / self.median_s))
@@ -152,8 +153,8 @@ class Learned:
     doubted: bool = False
     """True if the car has shown its stops before, and did not show the last one."""
     opened_as: str = ""
-    """The detected platform as which the gateway last opened a mode, until a report shows mode 0 again. In a silent
-    mode nothing else tells what ends it. Empty if none is open."""
+    """The platform that was detected when the gateway last opened a mode, until a report shows mode 0 again. In a
+    silent mode, only this tells the next gateway how to end the mode. Empty if no mode is open."""
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -164,12 +165,12 @@ class Learned:
     _blocks: dict[Blocking, float] = field(default_factory=dict)
     _unreacted: int = 0
     _reacted: int = 0
-    """Number of consecutive reactions of a car that counts as one that cannot show a stop."""
+    """Number of consecutive reactions since the finding that the car cannot show a stop."""
 
     # ------------------------------------------------------------------ rhythm and delays
 
     def add_interval(self, interval_s: float, *, echo: bool) -> bool:
-        """Add an undisturbed interval. Return True if it completes another rhythm: what the car has shown is over."""
+        """Add an undisturbed interval. Return True if it completes a new rhythm, so that earlier findings are void."""
         if interval_s > MAX_LEARNED_S:
             return False
         was_known = self.shows is not Shows.UNKNOWN or self.echo.is_firm
@@ -179,21 +180,21 @@ class Learned:
         return changed and was_known
 
     def forget_reactions(self) -> None:
-        """Forget what the car can show: it is not known whether it is the same car."""
+        """Forget whether the car can show a stop, because it may be another car or program now."""
         self.shows, self.doubted, self._unreacted = Shows.UNKNOWN, False, 0
         self._delays.clear()
         self._blocks.clear()
 
     def interval_s(self, expected_s: float) -> float:
-        """Return the interval of the reports with an echo: as seen, or else as expected."""
+        """Return the interval of the reports with an echo: the observed one, or else the expected one."""
         return self.echo.median_s if self.echo.is_known else expected_s
 
     def block_s(self, kind: Blocking, expected_s: float) -> float:
-        """Return by how much a frame of this kind delays the next report: as seen, or else as expected."""
+        """Return the time by which a frame of this kind delays the next report: as observed, or else as expected."""
         return self._blocks.get(kind, expected_s)
 
     def close_s(self, expected_s: float) -> float:
-        """Return by how much `MODE00` delays the next report: as seen, or else as expected."""
+        """Return the time by which `MODE00` delays the next report: as observed, or else as expected."""
         return self.block_s(Blocking.MODE_CLOSE, expected_s)
 
     @property
@@ -204,8 +205,8 @@ class Learned:
     def add_delay(self, kind: Blocking, delay_s: float, longest_s: float, *, controlled: bool) -> bool:
         """Add the delay of an undisturbed report after a frame. Return True if the last delays agree.
 
-        A delay counts if it is clearly longer than the spread and shorter than `longest_s`. If it is as long as lost
-        reports would be, it counts only if `controlled`: other frames of ours delay no report.
+        A delay counts if it is clearly longer than the spread and shorter than `longest_s`. If lost reports could have
+        caused it, it counts only if `controlled`, which means that another frame of ours has delayed no report.
         """
         tolerance_s = self.echo.tolerance_s
         if not 2 * tolerance_s < delay_s < longest_s or (not controlled and self.is_confusable(delay_s)):
@@ -220,15 +221,15 @@ class Learned:
         return True
 
     def on_reaction(self, *, sure: bool) -> None:
-        """Record that a report came late by just the block of a frame. If `sure`, a lost report cannot look so."""
+        """Record that a report came late by the block of a frame. `sure`: a lost report could not cause this delay."""
         self._unreacted = 0
         if self.shows is Shows.NO and sure:
             self._reacted += 1
-            if self._reacted >= REACTED:  # its wire was loose, or another program runs
+            if self._reacted >= REACTED:  # perhaps a wire was loose before, or another program runs now
                 self.shows, self._reacted = Shows.UNKNOWN, 0
 
     def on_no_reaction(self) -> bool:
-        """Record a blocking frame without a delay. Return True if the car counts as one that cannot show a stop now."""
+        """Record a blocking frame without a delay. Return True if the car now counts as one that cannot show a stop."""
         self._unreacted += 1
         self._reacted = 0
         if self.shows is not Shows.UNKNOWN or self._unreacted < UNREACTED:
@@ -241,12 +242,12 @@ class Learned:
         self.shows, self.doubted, self._unreacted = Shows.YES, False, 0
 
     def is_confusable(self, delay_s: float) -> bool:
-        """Return True if reports that the link loses could look like this delay."""
+        """Return True if reports that the link has lost could cause the same delay."""
         return self.echo.is_multiple(delay_s, 2 * self.echo.tolerance_s)
 
     @property
     def always_rejected(self) -> tuple[str, ...]:
-        """Return the fields whose values were often out of range, and never in it."""
+        """Return the fields whose values were often out of range, and never in range."""
         return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
 
     def on_fields(self, event: Sensors, rejects: tuple[Reject, ...]) -> None:
@@ -272,7 +273,7 @@ class Learned:
     # ------------------------------------------------------------------ state file
 
     def kept(self) -> dict[str, Any]:
-        """Return what is kept over a restart, as JSON values."""
+        """Return the part that must survive a restart, as JSON values."""
         return {
             "echo_s": [round(each, 4) for each in self.echo.intervals],
             "no_echo_s": [round(each, 4) for each in self.no_echo.intervals],
@@ -285,7 +286,7 @@ class Learned:
 
     @classmethod
     def restore(cls, kept: Mapping[str, Any]) -> "Learned":
-        """Return what `kept` returned. Raises ValueError, KeyError or TypeError if it is damaged."""
+        """Make the object from the result of `kept`. Raises ValueError, KeyError or TypeError if that is damaged."""
         learned = cls(
             shows=Shows(kept["shows"]),
             doubted=bool(kept["doubted"]),

@@ -1,7 +1,7 @@
 """Estimates the mode of the car from the commanded mode and the readings. The car never reports its mode.
 
 Silence never confirms a mode, so a silent mode is at best assumed. The table tests/vectors/mode_truth.tsv lists which
-modes can be distinguished and how soon; the tests check it.
+modes can be distinguished, and how soon. The tests check that table.
 """
 
 from collections import deque
@@ -20,15 +20,16 @@ CONTRADICTING_FRAMES: Final = 3
 (docs/explanation/how-sure-is-a-mode.md#contradiction)."""
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
-"""Minimum silence that contradicts mode 0, and modes 2, 5 and 6. Known blocks and a running fan do not count."""
+"""Minimum silence that contradicts mode 0, and that contradicts modes 2, 5 and 6. The time of known blocks, and of a
+running fan, is not counted."""
 FIRST_SILENCE_S: Final = 5.0
 """The same for mode 0 until the rhythm of the car is known."""
 SILENCE_MARGIN_S: Final = 0.75
-"""Minimum by which a silence is longer than the longest normal interval of the car."""
+"""How much longer than the car's longest normal interval a silence must be to contradict mode 0."""
 CORRUPTED_MATCH_S: Final = 0.5
-"""Period after a reading from another mode in which a single match may be a corrupted frame. Require three in a row."""
+"""Period after a reading of another mode in which a single match may be a corrupted frame, so three are required."""
 MAX_BLOCKS: Final = 256
-"""Maximum blocking frames that excuse a silence: a car that whistles without a pause reports nothing."""
+"""Maximum number of blocking frames that are remembered to excuse a silence, such as that of endless whistling."""
 
 
 @dataclass(slots=True)
@@ -44,22 +45,22 @@ class ModeEstimator:
     evidence: str = "no reading yet"
     evidence_at: float | None = None
     since: float | None = None
-    """Since when the mode is commanded and the verdict is what it is, or None if no mode was commanded on this link."""
+    """When the commanded mode or the verdict last changed, or None if no mode was commanded on this link."""
     candidates: tuple[Mode, ...] = ()
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
     _settled_at: float = field(default=float("-inf"))
-    """The latest time at which an obedient car is in the commanded mode."""
+    """When a car that obeys is in the commanded mode at the latest."""
     _obeys_by: float = field(default=float("-inf"))
-    """The same for a car that was in that mode before the last frame."""
+    """The same time for a car that was in that mode already when the last frame was written."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
     _other_at: float = field(default=float("-inf"))
     """When the last reading arrived that fits the commanded mode, and the last that does not."""
     _excused_at: float = field(default=float("-inf"))
-    """When silence was last expected. Unexpected silence is measured from here."""
+    """When silence was last expected. An unexpected silence is measured from then on."""
     _ended_silence_s: float = 0.0
-    """The longest silence on this link that was normal for this car after all (`allow_silence`)."""
+    """The longest silence on this link that proved to be normal for this car (`allow_silence`)."""
     _matches: int = 0
     _mismatches: int = 0
     """Number of consecutive readings that fit the commanded mode, and that do not."""
@@ -73,7 +74,7 @@ class ModeEstimator:
 
     @property
     def is_left(self) -> bool:
-        """Return True if readings show mode 0 where another mode was commanded: the car has left it."""
+        """Return True if readings show mode 0 although another mode was commanded, so the car has left that mode."""
         return self.asked is not Mode.MANUAL and self.verdict is Verdict.CONTRADICTED and self.inferred is Mode.MANUAL
 
     def on_mode_sent(self, mode: Mode, *, now: float, block_s: float) -> None:
@@ -97,12 +98,12 @@ class ModeEstimator:
         self.evidence_at = now
 
     def on_written(self, block_s: float, *, now: float) -> None:
-        """Record any other written frame: its block delays the readings."""
+        """Record any other written frame, because its block delays the readings."""
         if block_s > FRAME_S:
             self._blocks.append((now, block_s))
 
     def forget(self) -> None:
-        """Forget the mode: the link was lost."""
+        """Forget the mode, because the link was lost."""
         self.asked = None
         self.inferred = None
         self.candidates = ()
@@ -114,7 +115,7 @@ class ModeEstimator:
         self.evidence_at = self.since = None
 
     def on_reading(self, event: Sensors, *, counts: bool = True) -> None:
-        """Update the estimate with a reading. If it does not count, it only ends the silence."""
+        """Update the estimate with a reading. With `counts` False, the reading only ends the silence."""
         at = event.at
         self._heard_at = at
         if not counts:
@@ -153,7 +154,7 @@ class ModeEstimator:
             self._on_expected_silence(self.asked, now)
             return
         if self._heard_at == float("-inf"):
-            return  # a car that never sent anything shows no mode by its silence
+            return  # the silence of a car that never sent a reading shows nothing about its mode
         silent_s = self.unheard_s(now)
         if silent_s > self.manual_silence_s:
             self._set_candidates(self._silent_modes)
@@ -168,15 +169,15 @@ class ModeEstimator:
             self._conclude(Verdict.CONTRADICTED, words, now)
 
     def allow_silence(self, silent_s: float) -> None:
-        """Take a silence that a report has ended for one that this car has at times, on this link.
+        """Count a silence that a report has ended as normal for this car on this link.
 
-        A silence of over `FIRST_SILENCE_S` does not count: the car was off or out of range.
+        Ignore a silence of over `FIRST_SILENCE_S`, because then the car was off or out of range.
         """
         if silent_s <= FIRST_SILENCE_S:
             self._ended_silence_s = max(self._ended_silence_s, silent_s)
 
     def excuse_silence(self, now: float) -> None:
-        """Count no silence from before now: nobody could hear the car."""
+        """Ignore the silence until now, because nobody could hear the car."""
         self._excused_at = max(self._excused_at, now)
 
     @property
@@ -204,13 +205,13 @@ class ModeEstimator:
             self._conclude(Verdict.ASSUMED, f"no reading as in mode {self.asked} for {since_s:.1f} s", now)
 
     def unheard_s(self, now: float) -> float:
-        """Return the time without a reading beyond the blocks of our frames, s; never negative."""
+        """Return the time without a reading, less the time for which our frames blocked the car, s; at least 0."""
         return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
         """Return the longest silence of the commanded mode, s. None if silence shows nothing, or no mode was commanded.
 
-        In a mode other than 0, silence shows something only on a car that has reported in that mode before.
+        In a mode other than 0, silence shows something only if this car has reported in that mode before.
         """
         if self.asked is None or self.is_silent(self.asked) or (fan and self.profile.fan_silences):
             return None
@@ -256,12 +257,13 @@ class ModeEstimator:
 
     def _silence_s(self, heard_at: float, now: float) -> float:
         since = max(heard_at, self._settled_at, self._excused_at)
-        # The car obeyed earlier frames before this reading began. Its ranging took 1.0 s at most.
+        # Do not count older blocks: the car had obeyed those frames before it began this reading, whose ranging took
+        # 1.0 s at most.
         return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_INTERVAL_S)
 
     def _set_candidates(self, candidates: tuple[Mode, ...]) -> None:
         self.candidates = candidates
-        # One ambiguous reading withdraws no confirmation: it may be corrupted.
+        # One ambiguous reading does not withdraw a confirmation, because it may be corrupted.
         if len(candidates) == 1 or self.verdict is not Verdict.CONFIRMED:
             self.inferred = candidates[0] if len(candidates) == 1 else None
 

@@ -1,6 +1,6 @@
 """Estimates motion, speed, fan, servo and LED of the car from the written frames.
 
-The car confirms none of them. Readings give evidence of its mode only, see mode.py.
+The car confirms none of them. Its readings are evidence only of its mode (see mode.py).
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,19 +12,19 @@ from schemas.words import Motion
 
 @dataclass(slots=True)
 class StateEstimate:
-    """The sum of the frames written since the link came up. Times: s, monotonic."""
+    """The effect of all frames written since the link was opened. Times: s, monotonic."""
 
     profile: Profile
     motion: Motion = Motion.STOP
     """The last motion sent."""
     repeat: bool = False
-    """True if the motion changed, and was not repeated alone yet (docs/reference/protocol.md#pacing: the 1.1 s
+    """True if the motion has changed, and has not been repeated yet (docs/reference/protocol.md#pacing: the 1.1 s
     rule)."""
     fan: bool | None = None
     fan_at: float = float("-inf")
     """When the fan was last toggled."""
     fan_toggled: bool = False
-    """True if it was toggled, and no reading came since it had settled."""
+    """True if it was toggled, and no reading has arrived since the fan reached its new state."""
     servo_deg: int | None = None
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
     speed: float = field(init=False)
@@ -59,7 +59,7 @@ class StateEstimate:
 
     @property
     def fan_may_run(self) -> bool:
-        """Return True if the fan runs, or may run: its state is unknown, and it was toggled after the last reading."""
+        """Return True if the fan runs, or may run because its state is unknown and it was toggled since a reading."""
         return self.fan is True or (self.fan is None and self.fan_toggled)
 
     def with_motion(self, frame: Frame) -> Frame:

@@ -1,7 +1,7 @@
-"""Detects from the car's bytes which program runs on it, and checks them against the configured profile.
+"""Detects from the car's bytes which program runs on it, and checks the bytes against the configured profile.
 
-Two differences leave no trace in the bytes. An arduino and an stm32 send the same. And a car does not report its
-lights, such as light 1, which a raspberry_pi car cycles. A single frame may be corrupted, so it takes three in a row.
+Two differences cannot be seen in the bytes: an arduino and an stm32 usually send the same, and a car does not report
+its lights, such as light 1, which a raspberry_pi car cycles. A single frame may be corrupted, so three in a row count.
 """
 
 from dataclasses import dataclass, field
@@ -16,12 +16,12 @@ from schemas.platform_name import HEAD, NO_READINGS
 from schemas.words import Mode, Platform
 
 EVIDENCE_FRAMES: Final = 3
-"""Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
+"""Number of consecutive frames that make or end evidence. A single one may be corrupted, as there is no checksum."""
 
 OTHER_PROGRAM_FRAMES: Final = 12
-"""Number of consecutive frames of another program, or with another head, that replace the one with which the car was
-read. A link that loses or changes bytes makes such a frame now and then, and a wrong head or platform keeps every named
-frame from the car."""
+"""Number of consecutive frames of another program, or with another head, after which the car counts as such a car. The
+number is high, because a link that loses or changes bytes makes such a frame now and then, and with a wrong head or
+platform the car ignores every named frame."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
@@ -29,7 +29,7 @@ _CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimete
 _WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
 _WITH_MODES: Final = "arduino (or stm32: their bytes are usually the same)"
 TWO_CELLS_V: Final = 9.0
-"""Voltage over which a battery has more than two cells: they have 8.4 V when full."""
+"""Voltage above which a battery must have more than two cells: two full cells have 8.4 V."""
 
 
 @dataclass(slots=True)
@@ -59,15 +59,15 @@ class PlatformDetector:
     configured: Profile
     auto: bool = False
     remembered: Profile | None = None
-    """With `auto`: what the car was when a mode was opened that may still be open. It counts until readings come."""
+    """With `auto`: the profile with which a mode was opened that may still be open. Used until readings arrive."""
     profile: Profile = field(init=False)
     """The profile in force: the configured one, or with `auto` the detected one."""
     _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
     _with_modes: str = ""
     _raspberry_pi: str = ""
-    """Evidence for a car with modes, and for a Raspberry Pi. If both are set, the car is of an unknown kind."""
+    """Evidence for a car with modes, and for a Raspberry Pi. If there is evidence for both, the platform is unknown."""
     _alone: int = 0
-    """Number of consecutive readings that one of the two kinds sends, and the other one does not."""
+    """Number of consecutive readings that only one of the two kinds sends."""
     _alone_has_modes: bool = False
     _options: frozenset[str] = frozenset()
     _seen: dict[str, _PlatformEvidence] = field(
@@ -113,16 +113,16 @@ class PlatformDetector:
 
     @property
     def is_remembered(self) -> bool:
-        """Return True if no reading of this link has settled the platform, and one from before counts."""
+        """Return True if no reading of this link has shown the platform, so that the remembered one is used."""
         return self.profile is self.remembered
 
     @property
     def is_settled(self) -> bool:
-        """Return True if enough readings came to know what they can tell of the platform."""
+        """Return True if the platform is known, or enough readings have arrived that more would not show it."""
         return self.profile.kind is not Platform.UNKNOWN or self._readings > EVIDENCE_FRAMES
 
     def begin_link(self) -> None:
-        """Forget what the readings of the last link showed of the mode, and of the head."""
+        """Forget the mode and the head that the readings of the last link showed."""
         self._open_mode = _PlatformEvidence()
         self._is_read, self._heads = False, 0
 
@@ -134,7 +134,7 @@ class PlatformDetector:
     def on_event(self, event: Event, *, counts: bool = True) -> tuple[str, ...]:
         """Update the evidence, and with `auto` the profile. Return new contradictions, in words.
 
-        If a reading does not count, only its head does.
+        With `counts` False, use only the head of a reading.
         """
         if isinstance(event, Sensors):
             self._is_read, self._heads = True, 0
@@ -162,10 +162,10 @@ class PlatformDetector:
         return new
 
     def on_never_heard(self) -> str:
-        """Take a raspberry_pi car that has sent nothing on this link as one that never sends readings.
+        """Treat a raspberry_pi car that has sent nothing on this link as one that never sends readings.
 
-        Its reports show no stop in any case, so only words depend on them. Return what that contradicts, in words;
-        empty for any other car: its silence may be that of a mode.
+        The reports of such a car never show a stop, so only texts depend on this. Return the contradiction, in words.
+        Return an empty text for any other car, because that may be in a silent mode.
         """
         if self.profile.kind is not Platform.RASPBERRY_PI or not self.profile.has_readings:
             return ""
@@ -175,9 +175,9 @@ class PlatformDetector:
         return f"no readings, which {named} cars send. It is treated as {self.profile.name} until one arrives"
 
     def _count_reading(self) -> tuple[str, ...]:
-        """Count one reading of a car that counts as one without any. It counts as one with readings from the third on.
+        """Count a reading of a car that counts as one without readings. The third one ends that.
 
-        If only its silence had made it one, the first reading ends that.
+        If the car counted as such only because of its silence, the first reading is enough.
         """
         self._frames[NO_READINGS] = self._frames.get(NO_READINGS, 0) + 1
         if not self._assumed_silent and self._frames[NO_READINGS] < EVIDENCE_FRAMES:
@@ -197,14 +197,14 @@ class PlatformDetector:
         return True
 
     def _count_variant(self, option: str) -> None:
-        """Count one sign of a variant of the program. Only a car whose platform is detected gets it by itself."""
+        """Count one sign of a variant of the program. With `auto`, three signs add the option to the profile."""
         self._frames[option] = self._frames.get(option, 0) + 1
         if self.auto and self._frames[option] == EVIDENCE_FRAMES and option not in self.profile.options:
             self._options |= {option}
             self._apply_evidence()
 
     def _check_profile(self, event: Sensors) -> tuple[str, ...]:
-        """Update the contradictions of the profile. Only a mode-0 frame can end those of mode 0."""
+        """Update the contradictions of the profile. Only a frame of mode 0 can end a contradiction in mode 0."""
         observed = self.profile.contradictions(event)
         if not observed and not self._against:
             return ()
@@ -244,7 +244,8 @@ class PlatformDetector:
             self._options = _without_head(self._options) | {option}
             self._apply_evidence()
             return ()
-        # No other car sends such frames, so the option was written wrongly. With it, no reading could be read.
+        # Only cars with this head send such frames, so the configured option is wrong. With it, no reading could be
+        # read.
         named = self.profile.name
         self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
@@ -256,8 +257,8 @@ class PlatformDetector:
         if len(candidate_modes(event)) > 1:
             return
         in_manual = only_candidate(event) is Mode.MANUAL
-        # Whole centimeters with other values than these constants may come from a Raspberry Pi that measures its
-        # battery, or from an stm32. A mode frame ends the program of the first, so such a car stays unknown.
+        # Whole centimeters without these constants may come from a Raspberry Pi that measures its battery, or from an
+        # stm32. A mode frame would end the Raspberry Pi's program, so such a car stays unknown.
         whole = whole_cm(event)
         shown = {
             _MODE_READINGS: not in_manual,
@@ -277,7 +278,7 @@ class PlatformDetector:
                 self._apply_evidence()
 
     def _count_alone(self, *, with_modes: bool, pi: bool) -> None:
-        """Count one reading for the kinds. Many for one kind alone end what another program has shown before."""
+        """Count a reading that only one kind sends. After many of them, drop the evidence for the other kind."""
         if with_modes is pi:
             self._alone = 0
             return
@@ -292,7 +293,7 @@ class PlatformDetector:
         self._apply_evidence()
 
     def forget(self) -> None:
-        """Forget what the readings have shown of the program: another one runs."""
+        """Forget the evidence about the program, because another program is running."""
         self._with_modes = self._raspberry_pi = ""
         self._is_wide, self._alone, self._readings = False, 0, 0
         for words in self._seen:
@@ -317,7 +318,7 @@ class PlatformDetector:
         if not self.auto:
             return ()
         if self._with_modes and self._raspberry_pi:
-            return (f"both {self._with_modes} and {self._raspberry_pi}: none of the platforms that are known",)
+            return (f"both {self._with_modes} and {self._raspberry_pi}: no known platform sends both",)
         if self._with_modes and self._is_wide:
             return (f"stm32: {EVIDENCE_FRAMES} {_WIDE_READINGS}",)
         if self._with_modes:
@@ -325,8 +326,8 @@ class PlatformDetector:
         if self._raspberry_pi:
             return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._raspberry_pi}",)
         if self.is_remembered:
-            return (f"{self.profile.name}: so it was detected before a mode was opened, and it may be in that mode",)
-        return (f"not settled: it takes {EVIDENCE_FRAMES} readings running",)
+            return (f"{self.profile.name}: detected before a mode was opened, in which the car may still be",)
+        return (f"not settled: {EVIDENCE_FRAMES} readings in a row are needed",)
 
 
 def _profile_of(kind: Platform, options: frozenset[str]) -> Profile:

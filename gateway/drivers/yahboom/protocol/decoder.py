@@ -1,13 +1,13 @@
 """Finds the frames in a car's bytes: bytes in any pieces go in, events come out. No I/O, no clock.
 
-Linear and bounded: the buffer has at most `max_frame` bytes and is never searched twice. Every byte is in the `raw` of
-exactly one event, with two harmless exceptions. Separators (CR, LF, space, tab) between frames make no event, nor does
-a late `#` after a frame that silence has ended.
-A whole line of text between frames is an event of its own. Other junk is one event for each run of up to `max_frame`
-bytes. After an overlong frame, everything up to the next `$` is junk.
+Its work is linear and its memory bounded: the buffer has at most `max_frame` bytes and is never searched twice. Every
+byte is in the `raw` of exactly one event, with two harmless exceptions: separators (CR, LF, space, tab) between frames,
+and a late `#` after a frame that a silence has ended.
+A whole line of text between frames is an event. Other junk is one event for each run of up to `max_frame` bytes. After
+an overlong frame, everything up to the next `$` is junk.
 
-The events depend only on the bytes and on gaps of 50 ms and 0.5 s between them, not on the pieces. `parser` makes the
-reading of one whole frame.
+The events depend only on the bytes and on gaps of 50 ms and 0.5 s between them, not on the pieces. `frame_parser` makes
+the reading of one whole frame.
 """
 
 import re
@@ -26,8 +26,8 @@ _MIN_FRAME: Final = 64  # a sensors frame in its longest observed spelling has 4
 MISSING_END_SILENCE_S: Final = (
     0.050  # docs/reference/protocol.md#readings: a missing `#` is accepted when nothing follows for 50 ms
 )
-# A link that was dead joins the beginning of one frame and the end of another. Such a frame was never measured. A
-# radio repeats lost bytes in less time.
+# After an outage, a link joins the beginning of one frame and the end of another. Such a frame is no measurement, so
+# end an incomplete frame after a silence. A radio link repeats lost bytes in less time than this.
 CUT_FRAME_SILENCE_S: Final = 0.5
 """Silence that ends an incomplete frame. It is rejected as truncated (docs/reference/protocol.md#readings)."""
 ECHO_S: Final = 2.0  # docs/reference/protocol.md#readings: bytes equal to a frame that we sent in the last 2 s
@@ -38,14 +38,14 @@ _MARK = re.compile(rb"[$#]")
 _SEPARATORS = b"\r\n \t"
 _LINE_END_BYTES = frozenset(b"\r\n")
 _LINE = re.compile(rb"[^\r\n]*(?:\r\n|[\r\n])")
-# A piece of a damaged frame ends with a line end, too, where the car prints one after each frame. So a text has a word
-# of its own and none of the protocol's, wherever it begins.
+# If the car prints a line end after each frame, a piece of a damaged frame also ends with one. So a line counts as text
+# only if it contains a word, and no word of the protocol.
 _TEXT = re.compile(rb"(?=.*[A-Za-z]{2})[\t\x20-\x22\x24-\x7e]+")
 _PROTOCOL_WORD = re.compile(rb"(?<![A-Za-z])(?:4WD|CSB|PV|GS|LF|HW|GM|J[1-6]|MPU|Servo|PTZ|CL[RGB]|MODE)")
 
 
 class Decoder:
-    """Decodes the bytes of one connection, so that a new link never completes an old frame."""
+    """Decodes the bytes of one connection. Make a new one for a new link, which must not complete an old frame."""
 
     def __init__(self, max_frame: int = MAX_FRAME, *, head: str = STANDARD_HEAD) -> None:
         """`head` is the first word of the frames of this car."""
@@ -61,7 +61,7 @@ class Decoder:
         self._sent: dict[bytes, float] = {}
 
     def use_head(self, head: str) -> None:
-        """Take this as the first word of the frames from now on."""
+        """Use this as the first word of the frames from now on."""
         self._head, self._head_bytes = head, head.encode()
         self._matcher = sensors_matcher(head)
         self._match_ended = self._matcher.match_ended
@@ -86,7 +86,7 @@ class Decoder:
         return events
 
     def tick(self, now: float) -> list[Event]:
-        """Return the events that silence up to `now` completes; `feed` calls this first."""
+        """Return the events that the silence until `now` completes. `feed` calls this first."""
         if now < self._last + self._silence_s:
             return []
         self._silence_s = inf
@@ -96,7 +96,7 @@ class Decoder:
         return self._unended(by_silence=True)
 
     def deadline(self) -> float | None:
-        """Return the time at which to call `tick`, on the clock of `now`. None if silence would complete nothing."""
+        """Return the time at which to call `tick`, on the clock of `now`. None if a silence would complete no event."""
         return self._last + self._silence_s if self._buffer else None
 
     def sent(self, data: bytes, now: float) -> None:
@@ -116,7 +116,7 @@ class Decoder:
         return events
 
     def _ending_silence_s(self) -> float:
-        """Return the silence that ends the buffered bytes; there is at least one."""
+        """Return the silence that ends the buffered bytes. The buffer must not be empty."""
         whole = self._buffer[0] != _START or self._matcher.is_complete(self._buffer)
         return MISSING_END_SILENCE_S if whole else CUT_FRAME_SILENCE_S
 

@@ -33,7 +33,7 @@ _NUMBER: Final = {
 
 
 def parse(raw: bytes, at: float, head: str) -> Event:
-    """Return the event of one frame, whose `raw` goes from its `$` to its `#`; never raise.
+    """Return the event of one frame, whose `raw` is all bytes from its `$` to its `#`. Never raise.
 
     `head` is the first word of the frames of this car.
     """
@@ -54,7 +54,7 @@ def parse(raw: bytes, at: float, head: str) -> Event:
     if missing := table.missing(words):
         return Rejected(raw, at, Cause.MISSING_WORD, f"no {', '.join(word.decode() for word in missing)}")
     if not table.are_in_order(words):
-        return Rejected(raw, at, Cause.UNKNOWN_WORD, "a word twice, out of its order, or of another frame")
+        return Rejected(raw, at, Cause.UNKNOWN_WORD, "a word that is doubled, out of order, or of another frame")
     for word, text in zip(words, texts, strict=True):
         if not _NUMBER[word].fullmatch(text):
             return Rejected(raw, at, Cause.BAD_NUMBER, f"{word.decode()} {_printable(text)}")

@@ -1,6 +1,6 @@
-"""Frames to the car: one value per frame of the table, to bytes and back.
+"""The frames to the car: one class per frame of the table, and their conversion to bytes and back.
 
-`platforms` decides which cars know a frame, `gateway.control` when it is sent.
+`platforms` says which cars understand a frame. `gateway.control` and the driver decide when it is sent.
 """
 
 import re
@@ -40,8 +40,8 @@ STANDARD: Final = Dialect()
 class General:
     """The nine-field frame. It always carries a motion.
 
-    All other fields are one-shot: sent again, they act again (the fan toggles, the speed climbs). For a program that
-    takes the fan as a level, `fan` is that level (`Profile.fan_is_level`).
+    All other fields are one-shot: if they are sent again, they act again (the fan toggles, the speed increases). If a
+    program reads `fan` as a level, it is that level (`Profile.fan_is_level`).
     """
 
     motion: Motion
@@ -74,14 +74,14 @@ class ColorLed:
 
 @dataclass(frozen=True, slots=True)
 class ModeOpen:
-    """Enter a mode; `Mode.MANUAL` (`MODE01`) is refused."""
+    """Enter a mode. `Mode.MANUAL` (`MODE01`) is not allowed."""
 
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True)
 class ModeClose:
-    """Stop the motors and return to mode 0; `Mode.MANUAL` (`MODE00`) closes whatever is open."""
+    """Stop the motors and return to mode 0. `Mode.MANUAL` (`MODE00`) closes any mode."""
 
     mode: Mode = Mode.MANUAL
 
@@ -95,7 +95,7 @@ class ArmSet:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """A lone `#`: ends a truncated frame in the car's buffer. If the buffer is empty, it is a stop in mode 0."""
+    """A lone `#`. It ends a truncated frame in the car's buffer. If the buffer is empty, it stops a car in mode 0."""
 
 
 _Word = TypeVar("_Word", bound=StrEnum)
@@ -137,8 +137,8 @@ def _named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> bytes:
 def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
     """Return the frame with these bytes. None if they are not one whole frame of the table.
 
-    Rotation wins over place 1, as in the car. A `Frame` cannot express MODE01, nor a servo that moves (place 5) and
-    resets (place 9) at once: None too.
+    Rotation takes precedence over place 1, as in the car. Return None also for frames that a `Frame` cannot express:
+    MODE01, and a servo that moves (place 5) and resets (place 9) at once.
     """
     if data == b"#":
         return Reset()

@@ -1,6 +1,6 @@
 """Turns a decoder's event into its verdict and the measured fields per topic. Pure.
 
-The level of the battery is an estimate of the gateway and is not set here.
+The level of the battery is not set here, because the gateway estimates it.
 """
 
 from gateway.control.driver import Echo, Rejected, TextLine
@@ -52,7 +52,7 @@ def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None) -> dict[s
     topics: dict[str, Fields] = {}
     for name, attribute, topic, published in _PUBLISHED:
         if name in names:
-            # What the bits of the obstacle sensors mean depends on the platform and the mode.
+            # The meaning of the obstacle bits depends on the platform and the mode.
             value = profile.obstacle(event, confirmed) if name == "obstacle" else getattr(event, attribute)
             topics[topic] = published(value)
     return topics

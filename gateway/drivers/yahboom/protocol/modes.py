@@ -17,8 +17,8 @@ class ModeRow:
     """The facts of docs/reference/protocol.md#modes about one mode.
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
-    longest block of one turn of the mode's own loop. `rate_hz` is the maximum of sensors frames per second. `measures`:
-    what a frame of this mode measures, even if only other programs than the vendor's print it.
+    longest block of one turn of the mode's own loop. `rate_hz` is the maximum number of sensors frames per second.
+    `measures` lists the measurements in a frame of this mode, even if only programs of others than the vendor print it.
     """
 
     digit: int
@@ -83,15 +83,17 @@ def only_candidate(frame: Sensors) -> Mode | None:
     return candidates[0] if len(candidates) == 1 else None
 
 
-# The control code looks at one event several times: the cache makes all but the first look free.
+# The control code asks this several times for one event, so cache the result.
 @lru_cache(maxsize=8)
 def _candidates(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:  # noqa: FBT001 - two facts of a frame
     found = [(mode, row) for mode, row, signature in _SIGNED if signature.fullmatch(raw)]
     if not found:
         return (Mode.MANUAL,)
-    # The end of the frame tells light seeking from following. Before a silence, the `#` may still be on its way.
+    # The end of the frame distinguishes light seeking from following. But if the frame was ended by a silence, its `#`
+    # may still be on its way.
     if len(found) > 1 and not by_silence:
         found = [(mode, row) for mode, row in found if row.has_end is terminated]
     modes = tuple(mode for mode, _ in found)
-    # A `#` where the mode sends none: the car follows and the `#` came from somewhere, or mode 0 reads the same.
+    # If there is a `#` although this mode sends none, either the `#` is foreign, or it is a frame of mode 0 that
+    # happens to have the same text.
     return (Mode.MANUAL, *modes) if terminated and not any(row.has_end for _, row in found) else modes

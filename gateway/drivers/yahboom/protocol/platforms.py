@@ -1,4 +1,4 @@
-"""The kinds of cars: the frames that they know, their way of stopping, and which of their readings are measured.
+"""The kinds of cars: the frames that they understand, how they are stopped, and which of their readings are measured.
 
 Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
 """
@@ -42,13 +42,13 @@ class StopStyle(StrEnum):
     """The stop sequences of a car (docs/reference/protocol.md#stops)."""
 
     MODE_FRAME = "mode_frame"
-    """`MODE00` stops the car in every mode, and its block shows it."""
+    """`MODE00` stops the car in every mode, and its block shows that it arrived."""
     TIMER = "timer"
-    """`MODE00` leaves a mode, general stops do in mode 0, and nothing shows either."""
+    """`MODE00` ends a mode, general stops stop the car in mode 0, and no reading shows that either arrived."""
     GENERAL = "general"
-    """General stops only: the car knows no MODE frame, or nobody knows whether it does."""
+    """Only general stops, because the car understands no MODE frame, or may not understand it."""
     BOTH = "both"
-    """Both kinds of frames: readings contradict the platform."""
+    """Both kinds of frames, because readings contradict the platform."""
 
 
 _FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
@@ -112,9 +112,9 @@ SPECIAL_CAPABILITIES: Final[Mapping[str, Frame]] = {
 
 @cache
 def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> frozenset[str]:
-    """Return the measurements that all these modes have in common. A silent mode excludes none.
+    """Return the measurements that all these modes have in common. A silent mode excludes no measurement.
 
-    `shown` are the modes whose text the frame has. In one of them, a program prints that is silent elsewhere.
+    `shown` are the modes whose text the frame has. Such a mode counts even if it is silent in the vendor's program.
     """
     counted = (mode for mode in modes if mode not in SILENT_MODES or mode in shown)
     common = EVERY_MEASUREMENT.intersection(*(MODES[mode].measures for mode in counted))
@@ -166,7 +166,7 @@ class Profile:
 
     @property
     def has_readings(self) -> bool:
-        """False if the car never sends a reading, so that nothing shows what it does."""
+        """False if the car never sends a reading."""
         return NO_READINGS not in self.options
 
     @property
@@ -196,7 +196,7 @@ class Profile:
 
     @property
     def close_s(self) -> float:
-        """The expected block of `MODE00`, s. What the car's readings show counts more."""
+        """The expected block of `MODE00`, s. It is used until the car's readings show its own."""
         return self.block_s(ModeClose())
 
     @property
@@ -206,7 +206,7 @@ class Profile:
 
     @property
     def ranging_s(self) -> float:
-        """The longest time that a report takes longer if the ranging gets no echo, s."""
+        """The maximum time by which a report takes longer if the ranging gets no echo, s."""
         return RANGING_S
 
     @property
@@ -228,14 +228,14 @@ class Profile:
 
     @property
     def possible_modes(self) -> frozenset[Mode]:
-        """The modes that this car may be in, whoever opened them. All modes if the platform is unknown."""
+        """The modes in which this car may be, whoever opened them. All modes if the platform is unknown."""
         return frozenset(Mode) if self.kind is Platform.UNKNOWN else self.modes
 
     @property
     def fan_silences(self) -> bool:
-        """True if a running fan may silence the car (hazards: the fan on; a Raspberry Pi only blocks for 1 s).
+        """True if a running fan may make the car silent (hazards: the fan on; a Raspberry Pi is only blocked for 1 s).
 
-        An stm32 car reports by a timer, and nothing shows what its fan does.
+        An stm32 car reports by a timer. Its readings while the fan runs were not observed.
         """
         return self.kind in {Platform.ARDUINO, Platform.UNKNOWN}
 
@@ -248,7 +248,7 @@ class Profile:
         return parse_sent(data, self.dialect)
 
     def refusal(self, frame: Frame) -> str | None:
-        """Return why the car must not get this frame, for a person. None if the car knows the frame."""
+        """Return a sentence on why the car must not get this frame. None if the car understands the frame."""
         match frame:
             case General():
                 return self._general_refusal(frame)
@@ -271,7 +271,7 @@ class Profile:
                 return self._unless("mode", "a lone '#'")
 
     def why_lacking(self, capability: str) -> str | None:
-        """Return why the car lacks a capability, for a person. None if it has it, or if every car has it."""
+        """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""
         frame = SPECIAL_CAPABILITIES.get(capability)
         return None if frame is None else self.refusal(frame)
 
@@ -283,15 +283,15 @@ class Profile:
         return block_s(frame, fan_s=RASPBERRY_PI_FAN_S if slow_fan else 0.0)
 
     def mode_turn_s(self, mode: Mode) -> float:
-        """Return the longest block of one turn of this mode's own loop; the car obeys nothing meanwhile."""
+        """Return the longest block of one turn of this mode's own loop, during which the car obeys no frame."""
         # An stm32 car obeys in every mode at once. Only a report of 48 ms delays it.
         return FRAME_S if self.kind is Platform.STM32 else MODES[mode].turn_s
 
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
-        """Return the modes that this frame may come from.
+        """Return the modes in which the car may have sent this frame.
 
-        The confirmed `mode` decides between the candidates. If it is not among them, the frame may be a corrupted frame
-        of that mode, until three frames in a row contradict it.
+        If the confirmed `mode` is among the candidates, return only that. If not, the frame may be a corrupted frame of
+        that mode, until three frames in a row contradict it, so add it.
         """
         candidates = candidate_modes(event)
         if mode is None:
@@ -299,10 +299,10 @@ class Profile:
         return (mode,) if mode in candidates else (*candidates, mode)
 
     def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
-        """Return which fields of this frame are measurements in every mode that it may come from.
+        """Return the fields of this frame that are measurements in every mode in which it may have been sent.
 
-        `mode` is the confirmed mode, or None (see `resolved`). A rejected field is not measured; a range without echo
-        is.
+        `mode` is the confirmed mode, or None (see `resolved`). A rejected field is no measurement. A range without an
+        echo is one.
         """
         common = _common_measurements(self.resolved(event, mode), candidate_modes(event))
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
@@ -313,7 +313,7 @@ class Profile:
         return frozenset(names - self._out_of_range(event))
 
     def rejects(self, event: Sensors) -> tuple[Reject, ...]:
-        """Return the rejected fields of a frame, with those that are out of the range of this car only."""
+        """Return the rejected fields of a frame, and those that are out of range only for this kind of car."""
         words = {"battery": ("PV", event.voltage_v), "grayscale": ("GS", event.grayscale)}
         own = (words[name] for name in sorted(self._out_of_range(event)))
         return (*event.rejects, *(Reject(word, f"{value:g}") for word, value in own))
@@ -328,7 +328,7 @@ class Profile:
         return found
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return everything that a car of this kind can measure in this mode, without constants of the platform."""
+        """Return the names of all readings that such a car can send in this mode, without constants of the platform."""
         if mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
@@ -336,7 +336,7 @@ class Profile:
         return (EVERY_MEASUREMENT | (self.options & OPTIONS)) - {name for name, _ in self.constants}
 
     def obstacle(self, event: Sensors, mode: Mode | None = None) -> tuple[bool, bool] | None:
-        """Return obstacle left, right, with the inversion of following undone. None if it is not measured."""
+        """Return the obstacle left and right, with the inversion of following undone. None if not measured."""
         if event.obstacle is None or "obstacle" not in self.measured(event, mode):
             return None
         left, right = event.obstacle
@@ -344,7 +344,7 @@ class Profile:
         return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
-        """Return the contradictions between this frame and the platform, for a person. None found proves nothing."""
+        """Return the contradictions between this frame and the platform, in words. If there is none, nothing follows."""
         if self.kind is Platform.UNKNOWN:
             return ()
         candidates = candidate_modes(event)

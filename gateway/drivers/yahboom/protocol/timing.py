@@ -24,11 +24,11 @@ DIGITLESS_OPEN_S: Final = 2.0  # hazards: a MODE frame that lost its digits open
 # the longest block outside avoidance: opening a mode, up to 3.5 s
 LONGEST_BLOCK_S: Final = max(row.open_s for row in MODES.values())
 # Stopping, recovery: after the longest block and a margin of 0.2 s, the last `MODE00` is alone in the car's buffer.
-# Derived, so that a mode which opens more slowly makes the recovery wait longer.
+# It is computed, so that the recovery waits longer if a mode opens more slowly.
 RECOVERY_SILENCE_S: Final = round(LONGEST_BLOCK_S + 0.2, 3)
 """Time from the first frame of a recovery to its last `MODE00`."""
 REPEAT_INTERVAL_S: Final = 1.1
-"""Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
+"""Minimum interval of two frames after which each is alone in the car's buffer: an unknown block takes up to 1.0 s."""
 
 
 def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:

@@ -1,7 +1,7 @@
-"""The events of a decoder, one value each.
+"""The events of the decoder, one class each.
 
-`Sensors`, the event of a sensors frame, is in `sensors`; what is not a reading is an event of every family.
-Everything that depends on the platform is in `platforms`.
+`Sensors`, the event of a sensors frame, is in `sensors`. `Echo`, `Rejected` and `TextLine`, which every family of cars
+has, are in `gateway.control.driver`. Everything that depends on the platform is in `platforms`.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,10 @@
 """The cases of a stop: what shows it, when it ends without being shown, and what is sent after it. Pure.
 
-A stop has a case from its beginning: what it rests on if the car does not show it. The case decides whether the stop
-may end as `sent`, and as which case it ends then. That one decides how the stop is repeated. A new case is a row here.
+A stop has a case from its beginning, for the event that the car does not show it. The case decides whether the stop may
+end as `sent`, and as which case it ends then. That second case decides how the stop is repeated. A new case is a row
+here.
 
-The docs print `CASES` (docs/reference/stop-evidence.md).
+docs/reference/stop-evidence.md has `CASES` as a table.
 """
 
 from collections.abc import Callable
@@ -14,23 +15,23 @@ from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from schemas.words import Platform
 
 DOUBTED_PROBES: Final = 2
-"""Maximum probes of a car whose readings contradict its platform: a Raspberry Pi does not react to them."""
+"""Maximum probes of a car whose readings contradict its platform. It may be a Raspberry Pi, which never reacts."""
 
 
 @dataclass(frozen=True, slots=True)
 class StopFacts:
-    """What a case may ask about the stop in progress."""
+    """The facts about the stop in progress on which the rules of the cases depend."""
 
     frames_sent: bool
     """All frames of this try are written."""
     sent_all: bool
-    """All frames of the first try are written, or a report came after its `MODE00`."""
+    """All frames of the first try are written, or a report has arrived after its `MODE00`."""
     is_time_up: bool
-    """The car has obeyed by now, if the frames arrived."""
+    """By now the car has obeyed, if the frames arrived."""
     reported: bool
-    """A report of mode 0 came after the last frame."""
+    """A report of mode 0 has arrived after the last frame."""
     reported_in_try: bool
-    """One came since this try began."""
+    """A report of mode 0 has arrived since this try began."""
     without_echo: bool
     """The reports after the newest `MODE00` have no echo."""
     is_soft: bool
@@ -38,7 +39,7 @@ class StopFacts:
     fan_silences: bool
     """The fan may run, and the car sends nothing while it does."""
     can_show: bool
-    """The car shows a stop, or may."""
+    """The car shows stops, or may show them."""
 
 
 def _never(_: "StopCase", _facts: StopFacts) -> "StopCase | None":
@@ -51,15 +52,15 @@ def _no(_: StopFacts) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StopCase:
-    """What a stop rests on, by what was stopped and what the car can report."""
+    """One case of a stop, by what was stopped and what the car can report."""
 
     name: str
     stop: str
-    """Which stop it is, for the docs."""
+    """The stops of this case, for the docs."""
     shown_by: str
-    """What shows it, or an empty text if the car cannot show it."""
+    """The evidence that shows the stop, for the docs. Empty if the car cannot show it."""
     otherwise: str
-    """What happens if it is not shown."""
+    """What happens if the stop is not shown, for the docs."""
     words: str = ""
     """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
     rule: Callable[["StopCase", StopFacts], "StopCase | None"] = _never
@@ -67,16 +68,16 @@ class StopCase:
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
-    """True if the stop is sent again at once when the reports go on as before."""
+    """True if the stop is sent again at once when the reports continue without a pause."""
     is_sure: bool = True
-    """True if a car that ended a stop this way counts as standing."""
+    """True if the car counts as standing still after a stop that ended this way."""
     renews_whole: bool = False
-    """True if the whole stop is repeated: the car may still be in the mode that it should leave."""
+    """True if the whole stop is repeated, because the car may still be in the mode."""
     clears: bool = False
     """True if the first renewals are `MODE00`, which clears half a named frame."""
 
     def ends(self, facts: StopFacts) -> "StopCase | None":
-        """Return as which case a stop that began as this one ends without evidence, or None if it goes on."""
+        """Return the case as which a stop of this case ends without evidence now, or None if it does not end yet."""
         return self.rule(self, facts)
 
     def why(self, car: str) -> str:
@@ -119,7 +120,7 @@ def _probes_wrong(facts: StopFacts) -> bool:
 
 
 def _probes_in_mode_0(facts: StopFacts) -> bool:
-    # The first frames of a stop always go out, unless the car is in mode 0 and reads.
+    # The first frames of a stop are always written before a probe, unless a report shows that the car is in mode 0.
     return facts.can_show and facts.sent_all
 
 
@@ -245,11 +246,11 @@ CASES: Final = (
     WRONG_PLATFORM,
     NOT_KNOWN,
 )
-"""All of them, in the order of the docs."""
+"""All cases, in the order of the docs."""
 
 
 def case_of(style: StopStyle, profile: Profile, *, is_soft: bool, can_show: bool) -> StopCase:
-    """Return what a stop of this style rests on if a car of this profile does not show it."""
+    """Return the case with which a stop of this style begins on a car of this profile."""
     if not profile.has_readings:
         return NO_READINGS
     match style:

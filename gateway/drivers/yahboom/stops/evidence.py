@@ -1,50 +1,50 @@
-"""Detects from the car's readings whether a stop arrived. `cases` lists what a stop can rest on. Pure.
+"""Detects from the car's readings whether a stop arrived. `cases` lists the possible evidence of each stop. Pure.
 
-The car acknowledges nothing. All that a gateway has is the frames that it wrote, and the moments at which readings
-arrived. This essay is about what those moments can prove, what they cannot, and what is still doubtful.
+The car acknowledges nothing. A gateway only knows the frames that it wrote, and the times at which readings arrived.
+This essay is about what those times can prove, what they cannot, and what is still doubtful.
 
-*Why pauses.* On most cars `MODE00` blocks the program for about a second: it beeps. Meanwhile the car sends nothing, so
-the next report comes late by just that second. That lateness is the acknowledgement which the protocol lacks. The
-general stop does not block, so no reading ever shows it. That is why a stop that wants to be shown ends with a `MODE00`
-alone, and why no other frame of ours may follow it: a general stop written after the evidence could be flipped into a
-motion by the link, and nobody would look again. The frame that is judged is the last one.
+*Why pauses.* On most cars `MODE00` makes the program beep, which blocks it for about a second. Meanwhile the car sends
+nothing, so the next report comes later by just that second. This delay is the acknowledgement that the protocol lacks.
+The general stop does not block, so no reading ever shows it. That is why a stop that is to be shown ends with a lone
+`MODE00`, and why no other frame of ours may follow it: the link could turn a general stop that is written after the
+evidence into a motion, and no evidence would judge that frame. The frame that is judged must be the last one.
 
 *Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
 (docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
-another. So nothing here compares a car with a constant: `Learned` has its own rhythm and its own blocks, and a pause
-is an interval that is longer than the rhythm by just the block. A car whose reports come by a timer never pauses. For
-it nothing is ever shown here, which costs it nothing else: stops end as `sent`, and the words say why.
+another. So nothing here compares a car with a constant: `Learned` has the rhythm and the blocks of this car, and a
+pause is an interval that is longer than the rhythm by just the block. A car that reports by a timer never pauses. So
+its stops are never shown. That has no other disadvantage: they end as `sent`, and the text says why.
 
-*Why not one pause.* A link that swallows both `MODE00` and the report after it leaves a gap, too: two intervals instead
-of one. If the interval is about as long as the block, that gap equals a pause. Half of all outages of 0.6 s around a
-stop do that on a car that reports every second. So two pauses are needed, each around a `MODE00` of its own. If one of
-them is in doubt, three are: if it is longer than it should be (a slow link, or a report that the link held), or if it
-differs from the block by more than the intervals have spread so far, and these are few.
+*Why not one pause.* A link that loses both `MODE00` and the report after it leaves a gap, too: two intervals instead of
+one. If the interval is about as long as the block, that gap looks like a pause. On a car that reports every second,
+half of all outages of 0.6 s around a stop look like that. So two pauses are needed, each around its own `MODE00`. Three
+are needed if one of them is in doubt: if it is too long (because of a slow link, or a report that the link held), or if
+it differs from the block by more than the intervals have differed so far, and there were only few intervals.
 
-*Why a control.* A half-duplex link mutes its reception for a moment at each write. If the car is deaf besides, each
-`MODE00` seems to make a pause, for ever. Where a lost report can be told from the block by its length, its length
-tells. Where it cannot, because the block is about a whole number of intervals, the gateway writes a general stop a
-third of an interval after a report. It does not block, so the next report must come on time. A link that was mute from
-a `MODE00` until the report after it is mute for so long again. So it hides this one for certain, however the intervals
-spread. If the report is missing or damaged, the pauses were the link's.
+*Why a control.* A half-duplex link receives nothing for a moment at each write. If the car does not receive our frames
+either, each `MODE00` seems to make a pause, for ever. Often the length of the gap shows whether a report was lost or
+the car was blocked. It does not if the block is about a whole number of intervals. Then the gateway writes a general
+stop a third of an interval after a report. This frame does not block, so the next report must come on time. A link that
+was mute from a `MODE00` until the report after it is mute for as long again, so it hides this report for certain,
+however much the intervals differ. If the report is missing or damaged, the link made the pauses.
 
-*Why silence follows.* A link that holds reports makes gaps of any length. But the held report comes late, and the next
-one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in which
-such a report would have come.
+*Why silence must follow.* A link that holds reports makes gaps of any length. But the held report comes late, and the
+next one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in
+which such a report would have come.
 
-*Modes.* A car that reports in a mode shows that it left the mode, by the shape of its next report. On a car that was
-seen to block, that needs one report only, but the report must begin after `MODE00` was obeyed, and come before a
-`MODE00` that lost its digits would let one through: without its digits the frame opens mode 0 with the motors on, which
-blocks longer. A silent mode shows nothing by its silence. If it was opened from a shown rest, the end of the silence
-shows that it was left.
+*Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
+block, one report is enough. But the car must have begun the report after it obeyed `MODE00`, and the report must come
+earlier than it could after a `MODE00` that lost its digits: that frame opens mode 0 with the motors on, and blocks for
+longer. The silence of a silent mode shows nothing. But if the mode was opened while the car had shown its rest, the end
+of the silence shows that it was left.
 
-*What a car can forge.* Its reports have no checksum. A damaged frame of another mode can look like mode 0, so a report
-counts only after a silence that no such mode has. The start of one frame and the end of another can join. The decoder
-ends a frame at a silence, and damage of any kind ends the comparison of intervals.
+*Damaged reports.* Reports have no checksum. A damaged frame of another mode can look like one of mode 0, so a report
+counts only after a silence that no such mode has. The start of one frame and the end of another can be joined. So the
+decoder ends a frame at a silence, and damage of any kind ends the comparison of intervals.
 
-*What is still doubtful.* A link that flips bits can turn the judged `MODE00` into another frame that blocks as long; no
-such frame is known. A car that pauses by itself just when it should, twice, would be believed. And a half-duplex link
-whose mute time changes from write to write can pass the control by chance.
+*What is still doubtful.* A link that flips bits could turn the judged `MODE00` into another frame that blocks as long,
+but no such frame is known. A car that by itself pauses twice at just the right times would be believed. And a
+half-duplex link whose mute time changes from write to write can pass the control by chance.
 """
 
 from dataclasses import dataclass, field
@@ -60,35 +60,36 @@ from schemas.words import Blocking, Mode, Shows
 
 SETTLED_SHARE: Final = 0.6
 SETTLED_S: Final = 0.8
-"""Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. A reporting mode
-sends 20 frames a second; a damaged one that looks like mode 0 has no silence before it."""
+"""Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. In another mode
+the car sends 20 frames a second, so a damaged one that looks like mode 0 has no such silence before it."""
 FASTEST_S: Final = 0.3
-"""Interval of the fastest car, until that of the car is known."""
+"""Interval of the fastest car. It is used until the interval of this car is known."""
 BUNCHED_SHARE: Final = 0.3
 BUNCHED_S: Final = 0.4
-"""Maximum interval of reports that the link has delayed: this share of the interval, at most this time."""
+"""Interval below which the link must have delayed reports: this share of the normal interval, at most this time."""
 EARLY_S: Final = 0.05
-"""How much earlier than the end of a block a report may seem to come."""
+"""How much earlier than the end of a block a report may seem to arrive."""
 WIRE_S: Final = 0.02
-"""Time from the end of a block to the report after it: less than the wire takes for a report of 41 bytes."""
+"""Time from the end of a block to the report after it. It is less than a report of 41 bytes takes on the wire."""
 LATE_S: Final = 0.2
-"""Additional time of the report that shows the end of a mode, on a slow link. It counts as a pause only."""
+"""Additional time on a slow link for the report that shows the end of a mode. Such a late report is only a pause."""
 SHAPE_UNTIL_S: Final = 1.0
-"""Maximum time that readings of a mode go on after the `MODE00` that ends it."""
+"""Maximum time for which readings of a mode continue after the `MODE00` that ends it."""
 LONGER_S: Final = 0.65
-"""Maximum by which a pause may be longer than the block. It is in doubt then."""
+"""Maximum time by which a pause may be longer than the block. Such a pause is in doubt."""
 PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
 PAUSES_IN_DOUBT: Final = 3
 """Number of pauses that are needed if one of them is in doubt."""
 MISFITS: Final = 2
-"""Number of intervals that fit nothing, after which the rhythm is looked at again without a `MODE00`."""
+"""Number of intervals that are neither normal nor a pause after which the rhythm is measured without a `MODE00`."""
 SETTLING_S: Final = 0.25
 """Minimum time without a reading after the last pause, before the pauses count."""
 SHAPES: Final = 2
-"""Number of consecutive readings with the shape of another mode that show that mode."""
+"""Number of consecutive readings in the form of another mode that show that mode."""
 ROUND_TRIP_S: Final = 2.5
-"""Round trip of a slow link, from the second try on: the car may have sent earlier reports before `MODE00`."""
+"""Round trip of a slow link, which is allowed for from the second try on: the car may have sent an earlier report
+before it received `MODE00`."""
 READ_LATE_S: Final = 0.3
 """Maximum time from a frame to a report that was under way before the car read the frame."""
 IN_FLIGHT_S: Final = 0.1
@@ -96,21 +97,21 @@ IN_FLIGHT_S: Final = 0.1
 
 
 class Finding(StrEnum):
-    """The result of one reading, about the last `MODE00`."""
+    """The result of one reading, for the last `MODE00`."""
 
     NOTHING = "nothing"
     REPORT = "report"
-    """A report of mode 0 with an echo that judges no `MODE00`. The car can react to a `MODE00` now."""
+    """A report of mode 0 with an echo that is no result of a `MODE00`. The car could react to a `MODE00` now."""
     UNJUDGED = "unjudged"
-    """The same, while the rhythm of the car is not known: a `MODE00` now would show nothing."""
+    """The same, but the rhythm of the car is not known, so a `MODE00` now would show nothing."""
     PAUSE = "pause"
-    """A pause; more are needed."""
+    """A pause. More are needed."""
     CONTROL = "control"
-    """A pause that a link could forge: the next frame must be one that does not block."""
+    """A pause that the link may have made by itself. The next frame must be one that does not block."""
     SETTLING = "settling"
-    """The last pause that is needed. The stop is shown if no reading follows too early."""
+    """The last needed pause. The stop is shown if no reading follows too early."""
     LOST = "lost"
-    """Reports went on without a pause."""
+    """The reports continued without a pause."""
     NO_ECHO = "no_echo"
     """A report of mode 0 without an echo."""
     SHOWN = "shown"
@@ -136,28 +137,28 @@ class StopEvidence:
     profile: Profile
     learned: Learned = field(default_factory=Learned)
     reacted_at: float | None = None
-    """When the car last reacted to a frame, or None if never on this link, or not to the last stop."""
+    """When the car last reacted to a frame. None if it never did on this link, or did not react to the last stop."""
     words: str = ""
     """The evidence for `SHOWN`."""
     settles_at: float | None = None
-    """When the pauses count, unless a reading comes before, or None if they do not suffice."""
+    """When the pauses count, unless a reading arrives earlier. None if there are not enough pauses."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
     found_out: bool = False
-    """True if the last reading made this car one that cannot show a stop, or gave it another rhythm."""
+    """True if the last reading has shown that this car cannot show a stop, or that it has another rhythm."""
     _last_at: float = _NEVER
     """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
-    """When the last frame arrived, whole or corrupted, that is not a report of mode 0."""
+    """When the last frame arrived that is not a report of mode 0, whether whole or corrupted."""
     _before: float | None = None
     """When the last report with an echo arrived, if nothing else has arrived since."""
     _before_no_echo: float | None = None
     _pending: float | None = None
-    """When the last `MODE00` without a result was written."""
+    """When the last `MODE00` was written, if it has no result yet."""
     _delay_s: float | None = None
     """The delay of the first report after that `MODE00`, if it is known."""
     _delayed: int = 0
-    """Number of `MODE00` frames of this stop after which the first report was late, but not by the block."""
+    """Number of this stop's `MODE00` frames after which the first report was late, but not by the block."""
     _pauses: int = 0
     _pauses_needed: int = PAUSES
     _unjudged: bool = False
@@ -167,17 +168,17 @@ class StopEvidence:
     _blocking: list[_Block] = field(default_factory=list)
     """The other frames that block, since the last report."""
     _misfits: int = 0
-    """Number of intervals with a `MODE00` that neither were normal nor had a pause: this may be another program."""
+    """Number of intervals with a `MODE00` that were neither normal nor a pause. Another program may be running."""
     _fast_before: bool = False
-    """True if the last bytes were a report with an echo, however soon it came."""
+    """True if the last bytes were a report with an echo, however early it arrived."""
     _general: bool = False
     """True if a general frame that does not block was written since the last report."""
     _window_s: float = 0.0
     _shapes: int = 0
     _shape_at: float | None = None
-    """When the last reading of another mode arrived, since the last motion or opening."""
+    """When the last reading of another mode arrived, since the last motion or the opening of a mode."""
     _silent_mode: Mode | None = None
-    """The silent mode that was opened from a shown rest."""
+    """The silent mode that was opened while the car had shown its rest."""
     _opened_at: float = _NEVER
     """When the last mode was opened."""
     _closed_at: float | None = None
@@ -189,7 +190,7 @@ class StopEvidence:
 
     @property
     def close_s(self) -> float:
-        """Return by how much `MODE00` delays this car's next report, s."""
+        """Return the time by which `MODE00` delays this car's next report, s."""
         return self.learned.close_s(self.profile.close_s)
 
     @property
@@ -214,13 +215,13 @@ class StopEvidence:
 
     @property
     def settling_s(self) -> float:
-        """Return the time after the last pause in which a report that a link had held would be followed by another."""
+        """Return the time after the last pause within which a report follows if the link had held the one before."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
 
     def begin_link(self) -> None:
-        """Forget everything but what was learned: the link is new."""
+        """Forget everything except what was learned, because the link is new."""
         self.reacted_at = None
         self._last_at = self._foreign_at = _NEVER
         self._window_s = 0.0
@@ -228,15 +229,15 @@ class StopEvidence:
         self.sent_motion()
 
     def begin_stop(self) -> None:
-        """Prepare for another stop. Pauses of the one before stay, the control does not."""
+        """Prepare for another stop. Keep the pauses of the last stop, but not its control."""
         self.settles_at = None
         self._controlled = False
         self._delayed = 0
 
     def sent_motion(self) -> None:
-        """Drop the evidence: the car may drive."""
+        """Drop the evidence, because the car may drive now."""
         self._drop_pauses()
-        if self._pending is not None:  # nobody judges it any more, but it blocks the car
+        if self._pending is not None:  # it will not be judged any more, but it blocks the car
             self._blocking.append(_Block(None, self.close_s, self._pending))
         self._pending = self.settles_at = None
         self._general = True
@@ -258,15 +259,15 @@ class StopEvidence:
             self._plain = False
 
     def blocked(self, kind: Blocking | None, block_s: float, now: float) -> None:
-        """Record a frame that blocks the car for at most so long: the next report comes later."""
+        """Record a frame that blocks the car for at most `block_s`, and so delays the next report."""
         if block_s > FRAME_S:
             self._blocking.append(_Block(kind, block_s, now))
 
     def closed(self, now: float, *, awake: bool) -> None:
-        """Record a `MODE00`. If `awake`, no block of our frames runs, so the reports pause for exactly its block."""
+        """Record a `MODE00`. With `awake`, no frame of ours blocks the car, so the pause will be exactly its block."""
         self._pending = now if awake else None
         if not awake:
-            self._blocking.append(_Block(None, self.close_s, now))  # this interval does not count
+            self._blocking.append(_Block(None, self.close_s, now))  # so that this interval does not count
         self._delay_s = None
         self._unjudged = False
         self.settles_at = None
@@ -276,13 +277,13 @@ class StopEvidence:
             self._plain = False
 
     def tried_again(self) -> None:
-        """Allow for a slow link from now on."""
+        """Allow for the round trip of a slow link from now on."""
         self._window_s = ROUND_TRIP_S
 
     # ------------------------------------------------------------------ readings
 
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
-        """Record bytes that are not readings. If `damaged`, they begin like a frame, so the next may be, too."""
+        """Record bytes that are not readings. With `damaged`, they begin like a frame: the next may be damaged, too."""
         self._last_at = at
         self._before = self._before_no_echo = self.settles_at = None
         self._fast_before = False
@@ -290,20 +291,20 @@ class StopEvidence:
             self._foreign_at = at
 
     def reset_times(self) -> None:
-        """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
+        """Drop the evidence that depends on times, because a stall of the loop made the times of reports wrong."""
         self._before = self._before_no_echo = self._pending = self.settles_at = None
         self._drop_pauses()
 
     def is_settled(self, event: Sensors) -> bool:
-        """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
+        """Return False for a report of mode 0 just after other frames, as it may be a corrupted one of another mode."""
         return event.at - self._foreign_at >= self.settled_s or Mode.MANUAL not in candidate_modes(event)
 
     def on_reading(self, event: Sensors) -> Finding:
-        """Record a reading. Return what it shows."""
+        """Record a reading, and return its finding."""
         at, quiet_s = event.at, event.at - self._last_at
         self._last_at = at
         self.found_out = False
-        # A report that comes a normal interval after the last pause was not held back by the link.
+        # If this report comes a normal interval after the last pause, the link did not hold the report before it.
         on_time = self.settles_at is not None and quiet_s >= self.interval_s - self._rhythm.tolerance_s
         if on_time and Mode.MANUAL in candidate_modes(event):
             self._before, self._blocking, self._general = at if event.range_cm else None, [], False
@@ -321,7 +322,7 @@ class StopEvidence:
                 self._drop_pauses()
             return Finding.NOTHING
         self._fast_before = bool(event.range_cm)
-        if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
+        if event.range_cm is None:  # the frame is corrupted, and does not show whether there is an echo
             self._before = self._before_no_echo = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
@@ -343,7 +344,7 @@ class StopEvidence:
             if before_no_echo is not None and pending is None and not blocking:
                 self.learned.add_interval(at - before_no_echo, echo=False)
             if pending is not None and at > pending + self.close_s + self.profile.ranging_s:
-                self._pending = None  # it blocked this report or none
+                self._pending = None  # if it blocked a report, it was this one
             return Finding.NO_ECHO
         if pending is None:
             return self._without_mode_00(before, at, blocking, general=general)
@@ -359,7 +360,7 @@ class StopEvidence:
         return self._compare(before, pending, at, blocking)
 
     def settle(self, now: float) -> bool:
-        """Return True if the pauses count from now on: no reading came just after them."""
+        """Return True if the pauses count from now on, because no reading has followed them too early."""
         if self.settles_at is None or now < self.settles_at:
             return False
         self.settles_at = None
@@ -375,14 +376,14 @@ class StopEvidence:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
         if before is None:
             if general:
-                self._drop_pauses()  # the control has shown damage instead of a report
+                self._drop_pauses()  # there was damage instead of a report after the control
             return self._report
         gap_s = at - before
         if not blocking:
             if general and self._rhythm.is_known:
                 self._controlled = self._rhythm.fits(gap_s)
                 if not self._controlled:
-                    self._drop_pauses()  # the link loses reports when it is written to
+                    self._drop_pauses()  # writing makes the link lose reports
                     return self._report
             self._learn_interval(gap_s)
         elif len(blocking) == 1 and (kind := blocking[0].kind) is not None and self._rhythm.is_known:
@@ -397,9 +398,9 @@ class StopEvidence:
         return self._report
 
     def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
-        """Learn the rhythm of a car that reports faster than it did."""
+        """Learn the rhythm of a car that reports faster than before."""
         if self._pending is not None and event.at > self._pending + self._left_s + ROUND_TRIP_S:
-            self._pending = None  # its block is over, and no report came in the earlier rhythm to show it
+            self._pending = None  # its block is over, and no report in the earlier rhythm can judge it
         clean = self._fast_before and self._pending is None and not self._blocking
         self._fast_before = bool(event.range_cm)
         if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:
@@ -416,7 +417,7 @@ class StopEvidence:
         gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
         delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
         blocked_s = sum(each.block_s for each in blocking)
-        # A block ends no sooner after its frame than it lasts: a longer delay is the link's.
+        # A block cannot delay a report by more than the time since its frame. A longer delay comes from the link.
         is_possible = after_s > IN_FLIGHT_S and delay_s <= after_s + EARLY_S
         if pending >= before and is_possible and not blocking:
             self._delay_s = delay_s
@@ -426,8 +427,8 @@ class StopEvidence:
         longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
             self._pending = None
-            # Few intervals do not show how far they spread. And nobody has judged an earlier `MODE00` that may have
-            # delayed this report.
+            # Require more pauses if there are too few intervals to know their spread, or if an earlier `MODE00`, which
+            # was not judged, may have delayed this report.
             seen_s = rhythm.seen_tolerance_s
             is_close = -seen_s <= delay_s - close_s <= blocked_s + seen_s
             if not is_close or any(each.kind is None for each in blocking):
@@ -438,11 +439,11 @@ class StopEvidence:
         self._pending = None
         first_delay_s, self._delay_s = self._delay_s, None
         if first_delay_s is not None and self._agrees(first_delay_s):
-            self._pauses = self._pauses_needed  # three that agree: this car blocks for another time than expected
+            self._pauses = self._pauses_needed  # equal delays: this car blocks for another time than expected
             return self._pause(at, first_delay_s)
-        # An interval that neither is normal nor has a pause. If the rhythm is not firm yet, let it become firm first.
+        # Here the interval is no pause. If the rhythm is not firm yet, let it become firm first.
         other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
-        # A delay that is no longer than this is none.
+        # A delay up to this counts as none.
         none_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
         if abs(delay_s) > none_s:
             self._drop_pauses()
@@ -459,7 +460,7 @@ class StopEvidence:
         return Finding.LOST
 
     def _agrees(self, delay_s: float) -> bool:
-        """Count a delay other than the expected block. Return True if the last ones agree, with enough of this stop."""
+        """Count a delay other than the expected block. Return True if the last ones agree, and enough are of this stop."""
         self._delayed += 1
         return self._add_close(delay_s) and self._delayed >= PAUSES
 
@@ -469,7 +470,7 @@ class StopEvidence:
         return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
 
     def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
-        """Count a pause. With `learn`, it is not as long as expected, and may be the block of this car."""
+        """Count a pause. With `learn`, its length is not the expected one, but may be the block of this car."""
         self._pauses += 1
         self.reacted_at = at
         self._delay_s = None
@@ -499,13 +500,14 @@ class StopEvidence:
             self._silent_mode = None
 
     def _left(self, at: float, quiet_s: float, within_s: float) -> Finding:
-        """Return SHOWN if this report shows that `MODE00` alone closed the mode of the car, PAUSE if it is late."""
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode, PAUSE if it is too late for that."""
         closed_at = self._closed_at
         shape_at, silent = self._shape_at, self._silent_mode
         if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
             return Finding.NOTHING
         opening_s = self.profile.shortest_opening_s
-        # Opening alone blocks for so long. During it a slow link delivers older reports: less silence is not evidence.
+        # Opening the mode blocks for at least this time. Meanwhile a slow link may deliver older reports, so a shorter
+        # silence is no evidence.
         earliest_at = self._opened_at + opening_s + self.close_s - EARLY_S
         if silent is not None and (quiet_s < opening_s - LATE_S or at < earliest_at):
             return Finding.NOTHING
@@ -516,7 +518,7 @@ class StopEvidence:
             return Finding.NOTHING
         mode = "the mode that it reported" if silent is None else silent
         self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
-        # On a car that was never seen to block, a report may come in the middle of a block, with the motors on.
+        # A car that was never seen to block may send a report in the middle of a block, with the motors on.
         is_judged = at <= closed_at + within_s and not self._unjudged and self.learned.shows is Shows.YES
         return Finding.SHOWN if is_judged else Finding.PAUSE
 

@@ -10,15 +10,15 @@ from schemas.words import Motion
 
 STOP_REPORT_TIMEOUT_S: Final = 4.5
 """Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
-# While the car may still show that it left its mode, a general stop would follow the evidence unjudged. A `MODE00`
-# that lost its digits blocks for 2.0 s or more, so an earlier general stop would not be read earlier.
+# Do not send the general stop while the car may still show that it left its mode: it would follow the evidence, and no
+# evidence would judge it. To send it earlier would not help: a `MODE00` that lost its digits blocks for at least 2.0 s.
 JUDGED_S: Final = 2.3
 """Time from `MODE00` to the general stop if the car was in another mode than 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a sequence. `after_s` is the minimum time since the previous frame was written, or the try began."""
+    """One frame of a sequence. `after_s` is the minimum time after the previous frame, or after the try's begin."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
@@ -40,7 +40,7 @@ class StopSequence:
 
     @property
     def is_recovery(self) -> bool:
-        """Return True if it brings a car in an unknown state to rest by a lone `#` and `MODE00`."""
+        """Return True if it brings a car in an unknown state to rest, by a lone `#` and `MODE00`."""
         return self.name == RECOVERY.name
 
 
@@ -57,13 +57,13 @@ FULL: Final = StopSequence(
     "full", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
 )
 
-# The same out of another mode than 0, in which a general stop is ignored.
+# The same for a car in another mode than 0, where it ignores a general stop.
 FULL_MODE: Final = StopSequence(
     "full_mode", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=JUDGED_S))
 )
 
-# The same if a frame of ours may be unread. Behind that frame the car would read `MODE00` at the wrong place, so it
-# waits. The general stop does not wait: behind an unread frame it is lost without harm, and usually there is none.
+# The same if a frame of ours may be unread. Behind that frame the car would misread `MODE00`, so `MODE00` waits. The
+# general stop does not wait: behind an unread frame it is lost without harm, and usually there is no such frame.
 FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(STOP_FRAME, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
 # docs/reference/protocol.md#stops, general stops only
@@ -100,8 +100,8 @@ BOTH: Final = StopSequence(
     ),
 )
 
-# The same if mode 0 is certain. General stops then stop every platform, even behind an unread frame of ours.
-# `MODE00` comes last and alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
+# The same if mode 0 is certain. Then general stops stop every platform, even behind an unread frame of ours. `MODE00`
+# comes later and alone: in one string with a stop it would undo the stop, and with a servo frame it would open a mode.
 BOTH_MANUAL: Final = StopSequence(
     "both_manual",
     3,
@@ -114,27 +114,27 @@ BOTH_MANUAL: Final = StopSequence(
     ),
 )
 
-# Tests whether a car in mode 0 receives frames: if so, its reports pause for the block of `MODE00`. Nothing follows
-# it, so the frame that is judged is the last one.
+# Tests whether a car in mode 0 receives frames: if it does, its reports pause for the block of `MODE00`. No frame
+# follows, so that the judged frame is the last one.
 PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE),))
 
 CONTROL_SHARE: Final = 0.35
-"""Part of an interval after which the control is written."""
+"""Time from a report to the control frame, as a share of the interval."""
 
 
 def control(interval_s: float) -> StopSequence:
-    """Return the test whether the link loses reports when it is written to: this frame does not block.
+    """Return the test whether writing makes the link lose a report. It is a frame that does not block the car.
 
-    It comes later after a report than the `MODE00` that it controls. A mute time that hid a report from then until the
-    next one is due hides that one, too, however the intervals spread.
+    It is sent later after a report than the `MODE00` before it. So if writing `MODE00` made the link mute for long
+    enough to hide the next report, writing this frame hides the next one too, however much the intervals differ.
     """
     return StopSequence("control", 3, (Step(STOP_FRAME, Gate.FLIGHT, after_s=CONTROL_SHARE * interval_s),))
 
 
 def clearing(color: ColorLed) -> StopSequence:
-    """Return a recovery that also clears a string which begins with `4WD,`: only a named frame of its own kind does.
+    """Return a recovery that also clears a string beginning with `4WD,`, for which it needs a color frame.
 
-    See docs/reference/protocol.md#hazards. A PTZ frame would clear it, too, but moves a servo.
+    See docs/reference/protocol.md#hazards. A PTZ frame would clear the string, too, but it moves a servo.
     """
     reset, manual, last, stop = RECOVERY.steps
     color_step = Step(color, after_s=last.after_s)

@@ -1,4 +1,4 @@
-"""Chooses the stop for a context, computes its worst case, and tracks a stop in progress. Frames: sequences.py."""
+"""Chooses the stop for a context, computes its worst case, and tracks a stop in progress. Its frames: sequences.py."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -21,31 +21,31 @@ RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory nev
 _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 """A car in an unknown state may be avoiding obstacles; assume the worst."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
-"""Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
+"""Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
-"""Minimum of that timeout, in intervals with a pause: three pauses (one may be in doubt), the report before, and the
-silence after them. Its maximum is `MAX_EVIDENCE_TIMEOUT_S`."""
+"""Minimum of that timeout, as a number of intervals with a pause: three pauses (because one may be in doubt), the
+report before them, and the silence after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
-"""Maximum of the worst case in that timeout, so that nobody waits longer than 17 s for an answer, 23 s at the slowest
-car."""
-# The silence is longer than any block outside avoidance, so the car reads the next frame alone. With growth to 6.5 s
-# the car reads one of two tries within 15 s of the end of a fault.
+"""Maximum of the worst case that is added to that timeout, so that nobody waits longer than 17 s for an answer, or 23 s
+with the slowest car."""
+# The silence between two tries is longer than any block outside avoidance, so the car reads the next frame alone. With
+# an increase up to 6.5 s, the car reads at least one of two tries within 15 s after the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
 """Intervals from `MODE00` to the next try, by the number of tries."""
 SLOWEST_S: Final = 3.0
-"""Interval of the slowest car, until that of the car is known."""
+"""Interval of the slowest car. It is used until the interval of this car is known."""
 REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
 IN_TIME_S: Final = 0.2
-"""Minimum time from the write of a frame to the end of a block, so that it arrives before that end on any link."""
+"""Minimum time between writing a frame and the end of a block, so that the frame arrives before the end on any link."""
 
 
 def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
     """Return the kind of stop for a car.
 
-    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame goes only
-    to a car whose platform knows it, or whose readings show that it does: others may die of it
-    (docs/reference/protocol.md#programs-that-people-have).
+    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame is sent
+    only to a car whose platform or whose readings show that it understands such frames, because a named frame ends the
+    program of some other cars (docs/reference/protocol.md#programs-that-people-have).
     """
     if profile.stop_style is StopStyle.GENERAL:
         return StopStyle.BOTH if open_mode else StopStyle.GENERAL
@@ -59,11 +59,11 @@ def evidence_s(profile: Profile, learned: Learned) -> float:
 
 
 def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
-    """Return the time after the last frame of a try in which a car that obeyed it has reported, s.
+    """Return the time after the last frame of a try within which a car that has obeyed it reports, s.
 
-    If `slowest`, its rhythm is not known, and it may be as slow as any.
+    With `slowest`, its rhythm is not known, so assume the slowest car.
     """
-    # Without an echo the car ranges before it reads the frame, is blocked by it, and ranges again before it reports.
+    # If there is no echo, the car ranges before it reads the frame, is blocked, and ranges again before it reports.
     interval_s = learned.interval_s(SLOWEST_S if slowest else profile.interval_s)
     return 2 * profile.ranging_s + learned.close_s(profile.close_s) + interval_s + REPORT_MARGIN_S
 
@@ -81,13 +81,13 @@ class StopContext:
     clear: bool
     """True if the car has read all our frames before the first frame of the stop is written."""
     blocked: bool = False
-    """True if a block of our last frame runs in mode 0. The car does not range directly after it."""
+    """True if our last frame is blocking the car in mode 0. The car does not range directly after such a block."""
     doubted: bool = False
     """True if readings contradict the platform, so the car needs a stop that works on any platform."""
     open_mode: bool = False
     """True if readings show a mode other than 0."""
     clearing: ColorLed | None = None
-    """The last color, if the car may keep a string that only a color frame clears."""
+    """The last color, if the car may hold a string that only a color frame clears."""
 
     @property
     def style(self) -> StopStyle:
@@ -101,7 +101,7 @@ class StopContext:
 
     @property
     def turn_s(self) -> float:
-        """Return the longest turn of the mode's loop, which reads nothing; of the slowest mode if unknown."""
+        """Return the longest turn of the mode's loop, which reads nothing meanwhile; of the slowest mode if unknown."""
         known = self.mode is not None and not self.contradicted
         return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
@@ -135,23 +135,23 @@ class StopInProgress:
     due: float = float("inf")
     """When the next step is due, by the last call of `due_at`."""
     report_at: float = float("-inf")
-    """When the last report of mode 0 came that the car sent after the newest `MODE00`."""
+    """Arrival of the last report of mode 0 that the car sent after the newest `MODE00`."""
     no_echo_at: float = float("-inf")
-    """When the last such report without an echo came. A single one may be corrupted, so two count."""
+    """Arrival of the last such report without an echo. A single one may be corrupted, so two are needed."""
     without_echo: int = 0
     """Number of reports without an echo since the stop began."""
     probes: int = 0
     sent_all: bool = False
-    """True if all frames of the first try are written, or a report came after its `MODE00`."""
+    """True if all frames of the first try are written, or a report has arrived after its `MODE00`."""
     overdue: bool = False
-    """True if the car did not show the stop in time. The stop goes on."""
+    """True if the car did not show the stop in time. The gateway continues to send it."""
     before: Pending | None = None
-    """The mode command that this stop precedes."""
+    """The mode command for which this stop is sent first."""
     repeats: bool = False
-    """True if it repeats a stop whose first frames went out: it gives way at once."""
+    """True if it repeats a stop whose first frames are written already. Then a command may replace it at once."""
     at_rest: bool = False
-    """True if the car had shown that it stands before it fell silent. Send it general stops only: unlike a named frame,
-    a general stop that loses bytes cannot start the motors."""
+    """True if the car had shown that it stands still before it fell silent. Then it gets only general stops: unlike a
+    named frame, a general stop that loses bytes cannot start the motors."""
     case: StopCase = cases.MANUAL
     """The case of the stop, if the car does not show it."""
 
@@ -195,10 +195,10 @@ class StopInProgress:
 
     @property
     def gives_way_at(self) -> float:
-        """Return when a new command may take the place of the repeats; inf if the first frames are not all written.
+        """Return when a new command may replace the repeats; inf if the first frames are not all written.
 
-        Missing evidence delays no command. The first frames do, through the announced worst case, unless a report came
-        in between: the car is in mode 0 then, and reads.
+        Missing evidence delays no command. The first frames delay it until the announced worst case is over, or until a
+        report shows that the car is in mode 0 and reads frames.
         """
         if self.repeats:
             return self.began_at
@@ -210,12 +210,12 @@ class StopInProgress:
         """Return the longest time until the motors are off, if the frames arrive."""
         worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
         if self.sequence.is_recovery and self.frames_sent:
-            # The car may have read all frames as one string, at the wrong places. Then only the next try counts.
+            # The car may have read all frames as one string, and so misread them. Then only the next try stops it.
             worst_at = max(worst_at, self.next_try_at + _AVOIDING_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
     def over_at(self, pacing: Pacing, now: float) -> float:
-        """Return when a new command may take the place of the stop, as far as that is known."""
+        """Return when a new command may replace the stop, as far as that is known."""
         if self.sent_all or self.repeats:
             return max(self.gives_way_at, now)
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
@@ -223,7 +223,7 @@ class StopInProgress:
 
     def on_step_written(self, now: float) -> bool:
         """Go to the next step. Return True if the written frame was the first of the stop."""
-        self.worst_at += max(0.0, now - self.due)  # a loop that slept
+        self.worst_at += max(0.0, now - self.due)  # the frame was late, because our loop was late
         first = self.first_at is None
         if first:
             self.first_at = now
@@ -235,9 +235,9 @@ class StopInProgress:
         return first
 
     def on_other_written(self, now: float) -> None:
-        """Move the rest of the stop: its frames keep their distance from the command that went before them."""
+        """Delay the rest of the stop, so that its frames keep their distance from the command that was sent now."""
         self.last_at = now
-        if self.index == 0 and self.tries > 1:  # a try that waits for a block to end
+        if self.index == 0 and self.tries > 1:  # a try that still waits for the end of a block
             self.try_at = max(self.try_at, now + FLIGHT_S)
 
     def begin_try(self, sequence: StopSequence, now: float) -> None:
