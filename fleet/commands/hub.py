@@ -69,9 +69,9 @@ def hub() -> None:
 def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> None:
     """Make this computer the hub that other computers may join.
 
-    The hub gets an authority, and a certificate for you and for each service. `fleet up` starts the hub, and adds the
-    certificates of its cars. The hub listens on the network, with TLS, and refuses everybody without a certificate. On
-    one computer alone, `fleet up --secure` does the same, but the hub listens on loopback only.
+    The hub gets its own certificate authority, and a certificate for you and for each service. `fleet up` starts the
+    hub, and adds the certificates of its cars. The hub listens on the network, with TLS, and refuses everybody without
+    a certificate. On one computer alone, `fleet up --secure` does the same, but the hub listens only on loopback.
     """
     with cli_errors(), _disk_errors():
         take = [*map(identity.car, map(keys.check_name, cars)), *map(identity.service, map(Service, services))]
@@ -107,7 +107,10 @@ examples:
     help="Invite the computer that is the hub of another site. With --service, invite a service there.",
 )
 @click.option(
-    "--port", type=Number(int, 1, 65535), default=JOIN_PORT, help=f"Listen at this port (default: {JOIN_PORT})."
+    "--port",
+    type=Number(int, 1, 65535),
+    default=JOIN_PORT,
+    help=f"Port on which this command waits for the joining computer (default: {JOIN_PORT}).",
 )
 @click.option("--as-hub", "host", metavar="HOST", help="Call this computer HOST in the command that is printed.")
 @click.option("--qr", is_flag=True, help="Also draw the command as a QR code, for a camera and `fleet join -`.")
@@ -125,7 +128,8 @@ def invite(
 ) -> None:
     """Let one other computer join, once, within ten minutes. Print the command to type there, and wait.
 
-    First the hub restarts, because it gets another rule. Drives may end, modes go on, and all are back after a second.
+    First the hub restarts, to load one more rule. Everybody is connected again after a second. Drives may end
+    meanwhile; modes continue.
     """
     if [person, car, service, None if service else site].count(None) != 3:
         raise click.UsageError(

@@ -405,7 +405,9 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
     "Exit codes: 0 it is true, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
 )
 @click.argument("words", nargs=-1, metavar="KEY CONDITION | --ready [CAR...]", shell_complete=complete_cars)
-@click.option("--ready", is_flag=True, help="Wait until these cars are ready, or all cars, recorder and plan.")
+@click.option(
+    "--ready", is_flag=True, help="Wait until these cars are ready. Without names: all cars, the recorder and the plan."
+)
 @click.option(
     "--timeout",
     "timeout_s",

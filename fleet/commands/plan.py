@@ -63,7 +63,8 @@ def why(
 
         if session is None or at is None or len(subjects) != 1:
             raise click.UsageError(
-                "of a recording, give one car, --session and --at: fleet why red --session latest --at 14:05"
+                "to explain a moment of a recording, give one car, --session and --at: "
+                "fleet why red --session latest --at 14:05"
             )
         explain_session(subjects[0], session, at, as_json=as_json)
         return
@@ -104,9 +105,9 @@ def _no_plan(client: Fleet) -> str:
 
 
 def _people(client: Fleet, cars: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, CarClaim]]:
-    """Return by car who stopped, paused, borrowed or drives it, with what ends that, and what is claimed of its motors.
+    """Return two maps by car: texts about who stopped, paused, borrowed or drives it, and the claim about its motors.
 
-    Empty `cars`: all cars.
+    The texts also say what ends that. Empty `cars` means all cars.
     """
     found, motors, now = {}, {}, time.time()
     for car in cars or ["*"]:

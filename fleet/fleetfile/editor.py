@@ -1,7 +1,7 @@
-"""Writes a link into the text of a fleet file; everything else, comments too, stays as it is. Pure.
+"""Writes a link into the text of a fleet file. Everything else, including comments, stays as it is. Pure.
 
-The editor inserts into the text at YAML marks, and never writes all of the YAML again. It parses the result and
-refuses it if anything but the link has changed.
+The editor inserts the link into the text at YAML's marks, and never writes the whole YAML again. It parses the result,
+and refuses it if anything except the link has changed.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from schemas.yaml_document.document import BadFile, Document
 
 
 class CannotEdit(ValueError):
-    """A file that must be edited by hand; the text says what to write."""
+    """The file must be edited by hand. The text says what to write."""
 
 
 def set_link(text: str, path: Path, car: str, link: str) -> str:
@@ -24,7 +24,7 @@ def set_link(text: str, path: Path, car: str, link: str) -> str:
     document = Document(text, str(path))
     cars = document.node(("cars",))
     entry, link_node = document.node(("cars", car)), document.node(("cars", car, "link"))
-    assert isinstance(cars, yaml.MappingNode)  # else the file is a bad one
+    assert isinstance(cars, yaml.MappingNode)  # parse_fleet would have raised BadFile otherwise
     if link_node is not None:
         start, end = link_node.start_mark.index, link_node.end_mark.index
         after = f"{text[:start]}{quote(link)}{text[end:]}"
@@ -33,7 +33,10 @@ def set_link(text: str, path: Path, car: str, link: str) -> str:
         after = _insert_first(text, entry, f"link: {quote(link)}")
     else:
         after = _insert_last(text, cars, f"{format_key(car)}: {{link: {quote(link)}}}")
-    by_hand = CannotEdit(f"{path} cannot be changed here without changing more: write cars.{car}.link: {quote(link)}")
+    by_hand = CannotEdit(
+        f"{path}: the link cannot be inserted without changing other parts of the file. Edit it by hand: set "
+        f"cars.{car}.link to {quote(link)}"
+    )
     try:
         now = parse_fleet(after, path, unbound=True)
     except BadFile as error:
@@ -44,7 +47,7 @@ def set_link(text: str, path: Path, car: str, link: str) -> str:
 
 
 def _insert_first(text: str, mapping: yaml.MappingNode, entry: str) -> str:
-    """Insert an entry before the first of a mapping."""
+    """Insert an entry before the first entry of a mapping."""
     if mapping.flow_style:
         inside: int = mapping.start_mark.index + 1
         return text[:inside] + entry + (", " if mapping.value else "") + text[inside:]
@@ -54,7 +57,7 @@ def _insert_first(text: str, mapping: yaml.MappingNode, entry: str) -> str:
 
 
 def _insert_last(text: str, mapping: yaml.MappingNode, entry: str) -> str:
-    """Insert an entry after the last of a mapping and after the comment beside that."""
+    """Insert an entry after the last entry of a mapping, and after a comment on the same line."""
     if mapping.flow_style:
         at: int = mapping.end_mark.index - 1
         return text[:at] + (", " if mapping.value else "") + entry + text[at:]
@@ -78,7 +81,7 @@ def _new_line(text: str, column: int) -> str:
 
 
 def _is_about_links(error: BadFile) -> bool:
-    """Return True if all faults are about links; else the insertion has broken the text."""
+    """Return True if all faults are about links. Otherwise the insertion has broken the text."""
     return all(problem.field.endswith(".link") for problem in error.problems)
 
 

@@ -1,7 +1,7 @@
-"""Pins of a session: times that the quota takes last, each with its cause. Pure.
+"""Pins of a session: spans of time whose recordings the quota deletes last, each with its cause. Pure.
 
-`pin_watch.py` finds them live, `session.json` keeps them, `quota_choice.py` spares them. A pin may reach beyond its
-session: what lay before it is in the one before.
+`pin_watch.py` finds them live, `session.json` stores them, and `quota_choice.py` spares them. If a pin begins
+before its session, that part lies in the session before.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,16 +13,16 @@ from schemas.words import PinCause
 
 PIN_BEFORE_NS: Final = 30_000_000_000
 PIN_AFTER_NS: Final = 30_000_000_000
-"""Time around a stop or a mark that is pinned, ns: its minute."""
+"""Pinned time before and after a stop or a mark, ns: together one minute."""
 MAX_PINS: Final = 500
-"""Maximum pins of a session: session.json has 150 bytes for each, and is written each second in which one changes.
-Beyond it pins of one cause grow together."""
+"""Maximum pins of a session. session.json has 150 bytes for each, and is written once in each second in which a pin
+changes. At the limit, a new pin is merged into the newest one of the same cause, even if the two do not touch."""
 _MS_NS: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Pin:
-    """A time that is pinned. Times on the recorder's clock, ns since the epoch."""
+    """A pinned span of time. Times on the recorder's clock, ns since the epoch."""
 
     begin_ns: int
     end_ns: int
@@ -55,7 +55,7 @@ def minute_of(at_ns: int, cause: PinCause, words: str, cars: Iterable[str] = ())
 
 @dataclass(slots=True)
 class PinList:
-    """The pins of one session. Those of one cause that touch each other are one."""
+    """The pins of one session. Pins of one cause that touch each other are merged."""
 
     pins: list[Pin] = field(default_factory=list)
 
@@ -70,8 +70,8 @@ class PinList:
         return self.pins[index] != old
 
     def _place_of(self, pin: Pin) -> int | None:
-        """Return which pin grows by this one."""
-        # The newest is the likely one.
+        """Return the index of the pin into which this one is merged, or None."""
+        # Look at the newest first, because it is the likely one.
         same = [index for index in reversed(range(len(self.pins))) if _is_of_one_cause(self.pins[index], pin)]
         touched = (
             index
@@ -82,7 +82,7 @@ class PinList:
 
 
 def _is_of_one_cause(one: Pin, other: Pin) -> bool:
-    # The words of a stop have its sender: the first one is enough.
+    # Pins of stops are merged although their words differ (they name the sender): the merged pin keeps the first words.
     return one.cause == other.cause and (one.cause != PinCause.CONDITION or one.words == other.words)
 
 
@@ -92,7 +92,7 @@ def _merge(old: Pin, new: Pin) -> Pin:
 
 
 def pins_of(pins: Iterable[Mapping[str, Any]], marks: Iterable[Mapping[str, Any]]) -> list[Pin]:
-    """Return the pins of a session and those of its marks, sorted by time. What is not a pin is left out."""
+    """Return the pins of a session and those of its marks, sorted by time. Leave out values that are not pins."""
     found = [pin for values in pins if (pin := Pin.from_dict(values)) is not None]
     for mark in marks:
         try:

@@ -85,7 +85,7 @@ class HistoryBuffer:
         if last is not None:
             match = _COUNT.fullmatch(last)
             if match is None:
-                raise BadRange(f"last={last}: give a whole number from 1 up. The history has at most {HISTORY} values.")
+                raise BadRange(f"last={last}: give a whole number from 1 on. The history has at most {HISTORY} values.")
             if len(match[1]) <= len(str(HISTORY)):
                 values = values[-int(match[1]) :]
         return values

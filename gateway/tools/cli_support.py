@@ -44,7 +44,7 @@ def run_command(name: str, run: Callable[[], None]) -> int:
         return _fail(f"{name}: {error}", 1)
     except KeyboardInterrupt:
         return startup.INTERRUPTED
-    except OSError as error:  # the commands handle the errors of what they open; this one is of the output
+    except OSError as error:  # the commands handle errors of files and links, so this one is an error of the output
         return stdio.silence_broken(error, name)
     return 0
 
@@ -63,7 +63,7 @@ def duration(option: str, text: str, min_s: float, max_s: float) -> float:
 
 
 def profile_of(text: str) -> Profile:
-    """Return the profile of `--platform`. Raises WrongUse if there is no such platform."""
+    """Return the profile that `--platform` names. Raises WrongUse if there is no such platform."""
     try:
         return parse_platform(text)
     except ValueError as error:
@@ -99,7 +99,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 class Paint:
-    """Colors text for a terminal. Leaves it plain in a pipe, with NO_COLOR, and on a terminal without colors."""
+    """Colors text for a terminal. In a pipe, with NO_COLOR, or on a terminal without colors, the text stays plain."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._on = stdio.shows_colors(stream)
@@ -110,7 +110,7 @@ class Paint:
 
 
 def run_until_interrupted(work: Coroutine[Any, Any, None]) -> None:
-    """Run the work. On a termination signal, let it clean up, then raise KeyboardInterrupt as for Ctrl-C."""
+    """Run the work. On a termination signal, let it clean up, and then raise KeyboardInterrupt as after Ctrl-C."""
     import asyncio
 
     from schemas.process import signals

@@ -31,9 +31,9 @@ examples:
   gateway monitor --link /dev/ttyUSB0 --raw morning.jsonl       save the bytes with their times
   gateway monitor --from morning.jsonl --json                   show them again
 
-A line shows only what the car measures in the mode of the frame. The rest of a frame is filler. Times are seconds
-since the start. Opening a serial port can reset an Arduino that is on a USB cable. The Arduino sends again after about
-three seconds."""
+A line shows only the values that the car measures in the mode of the frame. The other values of a frame are filler.
+Times are seconds since the start. Opening a serial port can reset an Arduino that is on a USB cable. It sends again
+after about three seconds."""
 
 _RAW_WIDTH: Final = 46  # a sensors frame in its longest observed spelling
 
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--link", metavar="URL", help=LINK_HELP)
     source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="show a file that --raw wrote")
     parser.add_argument(
-        "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + ". It decides what is filler"
+        "--platform", default=Platform.UNKNOWN, help=cli_support.PLATFORM_HELP + ". It decides which values are filler"
     )
     parser.add_argument("--raw", type=Path, metavar="FILE", help="save the bytes with their times in a new file")
     parser.add_argument("--json", action="store_true", help="print one JSON object per event, and a summary at the end")
@@ -62,7 +62,7 @@ def _run(arguments: argparse.Namespace) -> None:
         _run_live(parse_url(arguments.link), arguments.raw, lines)
         return
     if arguments.raw is not None:
-        raise cli_support.WrongUse("--raw saves the bytes of a --link. Those of --from are in a file already.")
+        raise cli_support.WrongUse("--raw saves the bytes of a --link. The bytes of --from are in a file already.")
     lines.begin(0.0)
     for piece in _pieces(arguments.file):
         lines.feed(piece)
@@ -125,7 +125,7 @@ async def _listen(link: Link, lines: "MonitorOutput", writer: capture.CaptureWri
             done, _ = await asyncio.wait([reading], timeout=timeout)
             now = round(
                 time.monotonic() - origin, 6
-            )  # rounded as in the file, so that the file decodes in the same way
+            )  # rounded as in the file, so that the file is decoded in the same way
             if not done:
                 lines.tick(now)
                 continue
@@ -174,7 +174,7 @@ class MonitorOutput:
         return self._decoder.deadline()
 
     def end(self, at: float | None = None) -> None:
-        """Print the last events and the summary; nothing if the link was never open."""
+        """Print the last events and the summary. Print nothing if the link was never open."""
         if self.statistics.since is None:
             return
         self._print(self._decoder.end())
@@ -232,6 +232,6 @@ def _words(fields: dict[str, Any]) -> Iterator[str]:
             case "rejected":
                 yield "rejected: " + ", ".join(word + text for word, text in value.items())
             case "contradicts":
-                yield "not as the platform sends it"
+                yield "contradicts the platform"
             case _:
                 yield f"{name} {' '.join(f'{item:g}' for item in value) if isinstance(value, list) else value}"

@@ -31,12 +31,12 @@ class LinkProbe:
     busy: bool = False
     probed: bool = False
     answered: bool = False
-    """True after a reading of mode 0; if the link was probed, only after the last frame of the probe."""
+    """True after a reading of mode 0. If the link was probed, only readings after the probe's last frame count."""
     _decoder: Decoder = field(default_factory=Decoder)
     _profile: Profile = field(default_factory=lambda: cli_support.profile_of(Platform.UNKNOWN))
 
     async def open(self) -> None:
-        """Open the link; store an error in `trouble`."""
+        """Open the link. Store an error in `trouble`."""
         try:
             self.link = await open_link(self.url)
         except LinkError as error:
@@ -45,7 +45,7 @@ class LinkProbe:
             self.statistics.since = time.monotonic()
 
     async def listen(self, seconds: float, *, until_answered: bool = False) -> None:
-        """Read for this time, or until a reading of mode 0; store the loss of the link in `trouble`."""
+        """Read for this time, or until a reading of mode 0. If the link is lost, store the reason in `trouble`."""
         assert self.link is not None
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end and not (until_answered and self.answered):

@@ -127,14 +127,14 @@ class _Scan:
             cli_support.print_note(str(error))
 
     async def _probe_silent(self) -> None:
-        # Also a car in mode 0: its readings do not show whether it drives.
+        # Probe also a car that sends readings of mode 0, because they do not show whether it drives.
         probed = [
             probe
             for probe in self._probes
             if probe.trouble is None and probe.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
         ]
         if not probed:
-            cli_support.print_note("nothing to probe: no port is open and is a car or silent")
+            cli_support.print_note("nothing to probe: on no open port is there a car, and no open port is silent")
             return
         frames = ", ".join(encode(step.frame).decode() for step in GENERAL.steps)
         where = ", ".join(str(probe.url) for probe in probed)
@@ -144,7 +144,7 @@ class _Scan:
         await self._with_progress(_all(probing), "probing", GENERAL.length_s + STOP_REPORT_TIMEOUT_S)
 
     async def _with_progress(self, work: Coroutine[Any, Any, None], what: str, seconds: float) -> None:
-        """Run the work; show its remaining time at a terminal."""
+        """Run the work. At a terminal, show the remaining time."""
         progress = None
         if sys.stderr.isatty() and seconds > 1:
             progress = asyncio.ensure_future(self._show_progress(what, seconds))
@@ -232,6 +232,6 @@ def _words(probe: LinkProbe) -> str:
         case LinkVerdict.SILENT:
             return "silent: no car, or the car is off or in a silent mode, or its fan runs (--probe finds out)"
         case LinkVerdict.BUSY:
-            return "in use by another program (its gateway?): not listened to"
+            return "in use by another program (its gateway?), so it was not listened to"
         case LinkVerdict.FAILED:
             return str(probe.trouble)

@@ -31,18 +31,18 @@ from schemas.links import LINK_HELP
 from schemas.words import Mode, Motion, Platform
 
 DESCRIPTION: Final = (
-    "Check one frame against the table, send it to a car on the desk, and tell what the car may do then."
+    "Check one frame against the table, send it to a car on the desk, and say what the car may do then."
 )
 EPILOG: Final = """\
 examples (use single quotes, because in double quotes the shell replaces $0 and $4):
   gateway send --link /dev/ttyUSB0 '$0,0,1,0,0,0,0,0,0#'                        sound once
   gateway send --link /dev/ttyUSB0 '$1,0,0,0,0,0,0,0,0#'                        drive on, for ever
   gateway send --link /dev/ttyUSB0 '$0,0,0,0,0,0,0,0,0#'                        stop
-  gateway send --link /dev/ttyUSB0 --platform arduino '$4WD,PTZ90#'             only some cars know it
+  gateway send --link /dev/ttyUSB0 --platform arduino '$4WD,PTZ90#'             only some cars understand it
 
-A car keeps its last motion for ever, so put it on blocks. To drive a car safely, use `gateway run`.
-Opening a serial port can reset an Arduino that is on a USB cable. Its start takes two seconds, in which it misses every
-frame. With --wait 3s the frame is sent after the start."""
+A car continues its last motion for ever, so put it on blocks. To drive a car safely, use `gateway run`.
+Opening a serial port can reset an Arduino that is on a USB cable. It misses every frame during its start, which takes
+two seconds. With --wait 3s the frame is sent after the start."""
 
 MAX_WAIT_S: Final = 60.0
 _STOP: Final = encode(General(Motion.STOP)).decode()
@@ -87,7 +87,7 @@ async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
     try:
         await asyncio.sleep(wait_s)
         await link.write(data)
-        # A port that closes before its bytes are sent may truncate them.
+        # Wait until the bytes are sent: a port that is closed earlier may truncate them.
         await asyncio.sleep(len(data) / BYTES_PER_S + FRAME_S)
     finally:
         await link.close()
@@ -112,12 +112,12 @@ def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
     refusal = profile.refusal(frame)
     if refusal is not None:
         raise cli_support.WrongUse(
-            f"frame {text!r}: {refusal} (--platform tells what the car is, --raw sends it anyway)"
+            f"frame {text!r}: {refusal} (name the car's platform with --platform; --raw sends the frame anyway)"
         )
     if url.harm and moves(frame) and profile.stop_style is not StopStyle.MODE_FRAME:
         raise cli_support.WrongUse(
-            f"frame {text!r}: the car would drive, and a Raspberry Pi car's program dies when this connection closes, "
-            "after which nothing can stop the car: use `gateway run` (or --platform arduino behind a bridge, or --raw)"
+            f"frame {text!r}: the car would drive, and a Raspberry Pi car's program dies when this connection closes. "
+            "Then nothing can stop the car: use `gateway run` (or --platform arduino behind a bridge, or --raw)"
         )
     return profile.encode(frame)
 
@@ -135,7 +135,7 @@ def why_not(text: str) -> str:
     if not text.endswith("#"):
         return f"a frame ends with '#': '{text}#'?"
     if text == "$4WD,MODE01#":
-        return f"mode 0 is not opened; '{_MANUAL}' closes whatever mode is open"
+        return f"mode 0 cannot be opened; '{_MANUAL}' closes the open mode"
     places = text[1:-1].split(",")
     if text.startswith("$4WD,"):
         return f"it is not in the table; there are: {_FORMS}"
@@ -166,13 +166,13 @@ def moves(frame: Frame) -> bool:
 
 
 def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
-    """Return for a person what the car may do now and how to stop it."""
+    """Return lines for a person that say what the car may do now, and how to stop it."""
     again = f"gateway send --link {shlex.quote(link)}"
     lines = ["cars do not answer; `gateway monitor` shows what the car sends"]
     match frame:
         case General(motion) as general:
             if motion is Motion.STOP:
-                lines.append("its motors are off, if it is in mode 0 and was not busy: in another mode it ignores this")
+                lines.append("its motors are off if it is in mode 0 and was not busy; in another mode it ignores this")
             else:
                 lines.append(f"it drives ({motion}) until the next command, even without a link")
             if general.fan:

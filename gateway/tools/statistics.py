@@ -80,21 +80,21 @@ class LinkStatistics:
         if self.seconds and self.readings:
             text += f" ({self.readings / self.seconds:.1f}/s)"
         if not self.bytes:
-            return f"{text}: nothing came. Is the car on? In some modes, and while its fan runs, it is silent"
+            return f"{text}: no byte arrived. Is the car on? In some modes, and while its fan runs, it is silent"
         if self.rejects:
             causes = ", ".join(f"{cause} {count}" for cause, count in self.rejects.most_common())
             text += f", {self.rejects.total()} rejected ({causes})"
         if self.kinds[FrameVerdict.ECHO]:
-            text += f", {self.kinds[FrameVerdict.ECHO]} echoes of what was sent"
+            text += f", {self.kinds[FrameVerdict.ECHO]} echoes of sent frames"
         if self.kinds[FrameVerdict.TEXT]:
             text += f", {self.kinds[FrameVerdict.TEXT]} lines of text"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
-            text += f"; mode by their shape: {modes}; platform: {self.detector.evidence[0]}"
+            text += f"; mode, by the form of the frames: {modes}; platform: {self.detector.evidence[0]}"
         elif not self.readings and not self.kinds[FrameVerdict.ECHO]:
-            text += ": no car of this protocol, or another baud rate"
+            text += ": this is no car of this protocol, or the baud rate is wrong"
         for words, count in self.contradictions.most_common():
-            text += f"; {count} times against the platform: {words}"
+            text += f"; contradicts the platform {count} times: {words}"
         return text
 
 

@@ -65,7 +65,7 @@ def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
     if not insecure_lan and not is_loopback(endpoint) and not is_secure(endpoint):
         raise BadEndpoint(
             f"a hub at {endpoint} would let everyone on that network drive the cars: "
-            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or allow it with --insecure-lan"
+            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or accept it with --insecure-lan"
         )
 
 

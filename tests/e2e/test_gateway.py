@@ -308,7 +308,7 @@ def test_a_second_gateway_refuses_and_names_the_first(fleet: FleetProcesses, tcp
     assert second.wait() == 1
     (line,) = second.stderr.splitlines()
     assert line.startswith(
-        f"gateway: car red is served already, by process {first.pid} on {socket.gethostname()} (link {tcp_car.link}): "
+        f"gateway: car red already has a gateway, process {first.pid} on {socket.gethostname()} (link {tcp_car.link}): "
     )
     assert fleet.ask("drive", motion="forward", duration_s=0.1)["status"] in TAKEN
 
@@ -321,7 +321,7 @@ def remaining(fleet: FleetProcesses, both: list[GatewayProcess]) -> GatewayProce
     (yields,) = ended
     (stays,) = [one for one in both if one is not yields]
     assert yields.wait() == 1
-    assert "is served already" in yields.stderr or "in use" in yields.stderr
+    assert "already has a gateway" in yields.stderr or "in use" in yields.stderr
     wait_for(lambda: (health := fleet.state("health")) and health.uptime_s > 2.0, "the other has looked again")
     assert stays.popen.poll() is None
     fleet.ready()

@@ -1,8 +1,8 @@
 """Finds when a condition of a plan held in a session. `ConditionRun` is pure; `find_in` reads the messages.
 
-`CarCondition` gives the condition its meaning, here as for the pins of a recording. A value that was not measured is
-unknown, and so is a stale one. A hit lasts from the first reading to the last one that shows it: what nobody measured
-between two readings counts, unless a value got stale there. So a gap is never true.
+`CarCondition` evaluates the condition, as it does for the pins of recordings. A value that was not measured is unknown,
+and so is a stale one. A hit lasts from the first reading to the last one that shows it. The time between two readings
+counts as true, unless a value that the condition needs became stale in between. So a hit never spans such a gap.
 """
 
 from collections.abc import Collection, Iterator
@@ -51,7 +51,7 @@ class Hit:
 
 
 class ConditionRun:
-    """The hits of one car, from its messages in the order in which they were published, by topic."""
+    """Finds the hits of one car. It gets the car's messages in the order of publishing, each with its topic."""
 
     def __init__(self, expression: Expression, car: str, for_s: float = 0.0) -> None:
         self._condition = CarCondition(expression)
@@ -68,8 +68,8 @@ class ConditionRun:
         """The longest time for which the condition held, s; negative if it never did."""
 
     def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
-        """Take in a message. `at_ns` is its stamp; ahead_ns: what the recorder's clock showed more."""
-        # The schema is that of the recording, and may lack a field.
+        """Use a message. `at_ns` is its stamp, `ahead_ns` how far the recorder's clock was ahead of that stamp, ns."""
+        # The message has the schema of the recording, which may lack a field.
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
             self._command = asked_by(message)
         if topic == MODE.name:
@@ -102,9 +102,9 @@ class Found:
     hits: list[Hit]
     """Sorted by time."""
     longest_s: float
-    """The longest time for which the condition held, whatever was asked for, s; negative if it never did."""
+    """The longest time for which the condition held, regardless of `for_s`, s; negative if it never did."""
     left_out: LeftOut
-    """Messages under the keys of the condition that have none of its values."""
+    """Messages under the keys of the condition that contain none of its values."""
 
 
 def find_in(
@@ -112,7 +112,7 @@ def find_in(
 ) -> Found:
     """Return the hits of these cars in a session. `session.damage` then has what could not be read.
 
-    Times are those of the recorder's clock, as in all that opens a session. since_ns: ns since the epoch.
+    Times are those of the recorder's clock, as in every tool that opens a session. since_ns: ns since the epoch.
     """
     topics = sorted({MODE.name, COMMANDS.name, *map(topic_of, expression.names)})
     selection = Selection(tuple(f"*/{car}/{topic}" for car in cars for topic in topics))
@@ -158,7 +158,7 @@ def _messages(
 def _why_left_out(
     info: ChannelInfo, decoder: MessageDecoder, message: Any, topic: str, names: Collection[str]
 ) -> LeftOutCause | None:
-    """Return why a message has no value of these names, or None if it has one, or could have."""
+    """Return why a message has no value of these names. None if it has one, or if its topic has none of the names."""
     if message is None:
         return why_not_decoded(decoder, info)
     if message.DESCRIPTOR.full_name != TOPICS[topic].message:

@@ -64,7 +64,7 @@ async def test_oversized_request_is_handed_over_unread_with_reason(hall: tuple[H
         await asyncio.to_thread(ask, asker, f"@cmd/{verb}", LARGE)
     await there.until(lambda: len(there.requests) == 2, "both commands")
     assert {each.unread for each in there.requests} == {
-        "a payload of 5000000 bytes is too large: at most 65536 are read, so nothing of it was"
+        "a payload of 5000000 bytes is too large and was not read: the limit is 65536 bytes"
     }
     assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.requests[0].unread]
     (long,) = await asyncio.to_thread(ask, asker, f"state/link?a={'x' * 5000}")

@@ -324,7 +324,7 @@ def test_only_lead_ends_hold_of_lead(desk: Workbench) -> None:
     desk.ask(Stop(), ANN)
     assert desk.control.safety.hold is not None
     assert desk.control.safety.hold.by == "teacher@lab"
-    words = "red is on hold: teacher stopped it, and only a lead ends what a lead began (teacher)."
+    words = "red is on hold: teacher stopped it, and only a lead may end what a lead began (teacher)."
     for what in (FORWARD, Resume(), Resume(all=True), SetMode(Mode.MANUAL)):
         answer = desk.ask(what, ANN)
         assert (answer.reason, answer.words) == (Reason.HELD, words)
@@ -357,7 +357,7 @@ def test_gateway_without_people_frees_nothing_of_a_lead() -> None:
     kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
     desk = Workbench(kept=kept).ready()
     desk.control.merge_pauses([FleetPause("p1", "teacher@lab", "listen", 7, LEAD)], [], "blue", desk.now)
-    rule = "only a lead ends what a lead began. The gateway of red knows no leads: "
+    rule = "only a lead may end what a lead began. The gateway of red knows no leads: "
     for sender in (ANN, replace(ANN, kind=LEAD), Sender("teacher@lab", SCRIPT)):
         answers = [desk.ask(what, sender) for what in (Resume(), Resume(("e1",)), Resume(all=True))]
         assert [each.reason for each in answers] == [Reason.HELD, Reason.ESTOPPED, Reason.ESTOPPED]

@@ -200,8 +200,8 @@ async def test_an_adapter_without_room_is_said(peer: BlePeer) -> None:
     hci0.slots = 3
     more(peer, 3, hci0)
     assert await refused(peer.url) == (
-        f"{peer.url}: the Bluetooth adapter is full: hci0 has 3 connections, and most take 5, some 3. Give this car "
-        "another one, ?adapter=hci1, or write ?adapter=auto"
+        f"{peer.url}: the Bluetooth adapter is full: hci0 has 3 connections, and most can hold 5, some 3. End this "
+        "car's link with ?adapter=hci1 or ?adapter=auto"
     )
     more(peer, 5, hci1)
     assert "is full: hci" in await refused(BleUrl(peer.module.address, adapter="auto"))

@@ -169,7 +169,7 @@ async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: 
     plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
     plug(CH340)
-    with pytest.raises(CannotOpen, match=f"is there, {path(peer)}, of which "):
+    with pytest.raises(CannotOpen, match=f"is there, {path(peer)}, about which "):
         await open_link(peer.url)
     peer.close()
     with pytest.raises(CannotOpen, match="no such port"):

@@ -158,7 +158,7 @@ FAULTS = [
         "line: {width_m: 2, depth_m: 1, radius_m: 0.6}",
         ["1:42: error: line.radius_m: 0.6 is not allowed: up to half of the shorter side, 0.5"],
     ),
-    ("lamps: {a: {x_m: 1}}", ["1:9: error: lamps.a.y_m: is missing: where it stands, or carried_by"]),
+    ("lamps: {a: {x_m: 1}}", ["1:9: error: lamps.a.y_m: is missing: write where it stands, or carried_by"]),
     ("lamps: {A: {x_m: 1, y_m: 1}}", ["1:9: error: lamps.A: name 'A' is not allowed"]),
     ("lamps: {1: {x_m: 1, y_m: 1}}", ["1:9: error: lamps: key '1' is not a word. Write it in quotes"]),
     (
@@ -173,16 +173,16 @@ FAULTS = [
         "lamps: {a: {carried_by: pink}}",
         ["1:25: error: lamps.a.carried_by: no car or thing 'pink' is simulated here: use red, green"],
     ),
-    ("things: {a: {x_m: 1, y_m: 1}}", ["1:13: error: things.a: is a disc or a box"]),
-    ("things: {a: {x_m: 1, y_m: 1, radius_m: 1, width_m: 1}}", ["1:13: error: things.a: is a disc or a box"]),
-    ("things: {a: {x_m: 1, y_m: 1, width_m: 1}}", ["things.a.depth_m: is missing: a box has both"]),
+    ("things: {a: {x_m: 1, y_m: 1}}", ["1:13: error: things.a: must be a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1, radius_m: 1, width_m: 1}}", ["1:13: error: things.a: must be a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1, width_m: 1}}", ["things.a.depth_m: is missing: a box needs both"]),
     (
         "things: {a: {radius_m: 1}}",
-        ["things.a.x_m: is missing: where it stands, or a path", "things.a.y_m: is missing"],
+        ["things.a.x_m: is missing: write where it stands, or a path", "things.a.y_m: is missing"],
     ),
     (
         "things: {a: {radius_m: 1, path: [[0, 0], [0, 0]]}}",
-        ["1:33: error: things.a.path: has at least 2 points [x, y] that differ"],
+        ["1:33: error: things.a.path: needs at least 2 different points [x, y]"],
     ),
     (
         "things: {a: {radius_m: 1, x_m: 0, y_m: 0, speed_m_s: 0.1}}",
@@ -207,7 +207,7 @@ FAULTS = [
     ("cars: {red: {x_m: 0}}", ["1:8: error: cars.red.y_m: is missing. Meters up from (0, 0)."]),
     (
         "cars: {red: {x_m: 0, y_m: 0}, green: {x_m: 0.2, y_m: 0}}",
-        ["1:38: error: cars.green: begins 0.2 m from red: at least 0.26 m"],
+        ["1:38: error: cars.green: begins 0.2 m from red: keep at least 0.26 m"],
     ),
     ("walls: [[0, 0, 1, 0]]\ncars: {red: {x_m: 0, y_m: 0.1}}", ["2:13: error: cars.red: begins in a wall"]),
     (

@@ -344,7 +344,7 @@ class Profile:
         return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
-        """Return the contradictions between this frame and the platform, in words. If there is none, nothing follows."""
+        """Return the contradictions between this frame and the platform, in words. None found proves nothing."""
         if self.kind is Platform.UNKNOWN:
             return ()
         candidates = candidate_modes(event)

@@ -460,7 +460,7 @@ class StopEvidence:
         return Finding.LOST
 
     def _agrees(self, delay_s: float) -> bool:
-        """Count a delay other than the expected block. Return True if the last ones agree, and enough are of this stop."""
+        """Count a delay other than the expected block. Return True if the last ones agree, with enough of this stop."""
         self._delayed += 1
         return self._add_close(delay_s) and self._delayed >= PAUSES
 

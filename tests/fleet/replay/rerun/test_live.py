@@ -245,7 +245,7 @@ def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         (["--web", "--save", "x.rrd"], 2, "not both"),
         (["--save", "x.txt"], 2, "name it x.rrd"),
         (["--web", "--memory", "much"], 2, "--memory much is not allowed"),
-        (["--web", "--connect", endpoint], 1, f"(Looked at {endpoint}; "),
+        (["--web", "--connect", endpoint], 1, f"(Tried {endpoint}; "),
         (["--save", str(tmp_path / "none" / "x.rrd"), "--connect", endpoint], 2, "there is no directory"),
         (["--web", "--fleet", "No"], 2, "fleet name 'No' is not allowed"),
         (["--web", "--for", "0"], 2, "--for"),
