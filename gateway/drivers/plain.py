@@ -40,19 +40,16 @@ from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from schemas.car_profile import CarProfile
 from schemas.limits import SHUTDOWN_S
 from schemas.words import (
-    CAPABILITIES,
     Basis,
     CarTrust,
     FrameOrigin,
     FrameVerdict,
     Level,
-    Light,
     Mode,
     Motion,
     Motors,
     Phase,
     Reason,
-    ServoAction,
     Shows,
     SpeedStep,
     Verdict,
@@ -65,51 +62,7 @@ SPEED_STEP: Final = 0.1
 _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
 
 
-# ---------------------------------------------------------------------- the profile, and the claims
-
-
-@dataclass(frozen=True, slots=True)
-class PlainProfile:
-    """What cars of one platform can do: a `CarProfile` without modes."""
-
-    name: str
-    capabilities: frozenset[str]
-    """Words of `schemas.words.CAPABILITIES`."""
-    measures: frozenset[str]
-    """The sensor topics that it publishes, without `sensor/`."""
-    lights: frozenset[Light] = frozenset()
-    servos: frozenset[ServoAction] = frozenset()
-    cells: int = 2
-    """Number of cells of its battery. The level of the battery depends on it."""
-    baud: int = 115200
-    """Rate of its serial port."""
-    dead_man_s: float | None = None
-    """Time after which it stops because no *motion* arrived; then stops that no reading shows are not repeated. None if
-    there is no such time. A car that only watches its link (a heartbeat, a closed connection) has none, because it
-    drives on while the link is alive."""
-    not_observed: tuple[str, ...] = ()
-    """Facts that were read or assumed, but not seen on a car, as sentences."""
-    modes: frozenset[Mode] = frozenset({Mode.MANUAL})
-    silent_modes: frozenset[Mode] = frozenset()
-
-    @property
-    def possible_modes(self) -> frozenset[Mode]:
-        """The modes that it may be in."""
-        return self.modes
-
-    @property
-    def has_readings(self) -> bool:
-        """False if it never sends a reading."""
-        return bool(self.measures)
-
-    def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return the names of all readings that such a car can send in this mode."""
-        return self.measures if mode in self.modes else frozenset()
-
-    def why_lacking(self, capability: str) -> str | None:
-        """Return a sentence on why the car lacks a capability. None if it has it, or if there is no such capability."""
-        known = capability in self.capabilities or capability not in CAPABILITIES
-        return None if known else f"{self.name} cars have no {capability}"
+# ---------------------------------------------------------------------- the claims
 
 
 @dataclass(slots=True)

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 from gateway.control.commands import Action
 from gateway.control.driver import Desk, Event, Fields, Rejected, TextLine
 from gateway.drivers.lines import LineSplitter
-from gateway.drivers.plain import PlainDriver, PlainProfile
+from gateway.drivers.plain import PlainDriver
+from gateway.drivers.plain_profile import PlainProfile
 from schemas.words import Cause, Motion
 
 PLATFORMS = ("tank",)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from gateway.drivers.plain import PlainProfile
+from gateway.drivers.plain_profile import PlainProfile
 from schemas.words import Light
 
 

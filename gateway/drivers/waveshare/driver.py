@@ -44,7 +44,8 @@ from gateway.control.commands import Action, Drive, Find, SetLight
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
 from gateway.drivers.lines import LineSplitter
-from gateway.drivers.plain import PlainDriver, PlainProfile
+from gateway.drivers.plain import PlainDriver
+from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, UgvFirmware
 from gateway.drivers.waveshare.feedback import Feedback, read_line
 from schemas.words import FrameOrigin, Level, Light, Motion, Motors, Phase, Reason, Shows

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from gateway.drivers.plain import PlainProfile
+from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare import chassis
 from gateway.drivers.waveshare.chassis import profile_of
 
