@@ -28,7 +28,7 @@ NUMBERS: Final[Mapping[str, tuple[str, float, float, str]]] = {
     "close": ("close_s", 0.0, 10.0, "a number of seconds"),
     "gray": ("gray_max", 1, 65535, "a whole number"),
 }
-"""For each option with a number: its trait, the least and the largest value, and what it is."""
+"""For each option with a number: its trait, the smallest and the largest value, and the words for an error message."""
 SILENT: Final = "silent"
 
 _REPORTS: Final = ("interval", "spread")
@@ -39,18 +39,18 @@ SIMULATED: Final[Mapping[str, tuple[str, ...]]] = {
     "raspberry_pi": _REPORTS,
     "course": (),
 }
-"""For each platform the options that only the simulator knows."""
+"""For each platform the options that exist only in the simulator."""
 UGV_OPTIONS: Final = ("mission", "no_encoder", "quiet", "arm", "gimbal")
 """The options of the second family's cars: see `UgvCar`."""
 _PLACEHOLDERS: Final = {"interval": "S", "spread": "S", "close": "S", "gray": "MAX", SILENT: "MODE"}
 
 
 class BadOption(ValueError):
-    """An option that is not allowed. The message says what is."""
+    """An option that is not allowed. The message says what is allowed instead."""
 
 
 def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
-    """Return the traits of a car, or None if its platform has the same ones. Raises BadOption for a wrong option."""
+    """Return the traits of a car, or None if they are those of its platform. Raises BadOption for a wrong option."""
     if platform in UGV_BUILDS:
         for option in options:
             if option not in UGV_OPTIONS:
@@ -61,13 +61,13 @@ def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
     for option in options:
         traits = _with_option(traits, platform, option)
     if traits.spread_s >= traits.interval_s:
-        words = f"+spread={traits.spread_s:g} is not allowed: less than the interval, {traits.interval_s:g} s"
+        words = f"+spread={traits.spread_s:g} is not allowed: use less than the interval, {traits.interval_s:g} s"
         raise BadOption(f"option {words}")
     return None if traits == base else traits
 
 
 def allowed_options(platform: str) -> str:
-    """Return the options of a platform, for a person."""
+    """Return the options of a platform, as text for an error message."""
     if platform in UGV_BUILDS:
         return ", ".join(f"+{word}" for word in UGV_OPTIONS)
     own = [f"+{word}={_PLACEHOLDERS[word]}" if word in _PLACEHOLDERS else f"+{word}" for word in SIMULATED[platform]]
@@ -92,7 +92,7 @@ def _with_option(traits: CarTraits, platform: str, option: str) -> CarTraits:
         return replace(traits, head=value)
     if word == SILENT:
         if value not in set(Mode):
-            raise BadOption(f"option '+{option}' is not allowed: a mode, one of {', '.join(Mode)}")
+            raise BadOption(f"option '+{option}' is not allowed: use one of {', '.join(Mode)}")
         return replace(traits, silent_modes=traits.silent_modes | {Mode(value)})
     field, least, most, what = NUMBERS[word]
     try:
@@ -100,6 +100,6 @@ def _with_option(traits: CarTraits, platform: str, option: str) -> CarTraits:
     except ValueError:
         number = math.nan
     if not least <= number <= most:
-        raise BadOption(f"option '+{option}' is not allowed: {what} from {least:g} to {most:g}")
+        raise BadOption(f"option '+{option}' is not allowed: use {what} from {least:g} to {most:g}")
     changes: dict[str, Any] = {field: number}
     return replace(traits, **changes)

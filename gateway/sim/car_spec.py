@@ -1,4 +1,4 @@
-"""Parses the description of a simulated or replayed car. Errors are one line. Pure: it does not open any link."""
+"""Parses the description of a simulated or replayed car. An error is one line. Pure: it does not open any link."""
 
 import re
 from collections.abc import Sequence
@@ -15,14 +15,15 @@ _REPLAY: Final = re.compile(r"(?P<file>.+?)(?::(?P<name>[a-z0-9_-]+)(?::(?P<link
 
 
 class BadSpec(ValueError):
-    """A description that is not allowed. The message tells the place, the value and what is allowed."""
+    """A description that is not allowed. The message names the place and the value, and says what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class PtyPath:
     """A pseudo terminal.
 
-    `path` is a symlink to it, which keeps its name when the link is lost and returns. Without a path, there is none.
+    At `path`, the simulator makes a symlink to it. The symlink has the same name again when a lost link returns, while
+    the terminal itself has a new one. If `path` is None, there is no symlink.
     """
 
     path: str | None = None

@@ -1,6 +1,6 @@
 """`gateway sim`: the arguments, one line of output per car, scheduled faults, a clean end.
 
-`control_channel` obeys the commands on stdin.
+`control_channel` carries out the commands on stdin.
 """
 
 import argparse
@@ -29,10 +29,10 @@ RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
 The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. A plain
-pty has another name after each link_drop: then the line is printed again. The link pty:PATH keeps its name.
+pty has another name after each link_drop, so the line is printed again. The link pty:PATH has the same name again.
 
 options of a platform that real cars have, too; join several with + (--car red:arduino+arm+interval=0.71:pty):
-  +arm +imu                             the car has an arm, a gyroscope
+  +arm +imu                             the car has an arm; the car has a gyroscope
   +text                                 the car prints the line EXEC:F after each general frame
   +no_readings                          the car sends nothing at all
   +3s                                   the battery has three cells: up to 12.6 V
@@ -49,37 +49,39 @@ options of the simulator only:
   +gray=MAX                             the grayscale values go up to MAX (arduino, stm32)
   +constants                            the values of line, obstacle, light and grayscale never change (arduino, stm32)
 options of wave_rover, ugv01, ugv02, ugv_rover and ugv_beast, which have no others:
-  +mission                              the car drives in the mission that it runs after its boot
+  +mission                              the car drives for 2 s in the mission that it runs after its boot
   +no_encoder                           the left encoder counts nothing
-  +quiet                                the car does not repeat the lines that it gets
+  +quiet                                the car does not send back the lines that it gets
   +arm                                  the car reports an arm instead of angles
   +gimbal                               the car searches for a gimbal that is not there
-An stm32 car reports by a timer, and no frame blocks it. A course car is a Raspberry Pi program that knows only the
-frames of the motions. It dies at any other frame, and sends nothing.
+An stm32 car reports by a timer, and no frame blocks it. A course car runs a Raspberry Pi program that knows only the
+frames for motions, the whistle and the lights. The program sends nothing, and ends with an error at any other frame.
 faults on the command line (AMOUNT is seconds, but bytes for garbage; --fault may be repeated):
   --fault red:link_drop@5+2             the link is gone for 2 s; without +2 until you end the fault
   --fault red:rename@5+2                the car comes back as another device: pty:PATH points to it, a plain pty and TCP
                                         have a new link; with ,path=/tmp/other it comes back at that path
-  --fault red:cut_write@5+2,bytes=7     only 7 bytes of the next frame reach the car, then the link is gone for 2 s
+  --fault red:cut_write@5+2,bytes=7     only 7 bytes of the next frame reach the car, and then the link is gone for 2 s
   --fault red:slow@5+10,factor=0.1      both directions run at a tenth of 960 bytes/s, byte by byte
   --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: only in this direction
   --fault red:stuck@5+10                the car stops reading: writes block (pty), or fill the system's buffers (TCP)
   --fault red:deaf@5+10                 the car reads every byte and ignores it
   --fault red:mute@5+10                 the car obeys, but sends nothing
   --fault red:echo@5+10                 the car obeys, and sends every byte back
-  --fault red:firehose@5+10,rate=1e6    the car sends so many random bytes/s beside its readings; with ,of=frame they
-                                        are a frame that never ends
+  --fault red:firehose@5+10,rate=1e6    the car sends a million random bytes/s besides its readings; with ,of=frame
+                                        these bytes are a frame that never ends
   --fault red:garbage@5+200             200 random bytes reach the host; with ,to=car they reach the car
   --fault brownout@10                   every car resets; with red: before it, only red
   --fault red:empty@5+20                the battery runs empty within 20 s; then the car is off, and its link is gone
 Faults on stdin are one JSON object per line. One line on stdout answers each. "for_s": 0 ends a fault (rename and
 cut_write end as link_drop does); without "for_s", a fault lasts until you end it:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
-The infrared remote: only an Arduino or STM32 car in mode remote_control obeys it. For a ugv car it is the web page.
-A button counts until the next one: forward, back, left, right, spin_left, spin_right, stop, whistle, faster, slower.
+The infrared remote: only an Arduino or STM32 car in mode remote_control obeys it. A ugv car has no remote, so a button
+here is a button of its web page. A motion lasts until the next button. The buttons are forward, back, left, right,
+spin_left, spin_right, stop, whistle, faster and slower.
   --ir red:forward@5                    on stdin {"car": "red", "ir": "forward"}
-Worlds from a file have lamps that light sensors see, things to bump into and to follow, and cars that see each other
-and are in each other's way. `fleet example copy follow` writes such a file with a comment for each field. On stdin:
+A world from a file can have lamps that light sensors see, things to bump into and to follow, and cars that see each
+other and block each other's way. `fleet example copy follow` writes such a file with a comment for each field. On
+stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (for a lamp on a car: ahead, left)
   {"thing": "cart", "x_m": 1, "y_m": 0} puts it there, off its path; or "speed_m_s" for its speed along its path
 The true state, on stdin:
@@ -117,11 +119,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--world",
         metavar="WORLD",
         default="room",
-        help="room has walls and a line to track, open has nothing, so no ranging has an echo. Or a file with lamps, "
-        "things and cars that meet, as `fleet example show follow` prints it (default: room)",
+        help="room has walls and a line to track. open has nothing, so no ranging has an echo. Or give a file with "
+        "lamps, things and cars that meet, such as `fleet example show follow` prints (default: room)",
     )
     parser.add_argument(
-        "--check", action="store_true", help="only check the world, for these cars, or without --car for any cars"
+        "--check",
+        action="store_true",
+        help="only check the world and end: for the cars of --car if there are any, otherwise for any cars",
     )
     parser.add_argument(
         "--fault",
@@ -145,7 +149,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="play a capture as a car. NAME is replay and LINK is pty unless you give others",
     )
     parser.add_argument(
-        "--loop", action="store_true", help="play captures again and again, with 1 s between two rounds"
+        "--loop",
+        action="store_true",
+        help="play captures again and again, with a pause between two rounds: 1 s at --rate 1",
     )
     parser.add_argument("--rate", type=float, metavar="FACTOR", help="speed of captures, as a factor (default: 1)")
     parser.add_argument(
@@ -191,10 +197,10 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
     if not replays and not args.car:
         raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
     if not replays and (args.loop or args.rate is not None):
-        raise BadSpec("--loop and --rate are for captures: give --replay FILE as well")
+        raise BadSpec("--loop and --rate need a capture: give --replay FILE as well")
     rate = 1.0 if args.rate is None else args.rate
     if not math.isfinite(rate) or not RATES[0] <= rate <= RATES[1]:
-        raise BadSpec(f"rate {rate!r} is not allowed: a number from {RATES[0]:g} to {RATES[1]:g}")
+        raise BadSpec(f"rate {rate!r} is not allowed: use a number from {RATES[0]:g} to {RATES[1]:g}")
     found = []
     for spec in replays:
         try:

@@ -21,7 +21,7 @@ MAX_COMMAND_BYTES: Final = 65536
 
 
 def print_json(line: dict[str, object]) -> None:
-    """Print one line of JSON to stdout. If the reader has gone or the disk is full, the cars go on silently."""
+    """Print one line of JSON to stdout. If the reader has gone or the disk is full, print nothing more."""
     try:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
@@ -29,12 +29,12 @@ def print_json(line: dict[str, object]) -> None:
         stdio.silence(sys.stdout)
         if not isinstance(error, BrokenPipeError):  # a closed pipe needs no message
             sys.stderr.write(
-                f"gateway sim: stdout cannot be written ({error.strerror}). The cars go on, without further output.\n"
+                f"gateway sim: stdout cannot be written ({error.strerror}). The cars run on without output.\n"
             )
 
 
 async def serve_commands(simulation: Simulation) -> None:
-    """Obey and answer the commands on stdin, until cancelled."""
+    """Carry out the commands on stdin and answer each, until cancelled."""
     lines: asyncio.Queue[bytes] = asyncio.Queue()
     threading.Thread(target=_read_lines, args=(asyncio.get_running_loop(), lines), daemon=True).start()
     while True:
@@ -45,9 +45,10 @@ async def serve_commands(simulation: Simulation) -> None:
 
 def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") -> None:
     """Read stdin, which may be a pipe, a terminal, a file or closed. Its end does not end the simulator."""
-    # `os.read`, not the buffered stdin: a daemon thread that holds the lock of stdin breaks the interpreter's shutdown.
+    # This calls `os.read`: with the buffered stdin, this daemon thread would hold the lock of stdin, which breaks the
+    # interpreter's shutdown.
     if hasattr(signal, "pthread_sigmask"):
-        # Reading a terminal from the background would stop the whole process.
+        # Without this, the system stops a process in the background that reads its terminal.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})
     rest = b""
     while True:
@@ -82,9 +83,9 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
         fault = fault_of(fields)
         return {"ok": True, "fault": fault.kind.value, "cars": await simulation.inflict(fault)}
     except ValueError as error:  # BadSpec, or invalid JSON
-        words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
+        words = str(error) if isinstance(error, BadSpec) else f"not JSON: {error}"
     except RecursionError:
-        words = "no JSON: it is nested too deep"
+        words = "not allowed: the JSON is nested too deep"
     except EndpointError as error:
         words = str(error)
     return {"ok": False, "error": words}

@@ -1,6 +1,6 @@
 """The end of a simulated car's link that a host opens: a pseudo terminal or a listening TCP port.
 
-A link passes the host's bytes to its owner. Bytes without a host are lost, as on a wire.
+A link passes the host's bytes to its owner. Bytes that the car sends while there is no host are lost, as on a wire.
 """
 
 import asyncio
@@ -21,11 +21,11 @@ _FILE_TIME_MARGIN_S = 2.0
 
 
 class EndpointError(Exception):
-    """A link cannot be opened. The message says why and what to do."""
+    """A link cannot be opened. The message says why, and what to do about it."""
 
 
 class Taken(EndpointError):
-    """The path of a link is in use: wrong use."""
+    """The path of a link is in use. The exit code is that of wrong arguments."""
 
 
 class Owner(Protocol):
@@ -55,20 +55,21 @@ class SimEndpoint(Protocol):
         """Open the link for a host. Raises EndpointError if the port or path is taken."""
 
     async def down(self) -> None:
-        """Close the link, as an unplugged cable or a lost network does; `up` opens it again."""
+        """Close the link, as when a cable is unplugged or a network is lost. `up` opens it again."""
 
     def send(self, data: bytes) -> None:
         """Send bytes to the host, if there is one."""
 
     def hold(self, *, on: bool) -> None:
-        """Pause or resume reading. The host can write until the system's buffers are full."""
+        """Pause or resume reading. Meanwhile the host can write until the system's buffers are full."""
         self._held = on
         self._update_reading()
 
     def stick(self, *, on: bool) -> None:
         """Stop or resume reading, as a stuck device does.
 
-        The next write to a PTY blocks at once. For TCP, both systems buffer some hundred kilobytes, which arrive later.
+        The next write to a PTY blocks at once. With TCP, the systems of both sides buffer some hundred kilobytes, which
+        arrive later.
         """
         self._stuck = on
         self._update_reading()
@@ -80,7 +81,7 @@ class SimEndpoint(Protocol):
         """Become another device at the next `up`, at `path` if not None. Raises EndpointError."""
 
     async def close(self) -> None:
-        """Close the link for good and remove its traces."""
+        """Close the link for good, and remove its symlink or sockets."""
 
 
 class PtyEndpoint(SimEndpoint):
@@ -93,7 +94,7 @@ class PtyEndpoint(SimEndpoint):
             import tty
         except ImportError:
             raise EndpointError(
-                "a pty link needs Linux or macOS, this system has no pseudo terminals: use tcp://127.0.0.1:0"
+                "a pty link needs Linux or macOS, because this system has no pseudo terminals: use tcp://127.0.0.1:0"
             ) from None
         self._openpty: Callable[[], tuple[int, int]] = pty.openpty
         self._setraw: Callable[[int], object] = tty.setraw
@@ -115,7 +116,7 @@ class PtyEndpoint(SimEndpoint):
         """Open a new terminal and point the symlink at it."""
         self._master, self._slave = self._next or self._open()
         self._next = None
-        # Our open slave keeps the terminal and its raw mode while no host has it open.
+        # The slave stays open here, so that the terminal and its raw mode last while no host has it open.
         self._setraw(self._slave)
         os.set_blocking(self._master, False)
         self._name = os.ttyname(self._slave)
@@ -136,7 +137,7 @@ class PtyEndpoint(SimEndpoint):
             raise EndpointError(f"The system has no free pseudo terminal: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
-        """Create the symlink. Replace only the leftover of a killed simulator."""
+        """Create the symlink. Replace nothing at this path except the symlink that a killed simulator has left."""
         if self._is_leftover(path):
             path.unlink(missing_ok=True)
         try:
@@ -248,7 +249,7 @@ class TcpEndpoint(SimEndpoint):
         return f"tcp://[{self._host}]:{self._port}" if ":" in self._host else f"tcp://{self._host}:{self._port}"
 
     async def up(self) -> None:
-        """Listen, after the first time on the same port."""
+        """Listen. After the first time, this uses the port of the first time again."""
         if self._server is not None:
             return
         loop = asyncio.get_running_loop()
@@ -271,7 +272,7 @@ class TcpEndpoint(SimEndpoint):
     def rename(self, path: str | None) -> None:
         """Bind another port now, while this one is still in use."""
         if path is not None:
-            raise EndpointError(f"{path} is not for a TCP link: it has no path")
+            raise EndpointError(f"path {path} is not allowed for a TCP link, which has no path")
         if self._next is None:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             self._next = socket.socket(family, socket.SOCK_STREAM)
@@ -298,7 +299,7 @@ class TcpEndpoint(SimEndpoint):
         self._owner.received(data)
 
     def left(self, transport: asyncio.Transport) -> None:
-        """Note the end of a connection, unless the link has cut it."""
+        """Note the end of a connection, unless this link has cut it itself."""
         if transport is self._transport:
             self._transport = None
             self._owner.disconnected()
@@ -321,7 +322,7 @@ class TcpEndpoint(SimEndpoint):
             self._server.close()
             self._server = None
         if self._transport is not None:
-            # Linger 0 turns the close into a reset, as a host sees from a bridge without power.
+            # Linger 0 turns the close into a reset, which is what a host sees when a bridge loses its power.
             linger = struct.pack("HH" if os.name == "nt" else "ii", 1, 0)
             self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
             transport, self._transport = self._transport, None

@@ -40,21 +40,21 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault. Without `car` it hits every car. A kind ignores fields that it does not have."""
+    """One fault. Without `car` it hits every car. A kind ignores the fields that `_FIELDS` does not list for it."""
 
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
-    """Duration in seconds. 0 ends the fault now. None means until the same kind comes with 0 (a lost link: link_drop).
+    """Duration in seconds. 0 ends the fault now. None means until a fault of the same kind with 0 ends it.
 
-    Of `empty`: the time until the battery is.
+    `link_drop` with 0 ends every loss of the link. For `empty`: the time until the battery is empty.
     """
     bytes: int = 0
-    """Number of bytes of garbage, or of the next frame before the cut."""
+    """Number of bytes of garbage, or number of bytes of the next frame that still reach the car before the cut."""
     ways: tuple[Direction, ...] = tuple(Direction)
     """Directions of `lossy` and `garbage`."""
     factor: float = 1.0
-    """Speed of a slow link as a fraction of 960 bytes/s."""
+    """Rate of a slow link, as a fraction of 960 bytes/s."""
     share: float = 0.0
     """Fraction of the bytes that a lossy link loses."""
     rate: float = 0.0
@@ -66,7 +66,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """A press of a button of the remote. Without `car` every car gets it."""
+    """A press of a button of the remote. Without `car` it is sent to every car."""
 
     button: Button
     car: str | None = None
@@ -81,7 +81,7 @@ class Scheduled:
 
 
 def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[str]:
-    """Return the names of the cars that this affects. Raises BadSpec for an unknown car, or one that cannot have it."""
+    """Return the names of the cars that this affects. Raises BadSpec if the car is unknown or cannot be affected."""
     names = [car.name for car in cars]
     if act.car is not None and act.car not in names:
         raise BadSpec(f"car {act.car!r} is not simulated here: use {', '.join(names)}")
@@ -90,14 +90,14 @@ def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[st
         what = "ir" if isinstance(act, Press) else act.kind.value
         simulated = [car.name for car in chosen if isinstance(car, CarSpec)]
         if not simulated:
-            raise BadSpec(f"{what} needs a simulated car, a replay only repeats its bytes")
+            raise BadSpec(f"{what} needs a simulated car, because a replay only repeats its bytes")
         return simulated
     if act.path is not None:
         if act.car is None or not isinstance(chosen[0].link, PtyPath) or chosen[0].link.path is None:
-            raise BadSpec(f"path {act.path!r} is not allowed: only with the name of a car whose link is pty:PATH")
+            raise BadSpec(f"path {act.path!r} is not allowed: path needs the name of a car whose link is pty:PATH")
         others = [car.name for car in cars if isinstance(car.link, PtyPath) and car.link.path == act.path]
         if [name for name in others if name != act.car]:
-            raise BadSpec(f"path {act.path!r} is not allowed: car {others[0]} has it")
+            raise BadSpec(f"path {act.path!r} is not allowed: car {others[0]} already uses it")
     return [car.name for car in chosen]
 
 
@@ -151,7 +151,7 @@ def fault_of(fields: object) -> Fault:
         low, high = (0, MAX_CUT_BYTES) if kind is FaultKind.CUT_WRITE else (1, MAX_GARBAGE_BYTES)
         count = int(number("bytes", given["bytes"], low, high))
     if path is not None and (not isinstance(path, str) or not path):
-        raise BadSpec(f"path {path!r} is not allowed: write where the symlink is to be made")
+        raise BadSpec(f"path {path!r} is not allowed: write the new path of the symlink")
     ways = ["host", "car"] if kind is FaultKind.GARBAGE else list(_WAYS)
     to = _choice("to", given["to"], ways) if "to" in known else "both"
     flood = Flood(_choice("of", given["of"], list(Flood))) if "of" in known else Flood.NOISE
@@ -200,7 +200,7 @@ def _choice(what: str, value: object, allowed: list[str]) -> str:
 def number(what: str, value: object, low: float, high: float) -> float:
     """Return a number from the control channel. Raises BadSpec if it is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise BadSpec(f"{what} {value!r} is not allowed: a number from {low:.12g} to {high:.12g}")
+        raise BadSpec(f"{what} {value!r} is not allowed: use a number from {low:.12g} to {high:.12g}")
     return float(value)
 
 
@@ -248,7 +248,7 @@ def parse_press(text: str) -> Scheduled:
 def _at(text: str) -> float:
     at = float(text)
     if not math.isfinite(at) or at > MAX_FAULT_S:
-        raise BadSpec(f"at most {MAX_FAULT_S:g} s after the start")
+        raise BadSpec(f"{text} s after the start is not allowed: use at most {MAX_FAULT_S:g}")
     return at
 
 

@@ -1,6 +1,6 @@
 """Runs the cars of the model in real time, each behind its link, all in one asyncio loop.
 
-The loop's clock is the only clock of the simulator. Carries out the faults that `faults` parses.
+The loop's clock is the only clock of the simulator. This also carries out the faults that `faults` parses.
 """
 
 import asyncio
@@ -59,7 +59,7 @@ class Machine(Protocol):
 
 
 class SimCar:
-    """One car: its program, its link, the faults between them, and the timer that drives all."""
+    """One car: its program, its link, the faults between them, and the timer that runs all of them."""
 
     def __init__(self, spec: CarSpec | ReplaySpec, firmware: Machine, seed: str) -> None:
         self.spec = spec
@@ -87,7 +87,7 @@ class SimCar:
         self.on_ended: Watcher = lambda _: None
         """Called at the end of a capture that does not loop."""
         self.on_failed: Callable[[SimCar, EndpointError], None] = lambda *_: None
-        """Called when a link cannot return."""
+        """Called when a lost link cannot be opened again."""
         self._link: SimEndpoint
         if isinstance(spec.link, PtyPath):
             self._link = PtyEndpoint(self, spec.link.path)
@@ -187,7 +187,7 @@ class SimCar:
             for watcher in self.watchers:
                 watcher(self)
         if was_alive and not self._alive and isinstance(self._link, TcpEndpoint):
-            # The program's sockets die with it: the connection ends and a new one is refused.
+            # The program's sockets close when it dies: the connection ends, and a new one is refused.
             self._later(self._link.down())
         if isinstance(self.firmware, CaptureCar) and self.firmware.done and not self._ended:
             self._ended = True
@@ -218,7 +218,7 @@ class SimCar:
         return obeyed
 
     async def inflict(self, fault: Fault) -> None:
-        """Carry out a fault now. Raises EndpointError if a link cannot return."""
+        """Carry out a fault now. Raises EndpointError if a lost link cannot be opened again."""
         self._pump()
         now = self._loop.time()
         until = inf if fault.for_s is None else now + fault.for_s
@@ -262,7 +262,7 @@ class SimCar:
         self._pump()
 
     async def _go_out(self) -> None:
-        """Switch the car off: its battery is empty. Its link is gone until somebody ends `link_drop`."""
+        """Switch the car off, because its battery is empty. Its link is gone until somebody ends `link_drop`."""
         if isinstance(self.firmware, Firmware | UgvCar):
             self.firmware.brown_out(self._loop.time())
         await self._drop(None)
@@ -331,7 +331,7 @@ class Simulation:
         self.cars: dict[str, SimCar] = {}
         now = asyncio.get_running_loop().time()
         for index, spec in enumerate(specs):
-            # The seed includes the name, so that a car behaves the same beside any other cars.
+            # The seed includes the name, so that a car behaves the same whatever other cars there are.
             seeded = f"{seed}:{spec.name}"
             transport = Transport.SERIAL if isinstance(spec.link, PtyPath) else Transport.TCP
             rng, options = _rng(seeded), spec.options
@@ -388,6 +388,6 @@ class Simulation:
         return as_it_is(self.world, now)
 
     def press(self, press: Press) -> list[str]:
-        """Press a button for one car or all; return the names of those that obey. Raise BadSpec as `inflict`."""
+        """Press a button for one car or all; return the names of those that obey. Raise BadSpec for an unknown car."""
         names = targets([car.spec for car in self.cars.values()], press)
         return [name for name in names if self.cars[name].press(press.button)]

@@ -25,7 +25,7 @@ TRUTH_INTERVAL_S: Final = 0.1
 WORLD_REPEAT_INTERVAL_S: Final = 1.0
 HUB_RETRY_DELAY_S: Final = 0.3
 HUB_OPEN_TIMEOUT_S: Final = 0.3
-# Cars may start before their gateways, which start the hub.
+# Cars may start before their gateways, which start the hub, so a missing hub is no fault at first.
 HUB_WARNING_DELAY_S: Final = 10.0
 """Time without a hub after which the simulator prints a warning."""
 
@@ -92,7 +92,8 @@ class TruthPublisher:
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Open the bus, with retries."""
-        # Opening blocks, so it runs in a thread. The thread is a daemon: a hub that hangs must not prevent our end.
+        # Opening blocks, so it runs in a thread. The thread is a daemon, so that a hub that does not answer cannot keep
+        # the simulator from ending.
         warn_at = loop.time() + HUB_WARNING_DELAY_S
         while True:
             if loop.time() >= warn_at:
@@ -149,7 +150,7 @@ class TruthPublisher:
 
 
 def world_message(world: World, state: WorldState) -> fleet_v1_pb2.World:
-    """Return the message of the world. `state` are its lamps and things as in the control channel."""
+    """Return the message of the world. `state` has its lamps and things, as the control channel reports them."""
     walls = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in world.walls]
     return fleet_v1_pb2.World(
         lamps=[fleet_v1_pb2.SimLamp(name=name, **fields) for name, fields in state["lamps"].items()],

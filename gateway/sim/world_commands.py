@@ -9,9 +9,9 @@ from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import World
 
 Change = Callable[[World, float], None]
-"""A change of a world at a time."""
+"""Changes a world. The second argument is the time of the change."""
 WorldState = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""`lamps` and `things`: by name, their fields."""
+"""Under `lamps` and `things`, for each name its fields."""
 
 _Kind = TypeVar("_Kind", Lamp, MovingObject)
 _PLACE: Final = {"x_m": (-FAR_M, FAR_M), "y_m": (-FAR_M, FAR_M)}
@@ -31,7 +31,7 @@ def _lamp_change(fields: Mapping[str, object], lamp: Lamp) -> Change:
     if "on" in fields:
         on = fields["on"]
         if not isinstance(on, bool):
-            raise BadSpec(f"on {on!r} is not allowed: true or false")
+            raise BadSpec(f"on {on!r} is not allowed: use true or false")
         given["on"] = on
     return lambda world, _: world.change_lamp(lamp.name, **given)
 

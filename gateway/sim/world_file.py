@@ -1,4 +1,4 @@
-"""Builds a world of a world file, which `schemas.world_check` has checked. Pure.
+"""Builds a world from a world file, after `schemas.world_check` has checked the file. Pure.
 
 Distances in meters, speeds in m/s, angles in the file in degrees counter-clockwise from x. The fields are in
 `schemas.world_fields`.
@@ -18,7 +18,7 @@ from schemas.world_fields import LineEntry, ThingEntry
 
 @dataclass(frozen=True, slots=True)
 class WorldSpec:
-    """The content of a world file. A World changes while it runs, so each run creates its own."""
+    """The content of a world file. A World changes while it runs, so each run creates a new one from this."""
 
     walls: tuple[Segment, ...]
     line: tuple[Point, ...]

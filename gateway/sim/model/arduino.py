@@ -1,4 +1,4 @@
-"""The program of the Arduino car: one loop, one string, modes. Its traits make it another car of the family.
+"""The program of the Arduino car: one loop, one string, modes. Other traits turn it into another car of the family.
 
 It reads its string by position, as the real program does, and does not use our codec. "Row" in a comment means the row
 of that name in docs/reference/protocol.md.
@@ -13,7 +13,7 @@ from gateway.sim.model.mode_car import ARDUINO_LIGHTS, MODE_OF_DIGIT, ModeCar, t
 from schemas.words import Mode
 
 TX_BUFFER: Final = 64
-# A wedged car never clears its string, which grows until the RAM is full.
+# A wedged car never clears its string, so in the real program the string grows until the RAM is full.
 STRING_LIMIT: Final = 512
 """Maximum length of the string. Further bytes are dropped."""
 START_SPEED: Final = 150
@@ -28,10 +28,10 @@ class ArduinoCar(ModeCar):
         super()._reset_variables()
         self._string = ""
         self._arriving = ""
-        """The frame that arrives, if a `$` restarts the string."""
+        """The frame that is arriving, in a car with `last_frame_wins`: there a `$` restarts the string."""
         self._speed = START_SPEED
         # The program counts turns of its loop, so these times stand still while it blocks. The frames of the options
-        # come between the reports, so that none blocks.
+        # are sent between the reports, so that none of them has to wait for room in the transmit buffer.
         self._due: dict[str, float] = {}
         """Loop time until each frame of mode 0."""
         if not self._traits.timer:
@@ -46,7 +46,7 @@ class ArduinoCar(ModeCar):
         while True:
             self._serial_event()
             if self._complete and (yield from self._parse()):
-                continue  # the car obeys bytes from the time of an opening right after it, not a turn later
+                continue  # bytes that arrived while a mode was opened are obeyed right after that, not a turn later
             if self._mode is Mode.MANUAL:
                 yield from self._manual()
             else:
@@ -71,7 +71,7 @@ class ArduinoCar(ModeCar):
         self._buffer.clear()
 
     def _keep_last(self) -> None:
-        """Keep the last whole frame of the buffered bytes. A `#` outside a frame does nothing."""
+        """Store only the last whole frame of the buffered bytes. A `#` outside a frame does nothing."""
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
@@ -83,7 +83,7 @@ class ArduinoCar(ModeCar):
         self._buffer.clear()
 
     def _parse(self) -> Generator[Wait, None, bool]:
-        """Obey the string; return True if it was cleared."""
+        """Obey the string if the program knows it; return True if the string was cleared."""
         text, head = self._string, self._traits.head
         if text.find("MODE") > 0 and text.find(head) > 0:
             yield from self._mode_frame(text)
@@ -98,7 +98,7 @@ class ArduinoCar(ModeCar):
         return True
 
     def _mode_frame(self, text: str) -> Program:
-        """Read the digits at places 9 and 10 of the string (with a head of three letters), whatever they are."""
+        """Read the characters at places 9 and 10 of the string (with a head of three letters), whatever they are."""
         self._pressed = None
         place = len(self._traits.head) + 6
         if text[place + 1 : place + 2] == "0":
@@ -186,7 +186,7 @@ class ArduinoCar(ModeCar):
                 yield from self._print(self._report_frame(cm))
 
     def _on_alarm(self) -> None:
-        """Report by the timer, also during a block. Its ranging blocks nothing."""
+        """Report by the timer, also during a block. The ranging for this report does not block the program."""
         self._alarm_at += self._next_interval_s(self._traits.interval_s)
         if self._mode is Mode.MANUAL and not self._is_silent:
             self._send(self._report_frame(self._range()))

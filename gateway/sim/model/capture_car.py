@@ -5,7 +5,7 @@ from math import inf
 from typing import Final
 
 LOOP_PAUSE_S: Final = 1.0
-"""Pause between two rounds of a loop, about that between two reports of a car."""
+"""Pause between two rounds of a loop, about as long as the time between two reports of a car."""
 
 
 class CaptureCar:
@@ -19,7 +19,7 @@ class CaptureCar:
         self._loop = loop
         self._index = 0
         self._start = now
-        """Start time of the round, or None if the capture waits for a host."""
+        """Start time of this round, or None while the capture waits for a host."""
         self.rounds = 0
         """Number of complete rounds."""
         self.sent_bytes = 0
@@ -29,7 +29,7 @@ class CaptureCar:
         self.alive: Final = True
 
     def begin(self, now: float) -> None:
-        """Start to play, unless the capture plays already."""
+        """Start to play, unless the capture is playing already."""
         if self._start is None:
             self._start = now
 
@@ -57,7 +57,7 @@ class CaptureCar:
         return sent
 
     def next_event(self) -> float:
-        """Return the time of the next piece; inf if there is none, or no host."""
+        """Return the time of the next piece; inf if there is none, or if no host has connected yet."""
         if self._start is None or self.done:
             return inf
         return self._start + self._pieces[self._index][0] / self._rate
@@ -71,4 +71,4 @@ class CaptureCar:
         return
 
     def drop_link(self, now: float) -> None:
-        """Do nothing: the capture goes on without its link, as a car does."""
+        """Do nothing, because a capture plays on without its link, as a car runs on without one."""

@@ -14,13 +14,13 @@ TRACK_M: Final = 0.20
 
 SONAR_AT_M: Final = 0.10
 SONAR_REACH_CM: Final = 499.0
-"""Just below the 500 cm from which the car's own program discards a reading."""
+"""Just below 500 cm: the car's own program discards a reading of 500 cm or more."""
 SONAR_CONE: Final = tuple(radians(degree) for degree in (-15.0, -7.5, 0.0, 7.5, 15.0))
 SONAR_STEEPEST: Final = cos(radians(76))
-"""Cosine of the steepest angle: a surface hit at a flatter angle reflects the sound away."""
+"""Cosine of the largest angle to a surface's normal with an echo. At a larger one, the sound is reflected away."""
 INFRARED_REACH_M: Final = 0.20
 INFRARED_SIDE: Final = radians(20)
-# For cars and things. Walls are only detected in the middle of the cone, so that recorded avoidance runs stay the same.
+# For cars and things. A wall is detected only in the middle of the cone, so that recorded avoidance runs do not change.
 INFRARED_CONE: Final = tuple(radians(degree) for degree in (-30.0, -15.0, 0.0, 15.0, 30.0))
 LINE_SENSORS: Final = ((0.08, 0.040), (0.08, 0.010), (0.08, -0.010), (0.08, -0.040))
 """Positions ahead and left of the axle's middle, m: left-outer .. right-outer."""
@@ -45,7 +45,7 @@ class CarBody:
         self._battery = 7.6 + 0.7 * rng.random()
         self._started = now
         self._drain: tuple[float, float] | None = None
-        """From when to when the battery runs empty."""
+        """The time when the battery begins to run empty, and the time when it is empty. None if it does not."""
         world.join(self, now)
 
     @property
@@ -77,7 +77,7 @@ class CarBody:
         return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
 
     def glide(self, now: float) -> None:
-        """Move on to `now`, at most one tick, as far as there is room. Only in a lively world."""
+        """Move on to `now`, at most one tick, as far as there is room. This is for a lively world only."""
         span = now - self._now
         if span <= 0:
             return
@@ -111,7 +111,7 @@ class CarBody:
             self._x, self._y = self._world.push_out(x, y)
 
     def _driven(self, span: float) -> tuple[float, float, float]:
-        """Return x, y, heading after this time if nothing is in the way."""
+        """Return x, y and heading after this time if nothing is in the way."""
         left, right = self._wheels()
         speed, turn = (left + right) / 2, (right - left) / TRACK_M
         heading = self._heading + turn * span
@@ -123,7 +123,7 @@ class CarBody:
         return x, y, heading
 
     def _look(self, now: float) -> None:
-        """Bring this car to `now`, and in a lively world all cars."""
+        """Move this car on to `now`, and in a lively world all cars."""
         self._move(now)
         if self._world.lively:
             for other in self._world.bodies:
@@ -206,7 +206,7 @@ class CarBody:
         return (seen[0], seen[1])
 
     def grayscale(self, now: float) -> int:
-        """Return the grayscale of the floor under the car's middle: high on the tape."""
+        """Return the grayscale of the floor under the car's middle. It is higher on the tape."""
         self._move(now)
         return TAPE_GRAY if self._world.line and self._world.on_line(self._x, self._y) else FLOOR_GRAY
 

@@ -1,7 +1,7 @@
-"""A course's Raspberry Pi program: a table of exact frames. Any other frame ends it, and it sends nothing at all.
+"""The Raspberry Pi program of a course, with a table of exact frames. It ends at any other frame, and sends nothing.
 
-The program was run (docs/reference/protocol.md#programs-that-people-have). Assumed: its speed, and what it knows beside
-the motions.
+The program was run (docs/reference/protocol.md#programs-that-people-have). Its speed, and the frames that it knows
+besides the motions, are assumptions.
 """
 
 from math import inf
@@ -34,7 +34,7 @@ COURSE_FRAMES: Final = frozenset(
 
 
 class CourseCar(Firmware):
-    """A car with a course's Raspberry Pi program. Once it has died, its motors stay as they were."""
+    """A car with a course's Raspberry Pi program. Once the program has died, the motors stay as they were."""
 
     def __init__(
         self, body: CarBodyState, rng: Rng, *, transport: Transport = Transport.SERIAL, now: float = 0.0

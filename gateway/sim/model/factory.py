@@ -1,4 +1,4 @@
-"""Builds a car in the world from the checked words of `car_spec`."""
+"""Builds a car in the world from a description that `car_spec` has checked."""
 
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
@@ -28,9 +28,9 @@ def build(
 ) -> Firmware:
     """Return car number `index` of the world, at rest on its start pose, with its program just started.
 
-    `name`: its name in the world file, which gives its place and the things that it carries. `transport` is used for a
-    Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART. `traits`: None for those of the platform;
-    the course's program has none.
+    The world file may give a start pose and things to carry to the car with this `name`. Only a Raspberry Pi uses
+    `transport`, because an Arduino behind a Wi-Fi bridge still has its UART. If `traits` is None, the car has those of
+    its platform. The course's program has no traits.
     """
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware
@@ -59,7 +59,7 @@ def build_ugv(
     now: float = 0.0,
     name: str = "",
 ) -> UgvCar:
-    """Return a car of the second family. It has run for a while, without a gateway."""
+    """Return a car of the second family, whose program has already run for a while without a gateway."""
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car = UgvCar(UGV_BUILDS[platform], body, rng, options=options, now=now)
     if world.lively:

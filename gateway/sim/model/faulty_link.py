@@ -1,6 +1,6 @@
 """A link with faults on virtual time: it delays, drops, changes or blocks bytes in either direction.
 
-Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware` has the rate of the UART.
+Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware` models the UART's rate.
 """
 
 from collections import deque
@@ -11,7 +11,7 @@ from typing import Final, Protocol
 from gateway.sim.model.firmware import BYTES_PER_S
 
 TO_HOST_LIMIT: Final = 1024
-"""Maximum bytes in a slow link to the host. Further bytes are lost, as in a Bluetooth module."""
+"""Maximum number of bytes in a slow link to the host. Further bytes are lost, as in a Bluetooth module."""
 FLOOD_INTERVAL_S: Final = 0.005
 NEVER_ENDING: Final = b"$4WD,CSB"
 """The beginning of a frame without an end; zeros follow."""
@@ -91,7 +91,10 @@ class _ByteQueue:
 
 
 class FaultyLink:
-    """Both directions of a car's link. Times: seconds from any origin, never backwards; `until` inf: for ever."""
+    """Both directions of a car's link.
+
+    Times are seconds from any origin and never run backwards. If `until` is inf, the fault lasts for ever.
+    """
 
     def __init__(self, to_car: Noise, to_host: Noise) -> None:
         self._noise = to_host
@@ -118,15 +121,15 @@ class FaultyLink:
             self._lanes[way].share, self._lanes[way].lossy_until = share, until
 
     def close(self, way: Direction, until: float) -> None:
-        """Accept all bytes and deliver none."""
+        """Accept and lose all bytes of a direction."""
         self._lanes[way].closed_until = until
 
     def echo(self, until: float) -> None:
-        """Send the host's bytes back to it as well."""
+        """Deliver the host's bytes to the car, and also send them back to the host."""
         self._echo_until = until
 
     def flood(self, what: Flood, rate: float, now: float, until: float) -> None:
-        """Send `rate` bytes per second to the host, besides the car's own."""
+        """Send `rate` bytes per second to the host, besides the bytes of the car."""
         self._flood, self._flood_rate, self._flood_at, self._flood_until = what, rate, now, until
         self._flooded = 0
 
@@ -178,7 +181,7 @@ class FaultyLink:
         out = self._lanes[Direction.TO_HOST].take(now)
         if self._flood_at < self._flood_until:
             end = min(now, self._flood_until)
-            # A busy host gets at most the bytes of one second: no buffer holds more.
+            # If the last call was longer ago, only the bytes of the last second are sent, because no buffer holds more.
             since = max(self._flood_at, end - 1.0)
             count = int((end - since) * self._flood_rate + 1e-6)
             self._flood_at = end if end == self._flood_until else since + count / self._flood_rate

@@ -1,7 +1,8 @@
 """The base of every car's program: one blocking loop on virtual time, a UART each way, motors.
 
-A program is a generator that yields a `Wait` wherever the real program blocks, so that both read alike. `arduino`,
-`stm32`, `raspberry_pi` and `course` have the programs, `traits` their parameters, `car_body` motion and sensors.
+A program is a generator that yields a `Wait` wherever the real program blocks, so that the code of both looks alike.
+`arduino`, `stm32`, `raspberry_pi` and `course` have the programs, `traits` their parameters, `car_body` the motion and
+the sensors.
 """
 
 from collections import deque
@@ -16,20 +17,20 @@ from gateway.sim.model.traits import CarTraits
 from schemas.words import Mode
 
 # The numbers below repeat those of gateway.drivers.yahboom.protocol on purpose: the simulator is the oracle of the
-# tests, and an oracle that shares its numbers with the tested code finds no wrong number.
+# tests, and an oracle that shared its numbers with the tested code could not find a wrong number.
 
 BYTES_PER_S: Final = 960.0
 """9600 baud, 8N1: ten bits a byte (docs/reference/protocol.md#framing)."""
 CHUNK: Final = 20
-"""Maximum bytes of a piece, as from a Bluetooth 4.0 module."""
+"""Maximum number of bytes in a piece, as from a Bluetooth 4.0 module."""
 
 WHISTLE_S: Final = 0.30
 SERVO_S: Final = 0.65
 COLOR_S: Final = 0.10
-# The vendor's Arduino program was measured at about 0.68 s. 1.0 s, the table's, is the worst case of the hazards.
+# The vendor's Arduino program was measured at about 0.68 s. The table's 1.0 s, used here, is the worst of the hazards.
 NO_ECHO_S: Final = 1.0
 ECHO_S_PER_CM: Final = 58e-6
-"""Time for both ways at the speed of sound."""
+"""Time of the sound for 1 cm of distance, there and back."""
 REPORT_BASE_S: Final = 0.004
 TEXT_LINE: Final = b"EXEC:F\r\n"
 
@@ -91,14 +92,14 @@ class Truth:
     motor_left: int
     motor_right: int
     blocked: bool
-    """True during a block of 0.1 s or more, while bytes pile up."""
+    """True while the program is blocked for 0.1 s or more, so that received bytes pile up."""
     fan: bool
     led: str
     """`off`, or `#rrggbb`."""
     servo: int
     """Direction of the front servo, 0..180 degrees; 90 is straight ahead, 180 left."""
     speed: int
-    """The PWM (0..255) of the next motion."""
+    """The PWM value (0..255) at which the next motion drives."""
     alive: bool
     """False once a Raspberry Pi program has died."""
 
@@ -160,11 +161,11 @@ class Firmware:
         self.lost_bytes = 0
         """Number of bytes dropped because the receive buffer was full."""
         self._pressed: Button | None = None
-        """A button of the remote that the program has not read yet."""
+        """A button of the remote that was pressed and that the program has not read yet."""
         self.scheduler: EventScheduler | None = None
-        """Runs this program in order with those of the other cars. None if cars do not meet."""
+        """Runs the programs of all cars in the order of time. None if cars do not affect each other."""
         self._alarm_at = inf
-        """Time of the next interrupt of a hardware timer."""
+        """Time of the next interrupt by a hardware timer; inf without a timer."""
         self._program = self._main()
         self._wait = Wait(now)
 
@@ -195,7 +196,7 @@ class Firmware:
         return min(due, self._outgoing[0][0]) if self._outgoing else due
 
     def backlog(self, now: float) -> int:
-        """Return the number of bytes still on the wire; feed no more while it is large."""
+        """Return the number of bytes still on the wire to the car. Callers feed no more bytes while it is large."""
         self._run(now)
         return len(self._arrivals)
 
@@ -211,7 +212,7 @@ class Firmware:
 
     @property
     def truth(self) -> Truth:
-        """The state at `now`, as of the last call."""
+        """The state at `self.now`, the time up to which the program has run."""
         return Truth(
             mode=self._mode,
             motor_left=self._left,
@@ -237,7 +238,7 @@ class Firmware:
     # Faults.
 
     def drop_link(self, now: float) -> None:
-        """Cut the link: bytes on the wire are lost. The car notices nothing and keeps a truncated frame."""
+        """Cut the link: bytes on the wire are lost. The car does not notice it, and a truncated frame stays in it."""
         self._run(now)
         self._arrivals.clear()
 
@@ -246,7 +247,7 @@ class Firmware:
         self._body.drain(now, in_s)
 
     def brown_out(self, now: float) -> None:
-        """Let the battery sag. The motors stop, the frame being sent is truncated, and the program reboots."""
+        """Let the voltage sag. The motors stop, the frame that is being sent is truncated, and the program reboots."""
         self._run(now)
         self._cut_outgoing(now)
         self._arrivals.clear()
@@ -333,7 +334,7 @@ class Firmware:
             self.motor_log.append((self._now, left, right))
 
     def _busy(self, seconds: float) -> Program:
-        """Block the program; show a long block in `truth`."""
+        """Block the program. `truth` shows a block of 0.1 s or more."""
         outer = self._blocked
         self._blocked = outer or seconds >= COLOR_S
         yield Wait(self._now + seconds)
@@ -375,7 +376,7 @@ class Firmware:
             self._fan = not self._fan
 
     def _next_interval_s(self, mean_s: float) -> float:
-        """Return the time until the next report: the mean, and a random part within the spread."""
+        """Return the time until the next report: the mean, plus or minus a random part of up to the spread."""
         spread = self._traits.spread_s
         return max(0.0, mean_s + spread * (2 * self._rng.random() - 1)) if spread else mean_s
 
@@ -396,7 +397,7 @@ class Firmware:
         return self._frame(",".join(f"J{number}{deg}" for number, deg in enumerate(joints, 1)))
 
     def _ranging(self) -> Generator[Wait, None, float | None]:
-        """Range once with ultrasound and return cm. Without echo, block until the timeout and return None."""
+        """Measure once with ultrasound and return cm. Without echo, block until the timeout and return None."""
         cm = self._range()
         if cm is None:
             yield from self._busy(NO_ECHO_S)
@@ -426,7 +427,7 @@ def bits(values: tuple[bool, ...]) -> str:
 MOTIONS: Final = {"1": (1, 1), "2": (-1, -1), "3": (0, 1), "4": (1, 0)}
 """Place 1 of the general frame: sign of the left and the right motor. A turn stops the inner wheels."""
 SPINS: Final = {"1": (-1, 1), "2": (1, -1)}
-"""Place 2, which wins over place 1."""
+"""Place 2, which takes precedence over place 1."""
 
 
 def motion(text: str) -> tuple[int, int]:

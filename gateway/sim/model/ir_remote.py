@@ -1,8 +1,7 @@
 """The buttons of the infrared remote and their motions.
 
-docs/reference/protocol.md#modes says that only a car in mode 1 obeys, but does not list the buttons: these are the
-motions and steps of the
-general frame.
+docs/reference/protocol.md#modes says that only a car in mode 1 obeys. It does not list the buttons, so the buttons here
+are the motions and the speed steps of the general frame.
 """
 
 from enum import StrEnum

@@ -27,7 +27,7 @@ BOOT_S: Final = 0.5
 AVOIDANCE_RANGINGS: Final = 5
 SHARP_S: Final = 0.08
 FAR_CM: Final = 500.0
-"""In avoidance, the program discards a distance from here on like a missing echo."""
+"""In avoidance, the program discards a distance of this or more, as if there were no echo."""
 
 MODE_OF_DIGIT: Final = {
     "0": Mode.MANUAL,
@@ -38,7 +38,7 @@ MODE_OF_DIGIT: Final = {
     "5": Mode.LIGHT_SEEKING,
     "6": Mode.FOLLOWING,
 }
-"""The modes by the x of `MODE<x><y>`. `_mode_turn` has what a car does in each."""
+"""The modes by the x of `MODE<x><y>`. The functions that `_mode_turn` calls say what a car does in each."""
 
 ARDUINO_LIGHTS: Final = {
     "1": (255, 255, 255),
@@ -54,10 +54,10 @@ _JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d
 
 
 class ModeCar(Firmware):
-    """A car with modes. A subclass has its main loop, obeys the frames and prints."""
+    """A car with modes. A subclass adds the main loop, obeys the frames and prints."""
 
     TRAITS: ClassVar[CarTraits] = CarTraits()
-    """The traits of a car that is given none."""
+    """The traits of a car for which no traits are given."""
     BUFFER: ClassVar[int] = 64
     """Size of the receive buffer, bytes."""
 
@@ -82,15 +82,15 @@ class ModeCar(Firmware):
         self._color_position = 0
 
     def _reboot(self) -> Program:
-        # A reboot loses the mode, the motion, the speed (that of a start again), the light, the fan and both buffers.
-        # The servo and the arm keep their positions.
+        # A reboot resets the mode, the motion, the speed, the light and the fan, and clears both buffers. The servo and
+        # the arm stay at their positions.
         self._reset_variables()
         yield Wait(self._now + BOOT_S)
         self._buffer.clear()  # the UART is off while it boots
         yield from self._main()
 
     def _set_joints(self, text: str) -> bool:
-        """Obey the frame of an arm; return True if the text is one and the car has an arm."""
+        """Obey the frame of an arm; return True if the text is such a frame and the car has an arm."""
         found = _JOINTS.search(text) if "arm" in self._options else None
         if found:
             self._joints = [min(180, int(value)) for value in found.groups()]
@@ -101,7 +101,7 @@ class ModeCar(Firmware):
         return self._mode in self._traits.silent_modes
 
     def _turn(self, fields: str) -> Program:
-        """Print the frame of one loop turn in modes 2, 5 and 6, which takes the time of the turn."""
+        """Print the frame of one loop turn in modes 2, 5 and 6, and wait for the time of that turn."""
         raise NotImplementedError
 
     def _faster(self) -> None:
@@ -129,7 +129,10 @@ class ModeCar(Firmware):
     # Mode 1.
 
     def press(self, button: Button, now: float) -> bool:
-        """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
+        """Press a button; return True if the car obeys it.
+
+        Only mode 1 reads the receiver. While the program is busy, the receiver stores one button and loses others.
+        """
         self._run(now)
         if self._mode is not Mode.REMOTE_CONTROL or self._pressed is not None:
             return False
@@ -154,7 +157,7 @@ class ModeCar(Firmware):
                 left, right = SIGNS[button]
                 self._drive(left * self._pwm(), right * self._pwm())
 
-    # The other modes. Each sets the speed, which mode 0 keeps afterwards.
+    # The other modes. Each sets the speed, and this speed still applies in mode 0 afterwards.
 
     def _go(self, left: int, right: int, speed: int) -> None:
         self._speed = speed
@@ -180,7 +183,7 @@ class ModeCar(Firmware):
             self._go(1, 0, 220)
         elif left_inner and right_inner:
             self._go(1, 1, 250)
-        # No line under any sensor: the motors stay as they were.
+        # If there is no line under any sensor, the motors stay as they were.
 
     def _light_seeking(self) -> Program:
         seen = self._body.light(self._now)
@@ -189,7 +192,7 @@ class ModeCar(Firmware):
         self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
 
     def _following(self) -> Program:
-        """Follow an object (row "6 following"): no `#`, inverted bits, 0 = object seen."""
+        """Follow an object (row "6 following"). The frames have no `#`, and inverted bits, where 0 = object seen."""
         seen = self._body.obstacle(self._now)
         yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
         left, right = seen
@@ -223,7 +226,7 @@ class ModeCar(Firmware):
             self._go(1, 1, 100)
 
     def _distance(self) -> Generator[Wait, None, float]:
-        """Return the distance of five rangings, 0.1 s. Without echo, brake and block for ever."""
+        """Return the mean of the middle three of five rangings, after 0.1 s. Without echo, brake and measure again."""
         found = []
         for _ in range(AVOIDANCE_RANGINGS):
             while (cm := self._range()) is None or cm >= FAR_CM:
@@ -234,7 +237,10 @@ class ModeCar(Firmware):
         return sum(sorted(found)[1:4]) / 3
 
     def _maneuver(self) -> Program:
-        """Back off, range right, left and ahead, turn: 4.2 s with the ranging before it, 4.3 s if hemmed in."""
+        """Back off, measure right, left and ahead, and turn.
+
+        Together with the ranging before it, this needs 4.2 s, or 4.3 s if there is an obstacle on all three sides.
+        """
         self._rgb = ARDUINO_LIGHTS["2"]
         self._go(-1, -1, 80)
         yield from self._busy(0.08)
@@ -261,6 +267,6 @@ class ModeCar(Firmware):
 
 
 def to_int(text: str) -> int:
-    """Return the leading digits as a number, 0 without any, as Arduino's String.toInt()."""
+    """Return the leading digits as a number, or 0 if there are none, as Arduino's String.toInt() does."""
     digits = re.match(r"\s*[+-]?\d{1,9}", text)
     return int(digits[0]) if digits else 0

@@ -24,7 +24,7 @@ from schemas.geometry import (
 
 FAR_M: Final = 100.0
 """Maximum of x and y in a world."""
-# A car's own top speed. A much faster thing would jump over a car between two ticks.
+# The top speed of a car. A much faster thing would jump over a car between two ticks.
 FASTEST_M_S: Final = 0.5
 """Maximum speed of a thing."""
 
@@ -36,14 +36,14 @@ class Lamp:
     x_m: float
     y_m: float
     reach_m: float = 1.5
-    """Range at a brightness of 1. Four times the brightness doubles the range."""
+    """Range at a brightness of 1. A lamp that is four times as bright has twice the range."""
     brightness: float = 1.0
     on: bool = True
     overhead: bool = False
     """True if the lamp hangs above everything, so that nothing hides it."""
     name: str = ""
     carried_by: str = ""
-    """A thing or a car, in whose frame x (ahead) and y (left) then are."""
+    """Name of the thing or car that carries the lamp. Then x (ahead) and y (left) are in the frame of this carrier."""
 
     @property
     def seen_from_m(self) -> float:
@@ -60,18 +60,18 @@ class MovingObject:
     y_m: float = 0.0
     radius_m: float = 0.0
     width_m: float = 0.0
-    """Width of a box: along x, if its heading is 0."""
+    """Width of a box, which is its size along x if its heading is 0."""
     depth_m: float = 0.0
     heading_rad: float = 0.0
     path: tuple[Point, ...] = ()
-    """A closed polyline, instead of a place. A path there and back includes the points back."""
+    """A closed polyline on which the thing moves instead of x and y. A path there and back includes both ways."""
     speed_m_s: float = 0.0
     carried_by: str = ""
-    """A car, in whose frame x (ahead) and y (left) then are."""
+    """Name of the car that carries the thing. Then x (ahead) and y (left) are in the frame of this car."""
     waits_for_m: float = 0.0
-    """The thing moves only while a car is within this distance of its middle; 0: always."""
+    """The thing moves only while a car is within this distance of its middle. If 0, it always moves."""
     from_m: float = 0.0
-    """Position along its path at `since_s`."""
+    """Its position along its path at the time `since_s`."""
     since_s: float = 0.0
     going: bool = True
     """False while the thing waits."""
@@ -83,11 +83,11 @@ class MovingObject:
 
     @property
     def extent_m(self) -> float:
-        """From its middle to the farthest of it."""
+        """The distance from its middle to its farthest point."""
         return self.radius_m or hypot(self.width_m, self.depth_m) / 2
 
     def pose(self, at_s: float) -> Pose:
-        """Where it is; of a carried thing: in the car's frame."""
+        """Return its pose. The pose of a carried thing is in the frame of its car."""
         if not self.path:
             return Pose(self.x_m, self.y_m, self.heading_rad)
         ends = _ends(self.path)
@@ -107,11 +107,11 @@ class MovingObject:
         return (self.from_m + gone) % length if length > 0 else 0.0
 
     def faster(self, speed_m_s: float, at_s: float) -> "MovingObject":
-        """Return the thing with another speed from now on."""
+        """Return the thing with another speed from this time on."""
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, speed_m_s=speed_m_s)
 
     def waiting(self, at_s: float, *, near: bool) -> "MovingObject":
-        """Return the thing, moving if a car is near and waiting otherwise."""
+        """Return the thing as it is from this time on: it moves if a car is near, and waits otherwise."""
         if not self.waits_for_m or near == self.going:
             return self
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, going=near)
@@ -121,7 +121,7 @@ class MovingObject:
         return replace(self, x_m=x_m, y_m=y_m, path=(), speed_m_s=0.0)
 
     def met(self, pose: Pose, x: float, y: float, dx: float, dy: float) -> Hit | None:
-        """Return the hit of a ray on the thing at `pose`."""
+        """Return the hit of a ray from x, y on the thing at `pose`, or None."""
         if self.radius_m:
             return ray_to_circle(x, y, dx, dy, (pose.x_m, pose.y_m), self.radius_m)
         if self._inside(pose, x, y):
@@ -141,7 +141,7 @@ class MovingObject:
         return radius + away if self._inside(pose, x, y) else radius - away
 
     def pushed(self, pose: Pose, x: float, y: float, radius: float) -> Point:
-        """Return the nearest place of a disc at which it does not overlap the thing."""
+        """Return the place nearest to x, y at which a disc does not overlap the thing."""
         depth = self.depth(pose, x, y, radius)
         if depth <= 0:
             return x, y

@@ -1,4 +1,4 @@
-"""The two programs of the Raspberry Pi car: a TCP server, and one behind a Bluetooth module. Neither has modes.
+"""The two programs of the Raspberry Pi car: a TCP server, and a program for a Bluetooth module. Neither has modes.
 
 "Row" in a comment means the row of that name in docs/reference/protocol.md.
 """
@@ -23,7 +23,7 @@ from gateway.sim.model.firmware import (
 from gateway.sim.model.traits import CarTraits
 
 TCP_RECEIVE: Final = 128
-"""Maximum bytes of one receive."""
+"""Maximum number of bytes in one call of receive."""
 SOCKET_BUFFER: Final = 65536
 TTY_BUFFER: Final = 4096
 START_PERCENT: Final = 80
@@ -57,7 +57,7 @@ class Transport(StrEnum):
 
 
 class _Died(Exception):
-    """The program ended with an error; the motors stay as they were."""
+    """The program has ended with an error. The motors stay as they were."""
 
 
 class RaspberryPiCar(Firmware):
@@ -100,7 +100,7 @@ class RaspberryPiCar(Firmware):
         self._client = True
 
     def disconnected(self, now: float) -> None:
-        """Note that the TCP client is gone: the next report kills the program, even after a reconnect."""
+        """Note that the TCP client is gone. The next report then ends the program, even if a client has reconnected."""
         self._run(now)
         self._client_gone = True
 
@@ -111,13 +111,13 @@ class RaspberryPiCar(Firmware):
         return dict(self._camera)
 
     def drop_link(self, now: float) -> None:
-        """Cut the link. Over TCP, bytes that have reached the machine stay readable."""
+        """Cut the link. Over TCP, the program can still read bytes that have reached the machine."""
         super().drop_link(now)
         if self._tcp and self._client:
             self.disconnected(now)
 
     def _reboot(self) -> Program:
-        # On a real car somebody must start the program, unless it runs as a service. Here it starts by itself.
+        # On a real car somebody must start the program, unless it is a service. In the simulator it starts by itself.
         self._reset_variables()
         yield Wait(self._now + PI_BOOT_S)
         self._buffer.clear()
@@ -142,13 +142,13 @@ class RaspberryPiCar(Firmware):
     # From the host.
 
     def _receive_tcp(self) -> str | None:
-        """Receive once. Return all of it if it begins with `$` and contains a `#`; otherwise ignore all of it."""
+        """Receive once. If the text begins with `$` and contains a `#`, return it whole; otherwise ignore it whole."""
         data = self._buffer[:TCP_RECEIVE].decode("latin-1")
         del self._buffer[:TCP_RECEIVE]
         return data if data.startswith("$") and "#" in data else None
 
     def _receive_serial(self) -> str | None:
-        """Read all buffered bytes and return the last whole frame. A truncated frame waits for its rest."""
+        """Read all buffered bytes and return the last whole frame. Store a truncated frame until its rest arrives."""
         last = None
         for byte in self._buffer:
             char = chr(byte)
@@ -178,9 +178,9 @@ class RaspberryPiCar(Firmware):
             yield from self._turn_servo(servo)
 
     def _general_frame(self, text: str) -> Generator[Wait, None, int | None]:
-        """Set the motion after whistle and fan; return the target of the front servo, which moves last."""
+        """Set the motion after whistle and fan. Return the target of the front servo, which moves last, or None."""
         if len(text) < 18:
-            raise _Died  # the program reads place 9 whether it is there or not
+            raise _Died  # the program reads place 9 without a check whether it exists
         left, right = motion(text)
         if text[5] == "1":
             yield from self._busy(WHISTLE_S)
@@ -254,7 +254,7 @@ class RaspberryPiCar(Firmware):
 
 
 def _number(text: str, word: str, end: str) -> int:
-    """Return the number between the FIRST occurrences of two words; the program dies if it is not a number."""
+    """Return the number between the FIRST occurrences of two words. If there is no number, the program dies."""
     start, stop = text.find(word) + len(word), text.find(end)
     if stop < start or not text[start:stop].strip().lstrip("+-").isdecimal():
         raise _Died

@@ -1,4 +1,7 @@
-"""Runs the programs of cars that meet. Their events run in the order of time, so all cars see the same moment. Pure."""
+"""Runs the programs of cars that affect each other, event by event in the order of time. Pure.
+
+So no program is ahead of another one when it reads its sensors.
+"""
 
 from typing import Protocol
 
@@ -14,7 +17,7 @@ class Member(Protocol):
 
 
 class EventScheduler:
-    """All programs of one world in which cars meet."""
+    """All programs of one lively world (see `World.lively`)."""
 
     def __init__(self) -> None:
         self._members: list[Member] = []

@@ -1,8 +1,8 @@
 """The vendor's STM32 program: a report by a timer, one buffer that an interrupt fills, and frames that never block.
 
-The program was run on a computer, with its interrupts (docs/reference/protocol.md#programs-that-people-have). Not
-measured: the slowest speed, the time of a turn of a silent mode, and the speeds of the modes, which are those of the
-Arduino program here.
+The program was run on a computer, with its interrupts (docs/reference/protocol.md#programs-that-people-have). Three
+things were not measured: the slowest speed, the time of a loop turn in a silent mode, and the speeds of the modes. The
+speeds of the modes here are those of the Arduino program.
 """
 
 from typing import ClassVar, Final
@@ -20,7 +20,7 @@ STM32_TRAITS: Final = CarTraits(
     silent_modes=frozenset({Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING}),
     gray_max=4095,
 )
-"""The traits of this program. `timer`, `close_s` and `last_frame_wins` are the program itself: it ignores others."""
+"""The traits of this program. It ignores other values of `timer`, `close_s` and `last_frame_wins`."""
 FRAME_BUFFER: Final = 80
 """Size of the buffer that the interrupt fills. Further bytes are dropped until the next `$`."""
 STM32_START_SPEED: Final = 200
@@ -28,12 +28,12 @@ STM32_SPEED_STEP: Final = 100
 STM32_TOP_SPEED: Final = 1000
 SILENT_TURN_S: Final = 0.02
 """Time of one loop turn of a mode that prints nothing."""
-# Lights 5 to 7 are unknown to it, and 3 and 4 are swapped against the table.
+# The program does not know lights 5 to 7, and its lights 3 and 4 are swapped in comparison with the table.
 STM32_LIGHTS: Final = {"1": (255, 255, 255), "2": (255, 0, 0), "3": (0, 0, 255), "4": (0, 255, 0), "8": (0, 0, 0)}
 
 
 class _TurnEnded(Exception):
-    """A MODE frame has ended the turn of the mode that ran."""
+    """A MODE frame has ended the loop turn of the mode that was running."""
 
 
 class Stm32Car(ModeCar):
@@ -41,7 +41,7 @@ class Stm32Car(ModeCar):
 
     TRAITS: ClassVar[CarTraits] = STM32_TRAITS
     BUFFER: ClassVar[int] = 4096
-    """The interrupt takes each byte at once: none is lost."""
+    """The interrupt reads each byte at once, so no byte is lost."""
 
     def _reset_variables(self) -> None:
         super()._reset_variables()
@@ -78,14 +78,14 @@ class Stm32Car(ModeCar):
     def _busy(self, seconds: float) -> Program:
         """Wait in a turn of a mode. Frames are obeyed meanwhile, and a MODE frame ends the turn."""
         end = self._now + seconds
-        while self._now < end and self._mode is not Mode.REMOTE_CONTROL:  # the remote has nothing to wait for
+        while self._now < end and self._mode is not Mode.REMOTE_CONTROL:  # this mode does not wait for anything
             yield Wait(end, wakes=True)
             self._obey_buffer()
 
     # From the host.
 
     def _interrupt(self) -> None:
-        """Put the received bytes into the one buffer. `$` starts at its begin, over what is there."""
+        """Put the received bytes into the one buffer. From a `$` on, they overwrite it from its beginning."""
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
@@ -100,8 +100,8 @@ class Stm32Car(ModeCar):
     def _obey_buffer(self) -> None:
         """Obey the buffer if a frame was complete since the last look, whatever is in it now.
 
-        A frame that has begun since then lies over the complete one. The rest of it comes into the cleared buffer, and
-        the program reads an empty string.
+        A frame that has begun since then has overwritten the beginning of the complete one. Its rest is put into the
+        buffer after this has cleared it, behind the place of its beginning, so the program reads an empty string then.
         """
         self._interrupt()
         if not self._complete:

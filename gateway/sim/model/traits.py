@@ -1,4 +1,4 @@
-"""In what the cars of one program differ. Pure.
+"""The traits in which cars with one program differ. Pure.
 
 Public programs of one family differ in the rhythm of their reports, in what blocks them and in what they print. A trait
 is a parameter of a simulated car, so that each of these cars can be tried.
@@ -9,7 +9,7 @@ from typing import Final
 
 from schemas.words import Mode
 
-# A ranging at 120 cm, where the intervals of real cars were measured: 4 ms, and the echo's way at the speed of sound.
+# For a ranging at 120 cm, at which the intervals of real cars were measured: 4 ms, plus the time of the sound.
 ECHO_RANGING_S: Final = 0.011
 """Time of one ranging with an echo, which is part of the interval between two reports."""
 
@@ -19,15 +19,15 @@ class CarTraits:
     """The parameters of one car. The defaults are those of the simulated Arduino car."""
 
     interval_s: float = 1.254
-    """Time from one mode-0 report to the next on the wire, with an echo. Without one, the ranging makes it longer."""
+    """Time from one mode-0 report to the next on the wire, with an echo. Without echo, the ranging makes it longer."""
     spread_s: float = 0.0
-    """Maximum by which each interval differs from `interval_s`, either way."""
+    """Maximum by which an interval is longer or shorter than `interval_s`."""
     timer: bool = False
     """True if a hardware timer sends the reports, so that no frame delays them."""
     close_s: float = 1.0
-    """Block of `MODEx0`."""
+    """Time for which `MODEx0` blocks the program."""
     last_frame_wins: bool = False
-    """True if the last of several whole frames in the buffer counts. A `$` then restarts the string."""
+    """True if only the last of several whole frames in the buffer counts. In such a car, a `$` restarts the string."""
     silent_modes: frozenset[Mode] = frozenset()
     """Modes in which this car prints nothing, although the vendor's program prints there."""
     text: bool = False
@@ -35,7 +35,7 @@ class CarTraits:
     readings: bool = True
     """False if the car sends nothing at all."""
     cells: int = 2
-    """Cells of the battery. Three give up to 12.6 V."""
+    """Number of cells of the battery. Three cells give up to 12.6 V."""
     head: str = "4WD"
     """First word of the frames in both directions."""
     fan_level: bool = False

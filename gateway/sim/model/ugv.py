@@ -1,11 +1,12 @@
-"""A car of Waveshare's UGV family: its two firmwares, with what makes them dangerous. Pure.
+"""A car of Waveshare's UGV family: its two firmwares, with their hazards. Pure.
 
-docs/reference/waveshare.md has what the programs do, each with its place in their source. Nobody has measured these
-cars. What the source does not say is a guess here: the time of one turn of the program's loop, how fast the motors
-follow, and the pauses of a boot.
+docs/reference/waveshare.md describes what the programs do, and names the place of each in their source. Nobody has
+measured these cars. Three things that the source does not say are guesses here: the time of one turn of the program's
+loop, how fast the motors follow, and the pauses of a boot.
 
-The program is one loop: take the lines that wait, control the speed, report, check the dead-man. Whatever blocks the
-loop (a delay, a mission) keeps the dead-man from being checked, too.
+The program is one loop: it obeys the lines that have arrived, controls the speed, reports, and checks its dead-man
+timer, which stops the motors after some time without a command. While a delay or a mission blocks the loop, the timer
+is not checked either.
 """
 
 import json
@@ -26,26 +27,29 @@ UGV_BYTES_PER_S: Final = 11520.0
 LOOP_S: Final = 0.01
 SPEED_LOOP_S: Final = 0.1
 FOLLOW: Final = 0.35
-"""Share of the way to the new speed that the motors go in one turn of the loop: they stand after some 0.1 s."""
+"""Fraction of the difference to the new speed by which the motors change in one turn of the loop.
+
+A car at full speed is almost still after some 0.1 s.
+"""
 UGV_DEAD_MAN_S: Final = 3.0
 UGV_LIMIT_M_S: Final = 2.0
-"""Beyond it a closed loop ignores the whole command, and is fed by it all the same."""
+"""Above it, a car with a closed speed loop ignores the speeds of a command. The command still restarts the dead-man."""
 MAX_DOCUMENT: Final = 256
 BATTERY_S: Final = 10.0
 PAGE_S: Final = 1.5
-"""Interval at which the car's own web page drives it on, for as long as it is open."""
+"""Interval at which the car's own web page repeats the command of the last button."""
 PAGE_ASKS_S: Final = ((1.0, 130), (2.5, 405))
-"""Intervals of the questions that it asks meanwhile. The answers go to the UART, too."""
+"""Intervals of the page's queries (number `T`) while it is open. The answers are sent to the UART, too."""
 WIFI_S: Final = 15.0
-"""Time for which `T:403`, `T:404` and `T:407` look for a network. Nothing else runs meanwhile, nor the dead-man."""
+"""Time for which `T:403`, `T:404` and `T:407` look for a network. Meanwhile nothing runs, not even the dead-man."""
 SERVO_SEARCH_S: Final = 0.1
-"""Time for which a servo is searched that does not answer."""
+"""Time for which the car waits for a servo that does not answer."""
 PAGE_OPEN_S: Final = 10.0
-"""Time after the last press in which it is closed."""
+"""Time from the last press until the page is closed and its queries end."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
 DEAD_DUTY: Final = 23.0
-"""Duty below this is zero."""
+"""A smaller duty counts as zero."""
 _ROM: Final = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805e4\r\n"
 _SETUP: Final = (
     (0.3, b"INA219 initialized.\r\n"),
@@ -54,18 +58,18 @@ _SETUP: Final = (
     (1.3, b"AP SSID: UGV\r\n......"),
     (1.9, b"\r\nServer Starts.\r\n"),
 )
-"""What a boot prints, by the time since the ROM's text."""
+"""The texts of a boot, each with its time since the start of the boot."""
 UGV_BOOT_S: Final = 2.0
 """Time from a reset until the loop runs."""
 _PARTS: Final = re.compile(r'"(\w+)"\s*:\s*(-?\d+(?:\.\d+)?)')
-"""The fields of a text that its web interface takes, also of one that ends too early."""
+"""A field as the web interface reads it, also in a text that ends too early."""
 UART_S: Final = 0.3
-"""Time from a reset until the program has its UART. Bytes that arrive before are lost."""
+"""Time from a reset until the program has opened its UART. Bytes that arrive before that are lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class UgvBuild:
-    """One product: its firmware, and the chassis that it really is."""
+    """One product: its firmware, and its real chassis. `main` is the number of the chassis in `T:900`."""
 
     is_ros: bool
     main: int
@@ -82,11 +86,16 @@ UGV_BUILDS: Final[Mapping[str, UgvBuild]] = {
 
 
 class UgvCar:
-    """One car and its UART on virtual time. Times: s from any origin, that must not run backwards.
+    """One car and its UART on virtual time. Times are seconds from any origin and must not run backwards.
 
-    options: `mission` (its boot mission drives for 2 s), `no_encoder` (a loose wire: the left encoder counts nothing),
-    `quiet` (`T:605` is 0: no echo), `arm` (its boot mission says that it has one: the arm's numbers take the places of
-    angles), `gimbal` (it says that it has one, and there is none: each turn of the loop searches two servos).
+    The options are:
+
+    - `mission`: the boot mission drives for 2 s.
+    - `no_encoder`: the left encoder counts nothing, as with a loose wire.
+    - `quiet`: `T:605` is 0, so there is no echo.
+    - `arm`: the boot mission says that there is an arm, whose numbers then replace the angles in the feedback.
+    - `gimbal`: the boot mission says that there is a gimbal, but there is none. So each turn of the loop waits for two
+      servos.
     """
 
     def __init__(
@@ -102,29 +111,29 @@ class UgvCar:
         self._out: deque[tuple[float, bytes]] = deque()
         self._tx_free = now
         self._kept_main = 2 if build.is_ros else 1
-        """The chassis after a reset. The ROS firmware keeps what it was told."""
+        """The chassis after a reset. In the ROS firmware, a `T:900` still counts after it."""
         self._kept_module = 1 if "arm" in options else 2 if "gimbal" in options else 0
-        """The number of the mounted module after a reset: 1 an arm, 2 a gimbal."""
+        """The number of the mounted module after a reset: 1 is an arm, 2 a gimbal, 0 none."""
         self._odometer = [0.0, 0.0]
         self._wheels = [0.0, 0.0]
         """The true speed of each wheel, m/s."""
         self._page: tuple[int, int] | None = None
-        """The motion of the web page that is open, by the sign of each side."""
+        """The motion that the web page repeats, as the sign of each side. None if it repeats none."""
         self.scheduler: EventScheduler | None = None
         self.alive: Final = True
         self.runaway_since: float | None = None
-        """Since when the motors are on while the dead-man is not armed, or None if they are not."""
+        """Time since which a command drives the motors while the dead-man is not armed. None if this is not so now."""
         self.wrong_since: float | None = None
-        """Since when it drives by a line of its host while it was told another chassis, or None if it does not."""
+        """Time since which a line of the host moves the car while it is set to a wrong chassis. None if not so now."""
         self._reset(now, text=False)
-        self._boot_until = self._uart_from = now  # it has run for a while
+        self._boot_until = self._uart_from = now  # the program has already run for a while
         self._mission: list[tuple[float, str]] = []
 
     # ------------------------------------------------------------------ the calls of the simulation
 
     @property
     def truth(self) -> Truth:
-        """The true state. The motors' numbers are the duty, -255..255."""
+        """The true state. The numbers of the motors are their duties, -255..255."""
         left, right = (round(each) for each in self._duty)
         light = "#ffffff" if self._outputs[0] else "off"
         speed = round(255 * max(abs(self._target[0]), abs(self._target[1])))
@@ -173,7 +182,7 @@ class UgvCar:
         return sum(len(data) for at, data in self._arrivals if at > now)
 
     def drop_link(self, now: float) -> None:
-        """Cut the link: what is on the way is lost. A partial line stays in the car for ever."""
+        """Cut the link: the bytes on the way are lost. A partial line stays, and the next bytes are joined to it."""
         self._run(now)
         self._arrivals.clear()
         self._out.clear()
@@ -188,7 +197,10 @@ class UgvCar:
         self._reset(now, text=True)
 
     def press(self, button: Button, now: float) -> bool:
-        """Press a button of the car's own web page; it drives on until `stop`, or until the page is closed."""
+        """Press a button of the car's own web page; return True if the page has it.
+
+        The page repeats the command until the next button or a reset.
+        """
         self._run(now)
         if button not in SIGNS:
             return False
@@ -202,7 +214,7 @@ class UgvCar:
         return True
 
     def take_http(self, text: str, now: float) -> None:
-        """Run what its web interface gets. It runs what it could parse, also of a text that ends too early."""
+        """Obey a command to the web interface: all fields that can be parsed, even if the text ends too early."""
         self._run(now)
         self._obey({name: float(value) for name, value in _PARTS.findall(text)})
 
@@ -232,18 +244,18 @@ class UgvCar:
         self._main = self._kept_main
         self._module = self._kept_module
         self._plays = False
-        """True if it plays a mission without an end. A byte that waits ends it."""
+        """True while the car plays an endless mission. A byte from the host ends the mission."""
         self._target = [0.0, 0.0]
         self._integral = [0.0, 0.0]
         self._duty = [0.0, 0.0]
         self._raw = False
-        """True after `T:11`: the duty is as commanded, without the speed loop."""
+        """True after `T:11`, which sets the duty itself, without the speed loop."""
         self._outputs = (0, 0)
         self._dead_man_s = UGV_DEAD_MAN_S
         self._fed_at = now
         self._timed_out = False
         self._uncovered = False
-        """True if something drives that the dead-man does not see."""
+        """True if a `T:13` after a timeout drives a car with the ROS firmware: the dead-man timer does not stop it."""
         self._stream = ros
         self._gap_s = 0.05 if ros else 0.0
         self._echo = not ros
@@ -255,7 +267,7 @@ class UgvCar:
         self._page = None
         self._page_at = inf
         self._page_open = (-inf, -inf)
-        """Since when the page is open, and until when."""
+        """The times at which the page was opened and is closed."""
         self._volts: tuple[float, float] = (self._body.battery_v(now) * 1.5, now)
         self._speed_at = now
         self._odometer = [0.0, 0.0]
@@ -290,7 +302,10 @@ class UgvCar:
         self._move(now)
 
     def _run_mission(self, now: float) -> None:
-        """Play the boot mission: a step at its time, unless a byte waits on the UART. Its duty counts at once."""
+        """Play the boot mission, each step at its time. A byte on the UART ends it.
+
+        With an open loop, a step sets the duty at once.
+        """
         while self._mission and now >= self._mission[0][0]:
             if self._arrivals and self._arrivals[0][0] <= now:
                 self._mission.clear()
@@ -300,7 +315,7 @@ class UgvCar:
                 self._control(now)
 
     def _search_servos(self, now: float) -> None:
-        """Search the two servos of a gimbal that is not there."""
+        """Wait for the two servos of a gimbal that is not there."""
         if self._module == 2:
             self._blocked_until = now + 2 * SERVO_SEARCH_S
             for number in (1, 2):
@@ -317,11 +332,11 @@ class UgvCar:
 
     @property
     def _is_closed(self) -> bool:
-        """True if this firmware controls the speed of the chassis that it was told."""
+        """True if this firmware has a closed speed loop for the chassis that it is set to."""
         return self._build.is_ros or self._main == 3
 
     def _control(self, now: float) -> None:
-        """Compute the duty of the motors: each 100 ms with a closed loop, at once with an open one."""
+        """Compute the duty of the motors: every 100 ms with a closed loop, and at once with an open one."""
         if self._raw:
             return
         if not self._is_closed:
@@ -341,19 +356,22 @@ class UgvCar:
             self._duty[side] = duty if abs(duty) >= DEAD_DUTY else 0.0
 
     def _measured(self, side: int) -> float:
-        """Return the speed by the encoder of a side. A loop that gets no signal winds up."""
+        """Return the speed that the encoder of a side measures. Without it, this is 0, and a closed loop winds up."""
         if not self._build.has_encoders or ("no_encoder" in self._options and side == 0):
             return 0.0
         return self._sign * round(self._wheels[side], 3)
 
     @property
     def _sign(self) -> int:
-        """Return -1 if the program turns the motors the wrong way, because it was told another chassis."""
+        """Return -1 if the motors turn the wrong way, because the program is set to a wrong chassis; otherwise 1."""
         inverted = (3,) if self._build.is_ros else (2, 3)
         return 1 if (self._main in inverted) is (self._build.main in inverted) else -1
 
     def _check_dead_man(self, now: float) -> None:
-        """Stop once when nothing has fed the dead-man for its time. There is no message, and no latch."""
+        """Stop once if nothing has restarted the dead-man timer in time. There is no message, and no latch.
+
+        So the next command drives the car again.
+        """
         if not self._timed_out and 0.0 <= self._dead_man_s < now - self._fed_at:
             self._timed_out, self._uncovered, self._raw = True, False, False
             self._target = [0.0, 0.0]
@@ -362,7 +380,7 @@ class UgvCar:
         self._fed_at, self._timed_out, self._uncovered = self._now, False, False
 
     def _move(self, now: float) -> None:
-        """Let the motors follow their duty, and the car its wheels."""
+        """Change the speed of the wheels towards the duty of the motors, and move the car by its wheels."""
         for side in (0, 1):
             wanted = self._sign * TOP_SPEED_M_S * self._duty[side] / 255
             self._wheels[side] += FOLLOW * (wanted - self._wheels[side])
@@ -378,7 +396,7 @@ class UgvCar:
     # ------------------------------------------------------------------ from the host
 
     def _take_lines(self, now: float) -> None:
-        """Obey the whole lines that have arrived. A partial line waits for ever, and is glued to the next."""
+        """Obey the whole lines that have arrived. A partial line stays, and the next bytes are joined to it."""
         while self._arrivals and self._arrivals[0][0] <= now:
             self._line += self._arrivals.popleft()[1]
         while (end := self._line.find(b"\n")) >= 0:
@@ -387,7 +405,7 @@ class UgvCar:
             self._on_line(text.decode("latin-1"))
 
     def _on_line(self, text: str) -> None:
-        """Obey the first object of a line. Everything that is wrong with it is silent."""
+        """Obey the first object of a line. A wrong line is ignored without a message."""
         if not text.strip() or len(text) > MAX_DOCUMENT:
             return
         try:
@@ -420,7 +438,7 @@ class UgvCar:
                 self._duty = [max(-255.0, min(255.0, each)) for each in (left, right)]
             case 13:
                 forward, turn = _number(command, "X"), _number(command, "Z")
-                if self._build.is_ros:  # the dead-man does not see it
+                if self._build.is_ros:  # this command does not restart the dead-man timer
                     self._uncovered = self._timed_out
                 else:
                     self._feed_dead_man()
@@ -461,7 +479,7 @@ class UgvCar:
                 pass
 
     def _set_target(self, left: float, right: float) -> None:
-        """Set the speeds of a closed loop, or the shares of an open one. Too great ones leave the old speed."""
+        """Set the speeds of a closed loop, or the fractions of an open one. Too high a speed leaves the old ones."""
         if self._is_closed and max(abs(left), abs(right)) > UGV_LIMIT_M_S:
             return
         self._raw = False
@@ -470,7 +488,7 @@ class UgvCar:
     # ------------------------------------------------------------------ to the host
 
     def _report(self, now: float, *, asked: bool = False) -> None:
-        """Send a feedback, unless the last one was within the gap: that holds for a question, too."""
+        """Send a feedback, unless the last one was sent less than the gap ago. The gap counts for a query, too."""
         if not (asked or self._stream) or now < self._reported_at + max(self._gap_s, LOOP_S):
             return
         self._reported_at = now
@@ -488,7 +506,7 @@ class UgvCar:
                 wheels = {"L": round(self._duty[0]), "R": round(self._duty[1])}  # the command itself
             yaw = round(degrees(self._body.pose(now).heading_rad), 2)
             fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
-        if self._module == 1:  # one object with the numbers of both: the last one of a name counts
+        if self._module == 1:  # a real car sends both numbers under one name, of which the last one counts
             places = [f"a{each}" for each in "xyz"] if self._build.is_ros else list("xyz")
             fields |= dict(zip(places, (310.2, -194.1, 228.6), strict=True)) | {"torB": -56, "torS": 12}
         elif self._module == 2:
@@ -506,5 +524,5 @@ def _is_number(command: Mapping[str, Any], name: str) -> bool:
 
 
 def _number(command: Mapping[str, Any], name: str) -> float:
-    """Return a field. One that is missing, or no number, counts as 0."""
+    """Return a field. A field that is missing, or that is not a number, counts as 0."""
     return float(command[name]) if _is_number(command, name) else 0.0

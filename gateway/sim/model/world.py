@@ -1,8 +1,8 @@
 """The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things, and the cars as bodies.
 
-`car_body` has the sensors. In a plain world (no things, cars do not meet), each car moves by itself when needed.
-In a lively world, all cars move together, tick by tick of STEP_S. REP-103: meters, x forward, y left, angles
-counter-clockwise.
+`car_body` has the sensors. In a plain world (no things, cars do not meet), each car is moved on only when its state is
+needed. In a lively world, all cars are moved together, in ticks of STEP_S. Units and axes are those of REP-103: meters,
+x forward, y left, angles counter-clockwise.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,7 +33,7 @@ STEP_S: Final = 0.04
 TAPE_M: Final = 0.025
 _BUCKET_M: Final = 0.25
 _PUSH_ROUNDS: Final = 3
-"""Maximum rounds of pushing a car out of one obstacle after the other."""
+"""Maximum number of rounds in which a car is pushed out of each obstacle in turn."""
 _TOLERANCE_M: Final = 1e-9
 _START_GRID_M: Final = 0.4
 """Distance of the start places of cars that have none in the world file."""
@@ -75,7 +75,7 @@ class World:
     ) -> None:
         self.walls = tuple(walls)
         self.line = tuple(line)
-        """A closed polyline. Empty for none."""
+        """A closed polyline. Empty if there is no line."""
         self.lamps = tuple(lamps)
         self.things = tuple(things)
         self.cars_meet = cars_meet
@@ -112,7 +112,7 @@ class World:
         return cls()
 
     def start_pose(self, index: int, name: str = "") -> Pose:
-        """Return the start pose of a car: its own place, or that of number `index` along the line.
+        """Return the start pose of a car: its own from the world file, or that of number `index` along the line.
 
         In a lively world, a car without a place of its own starts where there is room.
         """
@@ -135,7 +135,7 @@ class World:
         return sorted(spots, key=lambda pose: hypot(pose.x_m, pose.y_m))
 
     def _free(self, pose: Pose) -> bool:
-        """Return True if a car can start there: the place is empty, and in sight of a car with its own place."""
+        """Return True if a car can start there: the place is empty, and in sight of the start of a car in the file."""
         x, y, _ = pose
         cars = (*self._starts.values(), *(body.place for body in self.bodies)) if self.cars_meet else ()
         return (
@@ -170,7 +170,10 @@ class World:
         return any(distance(x, y, segment) <= TAPE_M / 2 for segment in near)
 
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
-        """Return the distance to the first wall. `steepest` is the minimum cosine to its normal that reflects."""
+        """Return the distance to the first wall, or None.
+
+        Only a wall reflects at which the cosine of the angle to its normal is at least `steepest`.
+        """
         best = self._wall(x, y, cos(angle), sin(angle))
         return None if best is None or best[1] < steepest else best[0]
 
@@ -187,7 +190,7 @@ class World:
         return best
 
     def push_out(self, x: float, y: float) -> Point:
-        """Return the nearest place at which a car does not overlap a wall."""
+        """Return the place near x, y at which a car does not overlap a wall."""
         for wall, (low_x, low_y, high_x, high_y) in self._touching:
             if not (low_x < x < high_x and low_y < y < high_y):
                 continue
@@ -207,7 +210,7 @@ class World:
             self.bodies.append(body)
 
     def settle(self, now: float) -> None:
-        """Bring all cars to the last tick up to `now`, all of them tick by tick."""
+        """Move all cars on to the last tick before `now`, tick by tick together."""
         last = floor((now - self._began) / STEP_S)
         if last <= self._tick:
             return
@@ -349,7 +352,7 @@ class World:
     # Changes at run time.
 
     def advance(self, now: float) -> None:
-        """Bring every program and every car to `now`, before a change or a query."""
+        """Run every program and move every car up to `now`, before a change or a query."""
         self.scheduler.run(now)
         self.settle(now)
         for body in self.bodies:
@@ -369,7 +372,10 @@ class World:
         self.things = tuple(each.faster(speed_m_s, at_s) if each.name == name else each for each in self.things)
 
     def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
-        """Move a thing to a place, where it stays. None keeps a coordinate. A carried thing's place is on its car."""
+        """Move a thing to a place, where it stays. None leaves a coordinate unchanged.
+
+        The place of a carried thing is in the frame of its car.
+        """
 
         def put(thing: MovingObject) -> MovingObject:
             pose = thing.pose(now - self._began)

@@ -65,7 +65,7 @@ BAD_SCHEDULES = [
     ("cut_write@1,bytes=257", "0 to 256"),
     ("firehose@1,rate=1e8", "1 to 10000000"),
     ("firehose@1,of=water", "noise or frame"),
-    ("rename@1,path=7", "where the symlink"),
+    ("rename@1,path=7", "new path of the symlink"),
     ("stuck@1+99999", "0 to 86400"),
 ]
 
@@ -91,7 +91,7 @@ BAD_FAULTS: list[tuple[object, str]] = [
     ({"fault": "garbage", "to": "both"}, "host or car"),
     ({"fault": "slow", "factor": None}, "0.001 to 1"),
     ({"fault": "lossy", "to": ["car"]}, "host, car or both"),
-    ({"fault": "rename", "path": ""}, "where the symlink"),
+    ({"fault": "rename", "path": ""}, "new path of the symlink"),
     ({"fault": "deaf", "bytes": 1}, "use car, for_s"),
 ]
 
@@ -161,7 +161,7 @@ def test_whom_it_is_for(act: Fault | Press, names: list[str]) -> None:
         (Fault(FaultKind.ECHO, "nobody"), "red, blue, green, old"),
         (Fault(FaultKind.BROWNOUT, "old"), "brownout … simulated car"),
         (Press(Button.STOP, "old"), "ir … simulated car"),
-        (Fault(FaultKind.RENAME, path="/tmp/new"), "only with the name"),
+        (Fault(FaultKind.RENAME, path="/tmp/new"), "needs the name of a car"),
         (Fault(FaultKind.RENAME, "blue", path="/tmp/new"), "whose link is pty:PATH"),
         (Fault(FaultKind.RENAME, "old", path="/tmp/new"), "whose link is pty:PATH"),
         (Fault(FaultKind.RENAME, "red", path="/tmp/green"), "car green"),

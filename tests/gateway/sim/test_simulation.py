@@ -346,7 +346,7 @@ def test_simulator_announces_cars_takes_faults_and_ends_clean(
     assert not sim.ask(fault="melt")["ok"]
     assert sim.popen.stdin is not None
     sim.popen.stdin.write("no json\n")
-    assert "no JSON" in sim.line()["error"]
+    assert "not JSON" in sim.line()["error"]
     sim.popen.stdin.write("[" * 60_000 + "\n")
     answer = sim.line()
     assert not answer["ok"]
@@ -423,7 +423,7 @@ def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[SimProc
         ({"lamp": "sun"}, "lamp 'sun' is not in this world: use beacon"),
         ({"thing": ["cart"], "x_m": 1}, "is not in this world: use cart"),
         ({"lamp": "beacon"}, "nothing to change in lamp 'beacon': give on, x_m"),
-        ({"lamp": "beacon", "on": 1}, "on 1 is not allowed: true or false"),
+        ({"lamp": "beacon", "on": 1}, "on 1 is not allowed: use true or false"),
         ({"lamp": "beacon", "color": 1}, "field 'color' is not allowed in lamp: use on, x_m"),
         ({"thing": "cart", "x_m": 1e9}, "a number from -100 to 100"),
         ({"thing": "cart", "speed_m_s": 0.1}, "speed_m_s 0.1 is not allowed: cart has no path"),
