@@ -25,6 +25,9 @@ LOOPBACK_TIMEOUT_S: Final = 1.0
 NETWORK_TIMEOUT_S: Final = 3.5
 """Timeout for the answer of a listener. A TCP stack repeats the first packet of a connection after 1 s and after 3 s,
 so two may be lost. On a network that lost 5 % each way, a timeout of 1 s was too short for 19 of 200 connections."""
+NETWORK_OPEN_TIMEOUT_S: Final = 6.0
+"""Time for one attempt to open a session. A hub that is switched off never answers, and whoever types a stop waits for
+so long. Where each way takes 100 ms and loses 5 %, 200 attempts took 0.8 to 4.0 s."""
 _LOOPBACK_HOSTS: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
@@ -112,7 +115,10 @@ def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.
         "retry": _RETRY,
     }
     link = Credentials.of(endpoint).of_client(identity) if is_secure(endpoint) else {}
-    return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_common(link)}))
+    settings: dict[str, Any] = {"mode": "client", "connect": connect, **_common(link)}
+    if not is_loopback(endpoint):
+        settings["transport"]["unicast"] = {"open_timeout": int(NETWORK_OPEN_TIMEOUT_S * 1000)}
+    return zenoh.Config.from_json5(json.dumps(settings))
 
 
 def accepts(endpoint: str) -> bool:
