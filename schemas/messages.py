@@ -1,7 +1,6 @@
 """Message classes by name, their encodings and JSON (that any Zenoh tool can read), and observations. No bus here."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -58,17 +57,6 @@ def name_in(encoding: str) -> str | None:
     """Return the message name in a Zenoh encoding. None if it is not protobuf with a schema part."""
     kind, _, name = encoding.partition(";")
     return name if kind == PROTOBUF and name else None
-
-
-def fill(message: Any, fields: Mapping[str, Any]) -> None:
-    """Set fields of a message: a tuple fills a repeated field, a mapping a map. Raises TypeError or ValueError."""
-    for name, value in fields.items():
-        if isinstance(value, tuple):
-            getattr(message, name).extend(value)
-        elif isinstance(value, Mapping):
-            getattr(message, name).update(value)
-        else:
-            setattr(message, name, value)
 
 
 def to_dict(message: Message) -> dict[str, Any]:

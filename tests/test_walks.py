@@ -17,6 +17,7 @@ ROOMS_OF_STOP: Final = 64
 """All rooms that run only because of it, also who is asked for a time or a word. Two came with issue 33."""
 ROOMS_OF_REPORT: Final = 37
 """Rooms from the bytes of a report until it is published and learned from."""
+CARRYING_ROOMS_OF_REPORT: Final = 18
 MAX_FORMS: Final = 12
 MAX_FLOORS: Final = 12
 TABLES_OF_A_SESSION: Final = ("analysis", "mode_spans")
@@ -76,3 +77,6 @@ async def test_walks_do_not_grow(tmp_path: Path, state: None) -> None:
     assert len(asked) <= ROOMS_OF_STOP, asked
     assert "gateway/bus/car_publisher.py" in of_report
     assert len(of_report) <= ROOMS_OF_REPORT, of_report
+    carrying = rooms(idle.carried_report)
+    assert {"gateway/link/tcp.py", "schemas/bus/publisher.py"} <= set(carrying)
+    assert len(carrying) <= CARRYING_ROOMS_OF_REPORT, carrying

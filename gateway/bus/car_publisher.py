@@ -90,8 +90,7 @@ class CarPublisher:
         stamp_ns = self._wall.ns(event.at)
         published: list[str] = []
         for name, fields in self._driver.measured(event).items():
-            message = _CLASSES[name]()
-            messages.fill(message, fields)
+            message = _CLASSES[name](**fields)
             if name == "sensor/battery":
                 voltage_v = message.voltage_v
                 loaded = model.motors is not Motors.OFF
@@ -310,7 +309,7 @@ def _fill_findings(message: pb.Health, model: DriverClaims) -> None:
     message.platform_contradictions.extend(findings.platform_contradictions)
     message.shows_stops, message.shows_stops_words = model.shows_stops
     message.doubted = model.doubted
-    messages.fill(message, findings.numbers)
+    message.MergeFrom(type(message)(**findings.numbers))
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:

@@ -295,7 +295,7 @@ def _faults_of_values(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
         return
     for name, value in fields.items():
         try:
-            messages.fill(kind(), {name: value})
+            kind(**{name: value})
         except (TypeError, ValueError) as error:
             yield f"{topic}: {name} is {_kind(value)}: {error}"
         else:

@@ -3,7 +3,8 @@
 A room is a module. The first walk is `fleet stop red`, from the command line through a real gateway until the car's
 readings show the stop. Two things are counted of it. The rooms that carry the command: a function takes one of its
 forms as an argument, or returns it. And all rooms that run only because of it, such as who reckons a time for it. The
-second walk is one report of a car in mode 0, from the bytes of the link until it is published and learned from.
+second walk is one report of a car in mode 0, from the bytes of the link until it is published and learned from. It is
+counted in the same two ways.
 """
 
 import asyncio
@@ -41,6 +42,13 @@ FORMS: Final = (
     "fleet.client.outcome.Outcome",
 )
 """The classes that are the command, in the order in which it takes these forms."""
+REPORT_FORMS: Final = (
+    "builtins.bytes",
+    "gateway.drivers.yahboom.protocol.sensors.Sensors",
+    "gateway.drivers.yahboom.stops.evidence.Finding",
+    *(f"fleet_v1_pb2.{name}" for name in ("Battery", "Grayscale", "Light", "Line", "Obstacle", "Range", "RxFrame")),
+)
+"""The classes that are a report of mode 0, or what is learned of it."""
 READING_ROOTS: Final = frozenset(("LinkLoop._read", "TcpLink.data_received"))
 """The functions of the gateway's loop in which the bytes of a car arrive."""
 IDLE_S: Final = 11.0
@@ -57,6 +65,7 @@ class Walk:
     called: set[Function] = field(default_factory=set)
     carried: set[Function] = field(default_factory=set)
     of_reading: set[Function] = field(default_factory=set)
+    carried_report: set[Function] = field(default_factory=set)
 
 
 class Tracer:
@@ -82,18 +91,21 @@ class Tracer:
         if walk is None or event not in ("call", "return") or not code.co_filename.startswith(PACKAGES):
             return
         function = code.co_filename.removeprefix(f"{ROOT}{os.sep}"), code.co_qualname
-        if is_form(value) if event == "return" else any(is_form(frame.f_locals.get(name)) for name in _arguments(code)):
+        values = [value] if event == "return" else [frame.f_locals.get(name) for name in _arguments(code)]
+        if any(is_form(each, FORMS) for each in values):
             walk.carried.add(function)
         if self._whole and "<module>" not in (callers := set(_callers(frame))):  # else an import
             walk.called.add(function)
             if callers & READING_ROOTS:
                 walk.of_reading.add(function)
+                if any(is_form(each, REPORT_FORMS) for each in values):
+                    walk.carried_report.add(function)
 
 
-def is_form(value: Any) -> bool:
-    """Return True for a form of the command, or a few of them."""
+def is_form(value: Any, forms: tuple[str, ...]) -> bool:
+    """Return True for one of these forms, or a few of them."""
     few = value if isinstance(value, list | tuple) and len(value) < 8 else (value,)
-    return any(f"{type(each).__module__}.{type(each).__name__}" in FORMS for each in few)
+    return any(f"{type(each).__module__}.{type(each).__name__}" in forms for each in few)
 
 
 def _arguments(code: CodeType) -> tuple[str, ...]:
@@ -154,7 +166,8 @@ def main() -> None:
     for what, found in (
         ("fleet stop red: rooms that carry the command", rooms(stop.carried)),
         ("fleet stop red: all rooms that run because of it", rooms(stop.called - idle.called)),
-        ("a report, until it is published and learned from", rooms(idle.of_reading)),
+        ("a report, until it is published and learned from: rooms that carry it", rooms(idle.carried_report)),
+        ("a report, until it is published and learned from: all rooms that run", rooms(idle.of_reading)),
     ):
         print(f"{what}: {len(found)}\n  " + "\n  ".join(found))
     print(f"forms of the command: {len(FORMS)}\n  " + "\n  ".join(FORMS))
