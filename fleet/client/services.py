@@ -38,8 +38,10 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
 def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
     """Yield the site and the fleet.v1.Recording of each recorder that says what it records. Strangers are skipped."""
     for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
-        if isinstance(answer, Sample) and (found := _recording(answer)) is not None:
-            yield keys.recorder_site(fleet, answer.key.removesuffix("/status")) or "", found
+        if isinstance(answer, Failure) or not (site := keys.recorder_site(fleet, answer.key.removesuffix("/status"))):
+            continue
+        if (found := _recording(answer)) is not None:
+            yield site, found
 
 
 def _recording(answer: Sample) -> Any:

@@ -13,6 +13,7 @@ from fleet.client.services import ask_recorder, site_recordings, why_unrecorded
 from fleet.commands.fleets import the_fleet
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
+from fleet.commands.output import echo_safely
 from fleet.commands.params import Choice, Duration
 from fleet.quota import Quota, parse_size
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
@@ -21,6 +22,7 @@ from fleet.recording.writing.recorder_service import AnotherRecorder
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.identity import Service, service
+from schemas.printable import printable_lines
 from schemas.process import signals
 from schemas.process.parent import has_ended, watched_pid
 from schemas.words import RecorderState, RecorderVerb
@@ -291,19 +293,19 @@ def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
         click.echo(json.dumps({**named, **MessageToDict(found, preserving_proto_field_name=True)}))
         return
     where = f"{site}: " if site else ""
-    click.echo(
+    echo_safely(
         f"{where}{found.state}: {found.session}, {found.messages} messages, {found.bytes / 1e6:.1f} MB in "
         f"{found.segments} file{'s' * (found.segments != 1)}, {found.free_bytes / 1e9:.1f} GB free"
     )
     for counts, words in ((found.drops, "dropped for want of room"), (found.missed, "missed on the bus")):
         if counts:
             worst = max(counts, key=lambda key: counts[key])
-            click.echo(f"{sum(counts.values())} {words}, most of {worst}: {counts[worst]}")
+            echo_safely(f"{sum(counts.values())} {words}, most of {worst}: {counts[worst]}")
     if found.recovered:
-        click.echo(f"{sum(found.recovered.values())} were missed at first and had again from their publishers")
+        echo_safely(f"{sum(found.recovered.values())} were missed at first and had again from their publishers")
     for words in (found.error, found.warning):
         if words:
-            say(words)
+            say(printable_lines(words))
 
 
 @record.command(epilog="\b\nexample:\n  fleet record start")

@@ -14,6 +14,7 @@ from fleet.recording.writing.recorder import Recorder
 from fleet.recording.writing.recorder_service import AnotherRecorder, speaks_for_fleet
 from schemas import messages
 from schemas.bus import Bus, Sample, messages_of
+from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import RecorderState, RecorderVerb
 from tests.fleet.recording.conftest import wait_for
 from tests.support import in_process
@@ -109,6 +110,27 @@ def test_status_skips_foreign_answers(endpoint: str, bus: Bus, tmp_path: Path) -
     assert (done.returncode, done.stderr) == (0, "")
     (line,) = done.stdout.splitlines()
     assert json.loads(line)["session"] == str(session)
+
+
+def test_status_of_stranger_sends_no_escapes_and_needs_name_of_site(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    odd = pb.Recording(state="recording\x1b[2J", session="/tmp/\x1b]0;x\x07", error="\x1b[1m", drops={"\x1b[1m": 1})
+    answering = ("fleet/@recorder/north/status", "fleet/@recorder/No Site/status")
+    with Bus.open(endpoint) as stranger, recording(endpoint, tmp_path):
+        for key in answering:
+
+            def answer(query: zenoh.Query, key: str = key) -> None:
+                with query:
+                    query.reply(key, odd.SerializeToString(), encoding=messages.encoding_of("fleet.v1.Recording"))
+
+            stranger._session.declare_queryable(key, answer)
+        wait_for(
+            lambda: len(list(bus.query("fleet/@recorder/*/status", timeout_s=10.0))) == len(answering), "both answer"
+        )
+        assert [site for site, _ in site_recordings(bus, "fleet")] == ["north"]
+        done = in_process.fleet("record", "status", "--connect", endpoint)
+    assert done.returncode == 0
+    assert "north: recording" in done.stdout
+    assert "\x1b" not in done.stdout
 
 
 def test_bad_site_name_is_refused(bus: Bus, tmp_path: Path) -> None:
