@@ -18,6 +18,34 @@ LOOKS: Final = 3
 """Number of looks in a row that find nothing until the gateway takes its certificate for revoked: about 12 s."""
 
 
+class LinkChecks:
+    """Decides when to look, and when silence means that the certificate was revoked. Pure."""
+
+    def __init__(self) -> None:
+        self._checked: tuple[str, ...] = ()
+        self._silent: tuple[str, ...] = ()
+        self._silences = 0
+
+    def is_due(self, hubs: tuple[str, ...]) -> bool:
+        """Return True while it is not known whether these hubs, as `Bus.hubs` names them, pass anything on."""
+        return bool(hubs) and hubs != self._checked
+
+    def take(self, before: tuple[str, ...], after: tuple[str, ...], *, found: bool | None) -> bool:
+        """Take the hubs before and after one look, and what it has found. Return True if the certificate is revoked.
+
+        found: as `passes_on` returns it.
+        """
+        if found is not False or before != after:
+            self._silences = 0
+        else:
+            self._silences = self._silences + 1 if before == self._silent else 1
+            self._silent = before
+        revoked = self._silences == LOOKS
+        if found or revoked:
+            self._checked, self._silences = before, 0
+        return revoked
+
+
 class RevocationWatch:
     """Looks for the gateway's own token after each new link to a hub with certificates."""
 
@@ -27,16 +55,12 @@ class RevocationWatch:
 
     async def run(self, on_revoked: Callable[[], object]) -> None:
         """Call `on_revoked` once for each link over which nothing is passed on. Runs until it is cancelled."""
-        checked: tuple[str, ...] = ()
-        silences = 0
+        checks = LinkChecks()
         while True:
             await asyncio.sleep(TOKEN_LOOK_INTERVAL_S)
             hubs = self._bus.hubs
-            if not hubs or hubs == checked:
+            if not checks.is_due(hubs):
                 continue
             found = await asyncio.to_thread(passes_on, self._bus, self._token, TOKEN_LOOK_S)
-            silences = silences + 1 if found is False and self._bus.hubs == hubs else 0
-            if silences == LOOKS:
+            if checks.take(hubs, self._bus.hubs, found=found):
                 on_revoked()
-            if found or silences == LOOKS:
-                checked, silences = hubs, 0
