@@ -1,5 +1,6 @@
 """Lists the cars that have a gateway on this computer, by locks in the state directory, so it needs no hub."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -29,12 +30,21 @@ class RunningMark:
 
 def running_cars(endpoint: str) -> list[str]:
     """Return the cars with a gateway of this user and bus on this computer: `red`, or `two/red` of fleet two."""
-    found = []
+    return [car if fleet == DEFAULT_FLEET else f"{fleet}/{car}" for fleet, car in _running(endpoint)]
+
+
+def running_cars_of(endpoint: str, fleet: str) -> set[str]:
+    """Return the cars of one fleet with a gateway of this user and bus on this computer."""
+    return {car for of, car in _running(endpoint) if of == fleet}
+
+
+def _running(endpoint: str) -> Iterator[tuple[str, str]]:
+    """Yield fleet and car of each mark that a gateway holds."""
     for path in sorted(directory_of(endpoint).glob(f"*{_SUFFIX}")):
         lock = FileLock(path)
         with suppress(OSError):
-            if not lock.try_take():
-                fleet, _, car = path.name.removesuffix(_SUFFIX).partition(".")
-                found.append(car if fleet == DEFAULT_FLEET else f"{fleet}/{car}")
+            is_held = not lock.try_take()
             lock.release()
-    return found
+            if is_held:
+                fleet, _, car = path.name.removesuffix(_SUFFIX).partition(".")
+                yield fleet, car

@@ -16,6 +16,7 @@ from fleet.client.supervision import ask_status
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.running_cars import running_cars_of
 from schemas.words import ProcessKind, RecorderState, RunState
 
 _CLOCK_LISTEN_S: Final = 3.0
@@ -24,8 +25,9 @@ _EVENT = topics.TOPICS["event/command"]
 
 
 def collect(client: Fleet) -> dict[str, CarEvidence]:
-    """Return the evidence of every car that is on the bus or that a supervisor starts a gateway for, by name."""
+    """Return the evidence, by name, of every car that is on the bus, supervised, or served on this computer."""
     present = client.cars()
+    here = running_cars_of(client.bus.endpoint, client.name)
     supervisions = ask_status(client.bus, client.name)
     processes = {
         each.name: each
@@ -58,9 +60,10 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
             recording=recording,
             assignment=assignment,
             coordinated=coordinated,
+            runs_here=car in here,
             asked=True,
         )
-        for car in sorted({*present, *processes})
+        for car in sorted({*present, *processes, *here})
     }
 
 

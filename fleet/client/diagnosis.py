@@ -75,6 +75,8 @@ class CarEvidence:
     """True if a coordinator is on the bus."""
     clock_off_s: float | None = None
     """How far the clock of its gateway's computer is ahead of ours, negative if behind, or None if not known."""
+    runs_here: bool = False
+    """True if a gateway of the car runs on this computer, on the bus or not."""
     asked: bool = False
     """True if the states are answers. Then a gateway answers, also one that says old things, such as a replay."""
 
@@ -119,15 +121,24 @@ class DoctorCheck:
     of_fleet: bool = False
 
 
+def _unheard(e: CarEvidence) -> str:
+    if e.state.present or not e.runs_here:
+        return ""
+    return (
+        "Its gateway runs on this computer, and the bus does not hear it. The hub may be restarting, or it refuses the "
+        "gateway's certificate: then the gateway stops the car after some 12 s. Its log says which."
+    )
+
+
 def _ended(e: CarEvidence) -> str:
-    if e.state.present or e.process is None:
+    if e.state.present or e.process is None or e.runs_here:
         return ""
     why = f" ({e.process.words})" if e.process.words else ""
     return f"Its gateway is {e.process.state}{why}. Nothing stops the car, and whether it moves is not known."
 
 
 def _absent(e: CarEvidence) -> str:
-    if e.state.present or e.process is not None:
+    if e.state.present or e.process is not None or e.runs_here:
         return ""
     return "No gateway serves the car. Nothing stops it, and whether it moves is not known."
 
@@ -319,6 +330,7 @@ def _stopped_plan(e: CarEvidence) -> str:
 
 
 CHECKS: Final = (
+    DoctorCheck("gateway_unheard", _unheard, "fleet logs {car}"),
     DoctorCheck("gateway_ended", _ended, "fleet logs {car}"),
     DoctorCheck("no_gateway", _absent, "fleet up"),
     DoctorCheck("gateway_hung", _hung, "fleet logs {car}"),

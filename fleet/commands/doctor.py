@@ -9,6 +9,7 @@ import click
 
 from fleet.client.car_evidence import collect
 from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe, diagnose
+from fleet.client.refused_by_hub import why_refused
 from fleet.commands.fleets import open_client
 from fleet.commands.group import hint_options, say
 from fleet.commands.options import bus_options, json_option
@@ -55,6 +56,8 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
     named = (name,) if name is not None else ()
     with open_client(connect, fleet, named) as client:
         found = collect(client)
+        if not any(each.state.present for each in found.values()) and (refused := why_refused(client)):
+            raise click.ClickException(refused)
         if not found:
             raise no_cars(client)
         if name is not None and name not in found:

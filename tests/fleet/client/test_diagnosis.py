@@ -42,6 +42,7 @@ def process(**fields: Any) -> pb.Supervised:
 
 STALE = pb.Link(state="stale", last_rx_s=12, url="tcp://x:1")
 ODD: dict[str, CarEvidence] = {
+    "gateway_unheard": evidence(present=False, states={}, process=process(), runs_here=True),
     "gateway_ended": evidence(present=False, states={}, process=process(state="waiting", words="exit code 1")),
     "no_gateway": evidence(present=False, states={}),
     "gateway_hung": evidence(states={}),
