@@ -251,11 +251,11 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         host, code = _host_and_code(words)
         parsed = JoinCode.parse(code)
         at, at_port = _address(site, 0) if site else ("", 0)
-        local_hub.check_storage()
+        name, port = _address(host, JOIN_PORT) if host else ("", 0)
+        local_hub.check_storage(at or name, at_port)
         addresses = own_addresses()
         own = (*addresses, *own_names())
-        if host:
-            name, port = _address(host, JOIN_PORT)
+        if name:
             joined = join(name, parsed, port, addresses=own)
         else:
             name, joined = join_one_of(hubs_found(addresses or [LOOPBACK]), parsed, own)
@@ -270,8 +270,12 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         said = _describe_cars_on(endpoint, SITE_RULES_S if site else HUB_RESTART_S)
     click.echo(f"You are {joined.identity} at {endpoint} now. {said}")
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
-        DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
-        click.echo(f"{DEFAULT_FLEET_FILE} is a copy of the hub's.")
+        try:
+            DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
+        except OSError as error:  # this computer has joined all the same
+            click.echo(f"{DEFAULT_FLEET_FILE} of the hub is not copied here: {error.strerror}", err=True)
+        else:
+            click.echo(f"{DEFAULT_FLEET_FILE} is a copy of the hub's.")
 
 
 @click.command(epilog="\b\nexample:\n  fleet leave")

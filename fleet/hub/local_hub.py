@@ -18,7 +18,7 @@ from schemas.bus import LOOPBACK, Credentials, is_secure
 from schemas.bus.credentials import CA_FILE, HUB, ME_FILE
 from schemas.identity import IdentityRole, Service, role_of
 from schemas.keys import is_name
-from schemas.state_dir import JOINED_FILE, default_directory, joined_endpoint
+from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, directory_of, joined_endpoint
 
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Where the programs of the hub's own computer find it."""
@@ -74,14 +74,31 @@ def use(endpoint: str) -> None:
     write_atomically(directory / JOINED_FILE, f"{endpoint}\n".encode())
 
 
-def check_storage() -> None:
-    """Raise OSError if this computer cannot store what it gets when it joins: then no code is spent for nothing."""
-    directory = default_directory()
-    directory.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=directory) as probe:
-        probe.write(bytes(JOINED_BYTES))
-        probe.flush()
-        os.fsync(probe.fileno())
+def check_storage(host: str, port: int = 0) -> None:
+    """Raise NotJoined if this computer cannot store what it gets when it joins. So no code is used up for nothing.
+
+    host: of the hub that this computer will use, empty if it must be found first. port: of that hub, if it is known.
+    """
+    default = int(SECURE_ENDPOINT.rpartition(":")[2])
+    directory = Credentials.of(f"tls/{host}:{port or default}").directory
+    of_all_hubs = directory_of(f"tls/{host}:{port or default}").parent
+    for place in (default_directory(), directory if host else of_all_hubs):
+        _check_writable(place)
+
+
+def _check_writable(place: Path) -> None:
+    """Write a file to a directory, or where it would be made, and remove it again. Raises NotJoined."""
+    try:
+        place = next(each for each in (place, *place.parents) if each.exists() or each.is_symlink())
+        with tempfile.TemporaryFile(dir=place) as probe:
+            probe.write(bytes(JOINED_BYTES))
+            probe.flush()
+            os.fsync(probe.fileno())
+    except OSError as error:
+        raise NotJoined(
+            f"{place}: {error.strerror}. A certificate must be stored there. The code was not sent, and is still good: "
+            f"make this a directory that you may write, with free space, or set {STATE_VARIABLE} to another one."
+        ) from None
 
 
 def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:

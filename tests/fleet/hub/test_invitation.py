@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import resource
 import socket
 import ssl
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from fleet.hub.invitation import Invitation, NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
 from schemas.bus import Credentials
 from schemas.identity import car, person, site
+from schemas.state_dir import STATE_VARIABLE, directory_of
 from tests.support import in_process
 from tests.support.ports import free_port
 
@@ -52,16 +54,38 @@ def post(invitation: Invitation, body: bytes, **headers: str) -> tuple[int, dict
     return found
 
 
-def test_join_spends_no_code_if_nothing_can_be_stored(
+@pytest.mark.parametrize("where", ["", "buses", "hub"])
+def test_join_spends_no_code_if_file_is_in_the_way(
+    where: str, invitation: Invitation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    state = tmp_path / "state"
+    monkeypatch.setenv(STATE_VARIABLE, str(state))
+    hub = directory_of("tls/127.0.0.1:7447")
+    place = {"": state, "buses": hub.parent, "hub": hub}[where]
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.touch()
+    done = in_process.fleet("join", f"127.0.0.1:{invitation.port}", invitation.code, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{place}: " in done.stderr
+    assert STATE_VARIABLE in done.stderr
+    assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
+
+
+def test_join_spends_no_code_if_disk_is_full(
     invitation: Invitation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "file" / "state"))
-    where = f"127.0.0.1:{invitation.port}"
-    done = in_process.fleet("join", where, invitation.code)
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setenv(STATE_VARIABLE, str(state))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        done = in_process.fleet("join", f"127.0.0.1:{invitation.port}", invitation.code, cwd=tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (done.returncode, done.stdout) == (1, "")
-    assert str(tmp_path / "file") in done.stderr
-    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "state"))
+    assert f"{state}: " in done.stderr
+    assert [*state.iterdir()] == []
     assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
 
 
