@@ -330,12 +330,19 @@ def _describe_cars_on(endpoint: str, within_s: float) -> str:
 
 
 def _stop_first(endpoint: str, car: str) -> None:
-    """Stop a car whose gateway is about to lose its certificate: nobody reaches it over the bus after that."""
+    """Stop a car whose gateway is about to lose its certificate: nobody reaches it over the bus after that.
+
+    The hub may be restarting just now, because its own certificate or its rules have changed. So wait for the car.
+    """
+    deadline = time.monotonic() + HUB_RESTART_S
     try:
         with Fleet(endpoint, kind=Rank.PERSON) as client:
-            if car not in client.cars():
-                return
-            outcome = client.car(car).stop()
+            while car not in client.cars():
+                if time.monotonic() > deadline:
+                    return
+                time.sleep(0.1)
+            while not (outcome := client.car(car).stop()).ok and time.monotonic() < deadline:
+                time.sleep(0.1)
     except BusError as error:
         click.echo(f"{car} was not stopped before: {error}", err=True)
         return

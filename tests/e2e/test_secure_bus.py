@@ -40,9 +40,9 @@ class SecureStage:
 
     def __init__(self, fleet: FleetProcesses, store: HubStore) -> None:
         self.fleet, self.store = fleet, store
-        self.sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+        self.sim, (self.red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
         self.gateways: dict[str, GatewayProcess] = {
-            "red": fleet.gateway(red, *PEOPLE, "mia"),
+            "red": fleet.gateway(self.red, *PEOPLE, "mia"),
             "blue": fleet.gateway(blue, *PEOPLE, "mia:other", car="blue"),
         }
         for name in self.gateways:
@@ -292,8 +292,11 @@ def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
             pass
 
 
-def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(stage: SecureStage) -> None:
+def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(
+    stage: SecureStage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It keeps its key and its certificate, as on a computer that nobody reaches in this moment."""
+    monkeypatch.setenv("FLEET_ENDPOINT", stage.store.credentials.endpoint)
     stage.free()
     with stage.client(ANN) as ann:
         for name in ("red", "blue"):
@@ -307,6 +310,8 @@ def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(stage: 
     assert "[revoked]" in stage.gateways["blue"].stderr
     assert driving(stage.sim, "red")
     assert "[revoked]" not in stage.gateways["red"].stderr
+    told = [json.loads(line) for line in in_process.fleet("doctor", "--json").stdout.splitlines()]
+    assert {each["car"]: each["findings"][0]["code"] for each in told if each["findings"]}["blue"] == "gateway_unheard"
 
 
 def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) -> None:
@@ -335,7 +340,7 @@ def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) ->
 
 
 def test_revoke_of_car_stops_it_first(stage: SecureStage, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Last in this file: red is gone after it."""
+    """Nearly last in this file: red is gone after it."""
     monkeypatch.setenv("FLEET_ENDPOINT", stage.store.credentials.endpoint)
     stage.free("red")
     with stage.client(ANN) as ann:
@@ -346,3 +351,22 @@ def test_revoke_of_car_stops_it_first(stage: SecureStage, monkeypatch: pytest.Mo
     assert not driving(stage.sim, "red")
     assert "NOT STOPPED" not in done.stderr
     assert "red is stopped first" in done.stderr
+
+
+def test_invitation_of_car_elsewhere_stops_it_first(stage: SecureStage) -> None:
+    """Last in this file. The test before it has revoked red, so red begins again on the hub's computer."""
+    stage.gateways["red"].end()
+    HubStore.load(stage.store.credentials).ensure([RED], ANN, addresses=["127.0.0.1"])
+    stage.gateways["red"] = stage.fleet.gateway(stage.red, *PEOPLE, "mia")
+    stage.fleet.ready("red")
+    stage.free("red")
+    with stage.client(ANN) as ann:
+        assert stage.command(ann, ANN, "red", Verb.MODE, mode="tracking")
+        wait_for(lambda: driving(stage.sim, "red"), "red drives")
+    where = ("--as-hub", "127.0.0.1", "--port", str(free_port()))
+    invitation = stage.fleet.start("-m", "fleet.cli", "hub", "invite", "--car", "red", "--json", *where)
+    assert invitation.line()["identity"] == RED
+    assert not driving(stage.sim, "red")
+    assert "NOT STOPPED" not in invitation.stderr
+    assert "[revoked]" not in stage.gateways["red"].stderr, "it is stopped before"
+    assert not (stage.store.directory / f"{RED}.key").exists()
