@@ -54,7 +54,7 @@ def test_one_fits(url: UsbUrl, device: str) -> None:
             THERE,
             (
                 "serial://?vid=2341&pid=0043: 2 devices fit, /dev/ttyACM0 (2341:0043 serial number 7573), /dev/ttyACM1 "
-                "(2341:0043 serial number 9912): add a serial= that only one has, or give its device path"
+                "(2341:0043 serial number 9912): add the serial= of one of them"
             ),
         ),
         (

@@ -89,7 +89,7 @@ def test_json_has_every_event_and_the_whole(command: Command, kept: Path) -> Non
 def test_monitor_reports_platform_contradiction_once(command: Command, kept: Path) -> None:
     done = command("monitor", "--from", kept, "--platform", "raspberry_pi")
     assert "platform" in done.stdout.splitlines()[1]
-    assert "2 times " in done.stderr
+    assert "platform 2 times: " in done.stderr
     assert "CSB; a raspberry_pi car " in done.stderr
 
 

@@ -147,7 +147,7 @@ def test_for_a_person(simulate: Callable[..., Any], command: Command, stranger: 
     first, what, second, nothing = done.stdout.splitlines()
     assert (first, second) == (link, silent.link)
     assert what.startswith("  a car: ")
-    assert "shape: manual; platform: arduino (or stm32" in what
+    assert "frames: manual; platform: arduino (or stm32" in what
     assert nothing.startswith("  silent: ")
 
 

@@ -82,7 +82,7 @@ def test_send_tells_how_to_stop_even_without_stdout(where: str, why: str, simula
         ("$0,0,1,0,,0,0,0,0#", "place 5 (servo) is '', allowed are 0..8"),
         ("$0,0,0,0,1,0,0,0,1#", "(place 5) … (place 9)"),
         ("$4WD,PTZ181#", "the table"),
-        ("$4WD,MODE01#", "mode 0 is not opened; '$4WD,MODE00#' closes"),
+        ("$4WD,MODE01#", "mode 0 cannot be opened; '$4WD,MODE00#' closes"),
     ],
 )
 def test_why_a_text_is_no_frame(text: str, words: str) -> None:
