@@ -95,7 +95,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     "state_unreadable": EventCode(Level.WARNING, "The file of holds and e-stops is damaged, so the car is on hold."),
     "no_hub": EventCode(Level.ERROR, "The gateway cannot reach the bus."),
     "revoked": EventCode(
-        Level.ERROR, "The hub passes nothing on for this gateway, whose certificate was revoked. It stops its car."
+        Level.ERROR, "The hub passes on no messages of this gateway, whose certificate was revoked. The car is stopped."
     ),
     "parent_gone": EventCode(
         Level.WARNING, "The process that started this gateway has ended, so the gateway ends too."

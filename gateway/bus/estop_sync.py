@@ -29,10 +29,10 @@ BATCH_RESET_S: Final = 1.0
 FIRST_RETRY_S: Final = 0.5
 """Delay before the first retry of gateways that did not answer. It doubles with each retry."""
 MAX_RETRY_S: Final = 10.0
-"""Maximum retry interval. Retries never end: the gateway may be starting, and know of an e-stop that no other knows."""
+"""Maximum retry interval. Retries never end, because a starting gateway may know an e-stop that no other one knows."""
 SYNC_QUERY_TIMEOUT_S: Final = 2.5
-"""Time for the answers to one query. Two sites that are linked again ask each other at once, over a link that is full:
-with 1 s, and 5 % of its packets lost, an e-stop of one site took 2 to 17 s to the other one."""
+"""Time for the answers to one query. When two sites are linked again, they ask each other at once, and the link is
+full: with 1 s here and 5 % of the packets lost, an e-stop of one site needed 2 to 17 s to reach the other one."""
 MAX_SINGLE_QUERIES: Final = 8
 """Number of gateways that may always be queried one by one, whatever their share of the fleet is."""
 MAX_SINGLE_SHARE: Final = 0.5
@@ -147,13 +147,13 @@ class EstopSync:
         try:
             state: Any = answer.message()
         except (messages.BadPayload, KeyError) as error:
-            log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
+            log.warning("%s: the answer is not the state of a gateway of this fleet: %s", answer.key, error)
             return
         merge(_shared(state), state.car)
         self._due.discard(state.car)
 
     async def _answers(self, names: Sequence[str]) -> AsyncIterator[bus.Sample]:
-        """Yield each state as it comes: one is enough to know of an e-stop, and the last one may be late."""
+        """Yield each state as it arrives, because one is enough to learn of an e-stop, and the last one may be late."""
         loop, answers = asyncio.get_running_loop(), asyncio.Queue[bus.Sample | None]()
         query = asyncio.to_thread(self._query, names, lambda each: loop.call_soon_threadsafe(answers.put_nowait, each))
         asked = asyncio.ensure_future(query)
@@ -173,7 +173,7 @@ class EstopSync:
                     is_silent = False
                     on_state(answer)
             silent += is_silent
-            if silent == MAX_SINGLE_QUERIES:  # each costs a timeout: so many would delay those that do answer
+            if silent == MAX_SINGLE_QUERIES:  # each costs a timeout, and delays the others
                 self._query(("*",), on_state)
                 return
 

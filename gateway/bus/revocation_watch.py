@@ -1,7 +1,7 @@
-"""Notices that the hub passes nothing on for this gateway: then nobody can command its car, or stop it.
+"""Notices that the hub no longer passes on messages of this gateway, so that nobody can command or stop its car.
 
-Rules change with a restart of the hub. So it is enough to look after each new link to a hub. A hub that has just
-started passes things on late, and a network may lose them, so one look proves nothing.
+The rules of a hub change only with a restart of the hub, so it is enough to look after each new link to a hub. A hub
+that has just started passes messages on late, and a network may lose them. So one look without a result proves nothing.
 """
 
 import asyncio
@@ -13,9 +13,9 @@ from schemas.bus.passing_on import passes_on
 
 TOKEN_LOOK_INTERVAL_S: Final = 1.0
 TOKEN_LOOK_S: Final = 3.0
-"""Time for which one look waits for the token. Where each way takes 100 ms and loses 5 %, it takes up to 1.5 s."""
+"""Time for which one look waits for the token. With 100 ms and 5 % loss each way, the token arrives within 1.5 s."""
 LOOKS: Final = 3
-"""Number of looks in a row that find nothing until the gateway takes its certificate for revoked: about 12 s."""
+"""Number of looks in a row without the token after which the certificate counts as revoked. They take about 12 s."""
 
 
 class LinkChecks:

@@ -267,7 +267,7 @@ class Controller(Generic[D_co]):
             self._halt(words, now)
 
     def cut_off(self, words: str, now: float) -> None:
-        """Stop the car, since nobody can command it any more."""
+        """Stop the car, because nobody can command it any more. `words` is the reason."""
         self._halt(words, now)
 
     # ------------------------------------------------------------------ each command

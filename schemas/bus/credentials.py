@@ -26,8 +26,8 @@ ME_FILE: Final = "me"
 HUB: Final = "hub"
 """Name of the hub's certificate."""
 HUB_FILE: Final = "hub.json"
-"""File with the addresses that the hub listens on, and its rules. The hub of another site also has the address of the
-first one and the name of its site, and the first one also has the rules of the others."""
+"""File with the addresses on which the hub listens, and its rules. At another site, it also has the address of the
+first hub and the name of the site; at the first hub, it also has the rules for the hubs of the other sites."""
 LISTEN: Final = "listen"
 ACCESS_CONTROL: Final = "access_control"
 CONNECT: Final = "connect"
@@ -165,7 +165,10 @@ class Credentials:
             return ""
 
     def store_site(self, site: str, listens: list[str], first_hubs: list[str], rules: Mapping[str, Any]) -> None:
-        """Write the file of the hub of a site: where it listens and links to, and its rules. Raises OSError."""
+        """Write the hub's file at another site: its name, where the hub listens, where it links to, and its rules.
+
+        Raises OSError.
+        """
         made = {SITE: site, LISTEN: listens, CONNECT: first_hubs, ACCESS_CONTROL: dict(rules)}
         write_atomically(self.directory / HUB_FILE, json.dumps(made, indent=1).encode(), sync=True, private=True)
 

@@ -26,8 +26,8 @@ NETWORK_TIMEOUT_S: Final = 3.5
 """Timeout for the answer of a listener. A TCP stack repeats the first packet of a connection after 1 s and after 3 s,
 so two may be lost. On a network that lost 5 % each way, a timeout of 1 s was too short for 19 of 200 connections."""
 NETWORK_OPEN_TIMEOUT_S: Final = 6.0
-"""Time for one attempt to open a session. A hub that is switched off never answers, and whoever types a stop waits for
-so long. Where each way takes 100 ms and loses 5 %, 200 attempts took 0.8 to 4.0 s."""
+"""Time for one attempt to open a session over a network. A hub that is switched off never answers, so a person who
+types a stop waits for this time. With 100 ms and 5 % loss each way, 200 attempts needed 0.8 to 4.0 s."""
 _LOOPBACK_HOSTS: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 

@@ -65,7 +65,7 @@ def _has_clients(session: zenoh.Session) -> bool:
 
 
 def _answer_sites(links: HubLinks, session: zenoh.Session) -> None:
-    """Answer the hubs of other sites with the rules, and take what they tell. Ends with the session."""
+    """Answer the hubs of other sites with their rules, and store the links that they send, until the session ends."""
     if not (rules := links.credentials.hub_settings()[OF_SITES]):
         return
     payload = json.dumps(rules)
@@ -80,9 +80,9 @@ def _answer_sites(links: HubLinks, session: zenoh.Session) -> None:
 
 
 def _take_rules(links: HubLinks, session: zenoh.Session) -> None:
-    """Ask the first hub for its rules, if this is that of another site, and store them. Cut off, it keeps the last.
+    """Ask the first hub for the rules, if this hub is at another site, and store them. Without an answer, do nothing.
 
-    The question tells the first hub who is connected here.
+    The query also tells the first hub which programs are connected here.
     """
     credentials = links.credentials
     if not credentials.first_hubs:
@@ -93,7 +93,7 @@ def _take_rules(links: HubLinks, session: zenoh.Session) -> None:
         with contextlib.suppress(ValueError):
             rules = json.loads(reply.ok.payload.to_bytes())
             if isinstance(rules, dict) and rules and rules != credentials.access_control:
-                with contextlib.suppress(OSError):  # asked again
+                with contextlib.suppress(OSError):  # the next poll tries again
                     credentials.store_site(credentials.site, credentials.listens, credentials.first_hubs, rules)
 
 

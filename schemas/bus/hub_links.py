@@ -1,6 +1,7 @@
-"""Who is connected to a hub, and to the hubs of other sites that are linked to it. `fleet hub show` reads the file.
+"""Writes a file with the programs that are connected to a hub, and to the linked hubs of other sites.
 
-It only informs: no rule depends on it. What the hub of a site says about its links is checked like anybody's words.
+`fleet hub show` reads the file. It is only for information: no rule depends on it. The bytes in which the hub of a site
+lists its links are checked like any other bytes from outside.
 """
 
 import contextlib
@@ -16,9 +17,9 @@ from schemas.identity import IdentityRole
 from schemas.keys import is_name
 
 LINKS_FILE: Final = "links.json"
-"""File with the addresses from which each common name is connected. One at another site is followed by its name."""
+"""File with the addresses from which each common name is connected. The name of another site follows its addresses."""
 SITE_LINKS_S: Final = 10.0
-"""Time for which the links of a site count. Its hub tells them every two seconds."""
+"""Time for which the links of a site count. Its hub sends them every two seconds."""
 MAX_SITE_LINKS_BYTES: Final = 65_536
 MAX_SITES: Final = 64
 _MAX_TEXT: Final = 100
@@ -29,7 +30,7 @@ Links = dict[str, list[str]]
 
 
 class HubLinks:
-    """The links of one hub with certificates, and what the hubs of other sites have told it about theirs."""
+    """The links of one hub with certificates, and the links that the hubs of other sites have sent to it."""
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
@@ -39,14 +40,14 @@ class HubLinks:
         self._written: Links | None = None
 
     def of_this_site(self) -> bytes:
-        """Return what the hub of a site tells the first one. Empty if it has no name, or too many links."""
+        """Return the links that the hub of a site sends to the first hub. Empty without a name, or with too many links."""
         site = self.credentials.site
         links = {name: each for name, each in self._own.items() if name != HUB and not name.startswith(_SITE_HUB)}
         told = json.dumps({"site": site, "links": links}).encode() if site else b""
         return told if len(told) <= MAX_SITE_LINKS_BYTES else b""
 
     def take(self, told: bytes, now: float) -> None:
-        """Take what the hub of a site has told. Other bytes are ignored. Runs on a Zenoh thread."""
+        """Store the links that the hub of a site has sent. Ignore other bytes. Runs on a Zenoh thread."""
         found = parse_site_links(told)
         if found is None:
             return
@@ -59,7 +60,10 @@ class HubLinks:
         self._of_sites = {site: each for site, each in self._of_sites.items() if now < each[1] + SITE_LINKS_S}
 
     def write(self, own: Links, now: float) -> None:
-        """Write who is connected here and at other sites, if it has changed. A site counts while its hub is linked."""
+        """Write the links of this hub and of the other sites to the file, if they have changed.
+
+        The links of a site count only while its hub is linked to this one.
+        """
         self._own = {name: sorted(addresses) for name, addresses in sorted(own.items())}
         linked = {name.split(".")[1] for name in own if name.startswith(_SITE_HUB)}
         links = {name: list(addresses) for name, addresses in self._own.items()}
@@ -70,12 +74,12 @@ class HubLinks:
                     links.setdefault(name, []).extend(f"{each} ({site})" for each in addresses)
         if links != self._written:
             self._written = links
-            with contextlib.suppress(OSError):  # it only informs
+            with contextlib.suppress(OSError):  # the file is only for information
                 write_atomically(self.credentials.directory / LINKS_FILE, json.dumps(links).encode(), private=True)
 
 
 def links_of(session: zenoh.Session) -> Links:
-    """Return who is linked to a router with certificates."""
+    """Return the links of a router with certificates."""
     found: Links = {}
     for link in session.info.links():
         if link.auth_identifier:

@@ -1,8 +1,9 @@
-"""Asks whether a hub with certificates passes on what a session says.
+"""Finds out whether a hub with certificates passes on the messages of a session.
 
-The rules of a hub are silent. Whoever was revoked is still linked, and hears and reaches nothing. So we look for
-something that only we can have said: the token of our own session, asked for over a second one. That is not a command,
-and every identity that a rule knows may have and see a token.
+A hub applies its rules without any message. So a program whose certificate was revoked is still linked, but no message
+of it arrives anywhere, and it receives none. This module therefore looks for something that only this session can have
+published: its own token. It asks for the token over a second session. That is not a command, and every identity that a
+rule knows may declare and see tokens.
 """
 
 import time
@@ -18,9 +19,10 @@ _TOKEN_POLL_S: Final = 0.1
 
 
 def passes_on(bus: Bus, token: str, within_s: float) -> bool | None:
-    """Return True if the hub passes on this token of the session, and False if it passes it on to nobody.
+    """Return True if the hub passes on this token of the session, and False if it does not.
 
-    Return None if that is not known: a session has no link now. Blocks for `within_s`, s, and the opening of a session.
+    Return None if this is unknown, because one of the two sessions has no link now. Blocks for the opening of a session
+    and for about `within_s`.
     """
     try:
         until = time.monotonic() + within_s
@@ -33,7 +35,7 @@ def passes_on(bus: Bus, token: str, within_s: float) -> bool | None:
                 if time.monotonic() >= until:
                     return False
                 time.sleep(_TOKEN_POLL_S)
-    except NoCredentials:  # it was revoked on this computer
+    except NoCredentials:  # the certificate is no longer valid on this computer
         return False
     except (BusError, zenoh.ZError):
         return None
