@@ -40,7 +40,7 @@ class HubLinks:
         self._written: Links | None = None
 
     def of_this_site(self) -> bytes:
-        """Return the links that the hub of a site sends to the first hub. Empty without a name, or with too many links."""
+        """Return the links that the hub of a site sends to the first hub. Empty if it has no name or too many links."""
         site = self.credentials.site
         links = {name: each for name, each in self._own.items() if name != HUB and not name.startswith(_SITE_HUB)}
         told = json.dumps({"site": site, "links": links}).encode() if site else b""
