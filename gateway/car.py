@@ -250,9 +250,9 @@ class CarGateway:
         """Stop the car, because nobody can command it any more, and it may be moving in a mode."""
         car, who = self._settings.car, self._bus.identity
         words = (
-            f"the hub passes on no messages of {who}: its certificate was revoked, or {car} was invited elsewhere. "
-            f"Nobody can command {car} through this gateway, so it is stopped. `fleet hub invite --car {car}` on the "
-            "hub's computer and `fleet join` here make another certificate; then start this gateway again."
+            f"the hub passes nothing on for {who}: its certificate was revoked, or {car} was invited elsewhere. Nobody "
+            f"can command {car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's computer and "
+            "`fleet join` here make another certificate; then start this gateway again."
         )
         self._commands.log(Level.ERROR, "revoked", words)
         self._control.cut_off(words, self._loop.time())
