@@ -445,5 +445,5 @@ def test_a_link_that_is_another_cars_is_not_written() -> None:
 
 def test_ambiguous_yaml_text_is_quoted() -> None:
     text = "cars:\n  red: &both\n    platform: stm32\n  blue: *both\n"
-    with pytest.raises(CannotEdit, match=r'write cars\.red\.link: "sim"'):
+    with pytest.raises(CannotEdit, match=r'cars\.red\.link to "sim"'):
         set_link(text, Path("f.yaml"), "red", "sim")
