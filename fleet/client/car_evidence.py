@@ -1,4 +1,4 @@
-"""Collects from the bus what `diagnosis` judges: states, recent commands, processes, recorder and plan."""
+"""Collects the evidence for `diagnosis` from the bus: states, recent commands, processes, recorder and plan."""
 
 import threading
 import time
@@ -51,7 +51,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {
         car: CarEvidence(
-            # Its times are of its clock.
+            # Its times are by its gateway's clock.
             CarState.of_answers(car, answers.get(car, []), now + clocks.get(car, 0.0), present=car in present),
             now + clocks.get(car, 0.0),
             clock_off_s=clocks.get(car),
@@ -78,10 +78,10 @@ def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
 
 
 def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
-    """Return how far the clocks of gateways are off, by car, of those that are.
+    """Return by car how far its gateway's clock is off. Cars whose clock is right are left out.
 
-    newest_s: the newest time of the states that each car has answered. It listens, at most for _CLOCK_LISTEN_S, only to
-    cars whose time is odd.
+    newest_s: by car, the newest stamp in its answers. For cars with an odd stamp only, listen to the states that they
+    publish, for at most _CLOCK_LISTEN_S.
     """
     now_s = time.time()
     odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}
@@ -119,7 +119,7 @@ def _commands(client: Fleet) -> dict[str, list[tuple[float, Any]]]:
         with suppress(messages.BadPayload):
             event: Any = messages.parse(_EVENT.message, bytes(sample.payload), str(sample.encoding))
             age_s = age_of_answer_s(messages.stamp_ns(event.stamp) / 1e9, now)
-            if age_s < inf:  # else nothing tells its age
+            if age_s < inf:  # otherwise its age is not known
                 found.setdefault(event.car, []).append((age_s, event))
     for events in found.values():
         events.sort(key=lambda each: -each[0])

@@ -1,21 +1,21 @@
-"""A car as the bus shows it: the newest message of each topic, how old it is, and what follows from it.
+"""A car as the bus shows it: the newest message of each topic, the age of each message, and conclusions from them.
 
 Pure: time is an argument (s, of any one clock). Lists, status, doctor, console and the plan all look at a car through
-one `CarState`, so that they agree. `claims` has the words.
+one `CarState`, so that they agree. `claims` puts it into words.
 
-**How old is a message?** Two clocks could tell: ours, when it came, or the gateway's, when it stamped it. The clocks of
-two computers differ by seconds, and then a stamp would make a car stale that speaks once a second. So a message that
-was published just now counts from when it came. The answer to a query is another matter. It may have waited in a
-gateway that hangs, or come from a replay, and only its stamp tells (`age_of_answer_s`). A stamp far ahead of our clock
-is from before a clock was set back, and tells nothing: such a message counts as stale.
+**How old is a message?** Two clocks could measure this: our clock when the message came, or the gateway's clock when it
+stamped the message. The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second
+could then look stale. So the age of a message that was published just now counts from when it came. An answer to a
+query is different. It may have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age
+(`age_of_answer_s`). A stamp far ahead of our clock is from before a clock was set back. Such a message counts as stale.
 
-**Whose word is it?** A gateway that has ended vouches for nothing. Its states are kept as its last words, since a
-person wants to know them, and `of` no longer returns them. As soon as another gateway speaks they are forgotten. A
-state that comes late from the earlier gateway does not bring them back (`GatewayStarts`).
+**Does its gateway still run?** The states of a gateway that has ended no longer count. They are kept as its last words,
+since a person wants to know them, but `of` does not return them. They are forgotten as soon as another gateway of the
+car publishes a state. A late state of the earlier gateway does not bring them back (`GatewayStarts`).
 
-**Is it ready, silent, unheard?** Each is one property here. What a car has not shown delays no command, so a car is
-ready without having shown anything; but a car of which nobody has heard yet, or whose gateway says nothing any more, is
-not.
+**Is the car ready, silent, unheard?** Each is a property or a method here. A command does not wait until a car has
+shown that it stops, so a car can be ready before that. But a car that nobody has heard yet, or whose gateway publishes
+nothing any more, is not ready.
 """
 
 from collections.abc import Iterable
@@ -57,7 +57,7 @@ class GatewayStarts:
         self._ended: dict[str, None] = {}
 
     def take(self, boot_id: str, stamp_ns: int = 0) -> bool:
-        """Return True if a message of this start counts. A new start ends the one before."""
+        """Return True if a message of this start counts. A new start ends the earlier one."""
         if boot_id in self._ended and stamp_ns <= self._newest_ns + LATE_MESSAGE_NS:
             return False
         if boot_id and boot_id != self.current:
@@ -68,7 +68,7 @@ class GatewayStarts:
         return True
 
     def end(self) -> None:
-        """Note that the running gateway has ended: its messages count no more."""
+        """Note that the running gateway has ended: its messages no longer count."""
         if self.current:
             self._ended[self.current] = None
             while len(self._ended) > _MAX_KNOWN_ENDED:
@@ -87,10 +87,10 @@ class CarState:
 
     car: str
     present: bool = True
-    """True if its gateway is there, as far as the caller knows."""
+    """True if its gateway is on the bus, as far as the caller knows."""
     newest_by_topic: dict[str, Observation] = field(default_factory=dict)
     _boot_id: str = ""
-    """The gateway that said the states in `newest_by_topic`."""
+    """The boot_id of the gateway that published the states in `newest_by_topic`."""
     _starts: GatewayStarts = field(default_factory=GatewayStarts)
 
     @classmethod
@@ -101,16 +101,16 @@ class CarState:
             state.take(topic, reading.value, now - age_of_answer_s(reading.time.timestamp(), now))
         return state
 
-    # ------------------------------------------------------------------ what comes in
+    # ------------------------------------------------------------------ input
 
     def take(self, topic: str, message: Any, at: float) -> bool:
-        """Take in a message of a topic such as `state/link`. `at` is the time from which its age counts.
+        """Add a message of a topic such as `state/link`. `at` is the time from which its age counts.
 
-        Return False if it does not count: it is older than what is known, or of a gateway that has ended.
+        Return False if it does not count: it is older than the newest one, or its gateway has ended.
         """
         before = self.newest_by_topic.get(topic)
         if before is not None and before.at > at:
-            return False  # what was published meanwhile has overtaken this answer
+            return False  # a message that was published meanwhile has overtaken this answer
         if topic.startswith("state/"):
             if not self._starts.take(message.boot_id, messages.stamp_ns(message.stamp)):
                 if message.boot_id == self._boot_id:  # the last words of a gateway that has just ended
@@ -125,7 +125,7 @@ class CarState:
         return True
 
     def on_presence(self, *, present: bool) -> None:
-        """Note that the car's gateway is on the bus, or not. One that has come back says again what is so."""
+        """Note whether the car's gateway is on the bus. When it comes back it publishes its states again."""
         if present and not self.present:
             self._forget_states()
         self.present = present
@@ -139,16 +139,16 @@ class CarState:
             self._starts.end()
 
     def on_sleep(self, slept_s: float) -> None:
-        """Let all messages age by a sleep of the computer, which the clock of their times does not count."""
+        """Make all messages older by a sleep of the computer: the clock of their times stood still meanwhile."""
         for topic, seen in self.newest_by_topic.items():
             self.newest_by_topic[topic] = seen.aged(slept_s)
 
     def _forget_states(self) -> None:
-        """Forget what its gateway has said of it. Readings stay: they are of the car."""
+        """Forget the states that its gateway published. Readings stay, because they come from the car itself."""
         for topic in self.states():
             del self.newest_by_topic[topic]
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ newest messages
 
     def newest(self, topic: str) -> Any:
         """Return the newest message, also of a gateway that has gone since. None if there is none."""
@@ -160,7 +160,7 @@ class CarState:
         return self.newest(topic) if self.present else None
 
     def states(self) -> list[str]:
-        """Return the topics of the states that its gateway has said."""
+        """Return the topics of the states that its gateway has published."""
         return [topic for topic in self.newest_by_topic if topic.startswith("state/")]
 
     def fresh(self, topic: str, now: float) -> Any:
@@ -168,7 +168,7 @@ class CarState:
         return None if self.is_stale(topic, now) else self.newest(topic)
 
     def age_s(self, topic: str, now: float) -> float:
-        """Return the age of the newest message. Infinite if there is none, or if its stamp tells none."""
+        """Return the age of the newest message. Infinite if there is none, or if its stamp gives no age."""
         found = self.newest_by_topic.get(topic)
         return inf if found is None else max(0.0, now - found.at)
 
@@ -185,17 +185,18 @@ class CarState:
         """Return the newest message, also of a gateway that has gone since. An empty one if there is none."""
         return self.newest(topic) or _empty(topic)
 
-    # The states of a gateway that is there, such as a fleet.v1.Link. What nobody said reads as an empty message.
+    # The states of a gateway that is on the bus, such as a fleet.v1.Link. A state that is missing reads as an empty
+    # message.
     link = property(lambda self: self.of("state/link") or _empty("state/link"))
     mode = property(lambda self: self.of("state/mode") or _empty("state/mode"))
     motion = property(lambda self: self.of("state/motion") or _empty("state/motion"))
     safety = property(lambda self: self.of("state/safety") or _empty("state/safety"))
     health = property(lambda self: self.of("state/health") or _empty("state/health"))
 
-    # ------------------------------------------------------------------ what follows from it
+    # ------------------------------------------------------------------ conclusions
 
     def claims(self, now: float) -> CarClaims:
-        """Return what is claimed of motors, mode and link. If the gateway is gone, the claims are past."""
+        """Return the claims about motors, mode and link. If the gateway is gone, they are past claims."""
         states = {topic: seen.message for topic, seen in self.newest_by_topic.items()}
         return claims_of(states, {topic: self.age_s(topic, now) for topic in states}, present=self.present)
 
@@ -206,7 +207,10 @@ class CarState:
 
     @property
     def driver(self) -> str:
-        """The client that drives it: the owner of its motion, or the holder of its lease. Empty if none, or a plan."""
+        """The client that drives the car: the owner of its motion, or the holder of its lease.
+
+        Empty for none, or a plan.
+        """
         lease = self.safety.lease
         return self.motion.owner or ("" if lease.kind == Rank.COORDINATOR else lease.holder)
 
@@ -232,12 +236,12 @@ class CarState:
         return bool(self.safety.motors == Motors.UNKNOWN and self.last_rx_s > _UNHEARD_S)
 
     def why_not_ready(self, now: float) -> str | None:
-        """Return why the car is not ready, in words: empty if nothing tells, None if it is ready.
+        """Return why the car is not ready, in words. Empty if the cause is not known, None if the car is ready.
 
-        A ready car answers, and a command to it waits for nothing.
+        A ready car answers, and a command to it does not have to wait.
         """
         link, safety, claims = self.link, self.safety, self.claims(now)
-        # Stale are the states of a replay, and of a gateway that hangs.
+        # States are stale in a replay, or if the gateway hangs.
         if not link.state or claims.link.is_stale or claims.motors.is_stale:
             return ""
         if link.state == LinkState.LOST:
@@ -246,7 +250,7 @@ class CarState:
             return "silent: is it switched on?"
         if safety.waits_for:
             return f"waits for {safety.waits_for}"
-        # Of a car that sends nothing a gateway knows the motors without a byte.
+        # For a car that never sends anything, a gateway knows the state of the motors without a byte from it.
         heard = safety.motors in (Motors.OFF, Motors.ON) or (safety.motors and self.last_rx_s is not None)
         return None if heard else NEVER_HEARD
 

@@ -1,10 +1,11 @@
-"""What is claimed of a car's motors, mode and link: the one source of words for it. Pure: time is an argument.
+"""Claims about a car's motors, mode and link, and their texts. Pure: time is an argument.
 
 A car acknowledges nothing, so each such statement is a claim. It has a basis (the car's own readings, or only the
-frames that were sent), a time since when it is so, and an age: the time since its gateway published it. A gateway that
-has ended vouches for nothing. Its last claims are told as past, with their age, and never as present ones.
+frames that were sent), a time since which it has been so, and an age: the time since its gateway published it. The
+claims of a gateway that has ended no longer count: its last claims are shown as past ones, with their age, and never as
+present ones.
 
-Lists, status, shutdown, doctor, console and Python take their words from here, so that one car is described in one way.
+Lists, status, shutdown, doctor, console and Python all use these texts, so that a car is described everywhere alike.
 """
 
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ STOPPED: Final = "stopped"
 STOP_SENT: Final = "stop sent"
 """First words of a stop of a car that cannot show it."""
 NOT_CONFIRMED: Final = "NOT CONFIRMED"
-"""First words of a stop that the car could have shown and did not."""
+"""First words of a stop that the car's readings could have shown, but did not."""
 NOT_STOPPED: Final = "NOT STOPPED"
 """First words of a stop that did not reach a car that may be moving."""
 NO_GATEWAY: Final = "no gateway"
@@ -32,13 +33,13 @@ class CarClaim:
     """One statement about a car."""
 
     what: str
-    """Such as `off`, `tracking` or `online`. `unknown` if nobody knows."""
+    """The claim, such as `off`, `tracking` or `online`. `unknown` if nobody knows."""
     basis: str = ""
     """Motors: `shown`, `sent`. Mode: `confirmed`, `assumed`, `contradicted`. Empty if there is none."""
     since_s: float | None = None
-    """Time since when it is so. None if that is not known."""
+    """How long it has been so. None if that is not known."""
     age_s: float | None = None
-    """Time since the gateway published it. None if it never did."""
+    """Time since the gateway published it. None if the gateway never did."""
     why: str = ""
     """The evidence or the cause, for a person."""
     past: "CarClaim | None" = None
@@ -60,7 +61,7 @@ class CarClaim:
 
     @property
     def words(self) -> str:
-        """The claim as a sentence without an end: what, basis, since when, why."""
+        """The claim as a sentence without a period: what, basis, since when, why."""
         if self.past is not None and self.past.age_s is not None:
             return f"{self.what}: its gateway is gone, and said {self.past.short} {describe_age(self.past.age_s)} ago"
         since = f" for {describe_age(self.since_s)}" if self.since_s is not None else ""
@@ -78,7 +79,7 @@ class CarClaim:
 
 
 def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the motors. `safety` is the newest fleet.v1.Safety, or None if there is none."""
+    """Return the claim about the motors. `safety` is the newest fleet.v1.Safety, or None if there is none."""
     if safety is None or not safety.motors:
         return CarClaim(UNKNOWN)
     since_s = safety.trust_since_s if safety.HasField("trust_since_s") else None
@@ -87,7 +88,7 @@ def motors_claim(safety: Any, age_s: float = 0.0, *, present: bool = True) -> Ca
 
 
 def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the mode. `mode` is the newest fleet.v1.Mode, or None if there is none."""
+    """Return the claim about the mode. `mode` is the newest fleet.v1.Mode, or None if there is none."""
     if mode is None or not mode.asked:
         return CarClaim(UNKNOWN)
     since_s = mode.since_s if mode.HasField("since_s") else None
@@ -96,7 +97,7 @@ def mode_claim(mode: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
 
 
 def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarClaim:
-    """Return what is claimed of the link. `link` is the newest fleet.v1.Link, or None if there is none."""
+    """Return the claim about the link. `link` is the newest fleet.v1.Link, or None if there is none."""
     if link is None or not link.state:
         return CarClaim(UNKNOWN if present else NO_GATEWAY)
     claim = _claim("state/link", age_s, link.state, "", link.since_s, link.reason)
@@ -104,7 +105,7 @@ def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
 
 
 def rest_words(motors: CarClaim, car: str) -> str:
-    """Return what a gateway's last claim says of its stop: stopped, stop sent, or not confirmed."""
+    """Return in words what a gateway's last claim says about the car's stop: stopped, stop sent, or not confirmed."""
     if motors.what != Motors.OFF:
         return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
     if motors.basis == Basis.SHOWN:
@@ -113,12 +114,12 @@ def rest_words(motors: CarClaim, car: str) -> str:
 
 
 def is_bad_rest(words: str) -> bool:
-    """Return True if the words about the end of a car say that it may be moving."""
+    """Return True if these words about a car's last stop say that the car may be moving."""
     return words.startswith((NOT_STOPPED, NOT_CONFIRMED))
 
 
 def describe_age(age_s: float) -> str:
-    """Return a time for a person: 3 s, 12 min, 5 h."""
+    """Return a duration as a person reads it: 3 s, 12 min, 5 h."""
     if age_s < 120:
         return f"{age_s:.0f} s"
     return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
@@ -128,7 +129,7 @@ def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | Non
     """Return a claim from a message of this age. `since_s` is what the message says."""
     after_s = topics.TOPICS[topic].stale_after_s
     is_stale = after_s is not None and age_s > after_s
-    if isinf(age_s):  # its stamp tells no age
+    if isinf(age_s):  # its stamp gives no age
         return CarClaim(what, basis, why=why, is_stale=is_stale)
     return CarClaim(what, basis, None if since_s is None else since_s + age_s, age_s, why, is_stale=is_stale)
 
@@ -147,7 +148,7 @@ class CarClaims:
 
     @property
     def by_name(self) -> dict[str, CarClaim]:
-        """The claims by what they are about."""
+        """The claims by subject: motors, mode, link."""
         return {"motors": self.motors, "mode": self.mode, "link": self.link}
 
 
@@ -165,7 +166,8 @@ def claims_of(
 
 
 def describe_end_of_doubt(car: str) -> str:
-    """Return how the doubt about a car ends: no plan uses it until then."""
-    return (
-        f"`fleet stop {car}` ends the doubt if it shows that stop, `fleet resume {car}` if a person has looked at it."
-    )
+    """Return a text that says how to end the doubt about a car. No plan uses the car until then."""
+    return f"`fleet stop {car}` ends the doubt if the car then shows its stop, `fleet resume {car}` if a person has "
+
+
+"looked at the car."

@@ -62,9 +62,9 @@ _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
-"""Maximum number of queries of stops that wait for answers, two for each stop."""
+"""Maximum number of queries for stops that wait for answers at a time. A stop has two queries."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
-"""Minimum timeout for the query of the current values, however short a wait is."""
+"""Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
 log = logging.getLogger("fleet")
 command_log = logging.getLogger(json_log.COMMANDS)
@@ -84,7 +84,7 @@ def default_sender(person: str | None = None) -> str:
 
 
 def certified_sender(identity: str, sender: str | None = None, person: str | None = None) -> str:
-    """Return the sender. Raises keys.BadKey for another name than that of a person's certificate."""
+    """Return the sender. Raises keys.BadKey if a person's certificate has another name than the one asked for."""
     known = parse_identity(identity)
     if known is None or known[0] is not IdentityRole.PERSON:
         return sender or default_sender(person)
@@ -101,14 +101,15 @@ class Fleet:
     """One operator on the bus. Use it with `with`. Its methods may be called from several threads.
 
     endpoint: `tcp/HOST:PORT` of the bus. The default is FLEET_ENDPOINT, else loopback port 7447.
-    `name` is the fleet's name. `person` is who drives, such as `group_a` (default: FLEET_AS, else the user's login).
-    `sender` is the name shown to others, person@host-pid by default.
+    `name` is the fleet's name. `person` is the person who drives, such as `group_a` (default: FLEET_AS, else the user's
+    login). `sender` is the name shown to others, person@host-pid by default.
     kind: `script`, `person` (outranks scripts) or `coordinator`.
-    identity: whose certificate it uses, such as `service.coordinator` (default: the user's). On a hub with certificates
-    the owner of the certificate drives, and another `person` or `sender` raises keys.BadKey.
+    identity: the owner of the certificate to use, such as `service.coordinator` (default: the user). On a hub with
+    certificates, the person who drives is the owner of the certificate. Another `person` or `sender` raises
+    keys.BadKey.
 
-    While it is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars that
-    it drives. A script that does not close it ends with a ResourceWarning.
+    While a Fleet is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars
+    that this client drives. A script that does not close its Fleet ends with a ResourceWarning.
     Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
 
@@ -140,7 +141,7 @@ class Fleet:
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._poses: dict[str, Publisher] = {}
-        """By car: what publishes its poses."""
+        """The publisher of each car's poses, by car."""
         self._pose_lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         # The query of a gateway that hangs occupies its thread for 10 s. A stop never waits for such a thread.
@@ -177,7 +178,7 @@ class Fleet:
 
     def _check_open(self) -> None:
         """Raise BusError if the fleet is closed."""
-        if self._closed:  # Zenoh and the pools would raise errors of their own, which name nothing that helps
+        if self._closed:  # the errors that Zenoh and the pools would raise do not help
             raise BusError("this Fleet is closed: use it inside its `with`, or open another one")
 
     # ------------------------------------------------------------------ reading
@@ -196,7 +197,7 @@ class Fleet:
         return canon(keys.expand(expression, self.name))
 
     def get(self, expression: str) -> list[Reading]:
-        """Return the latest value of every matching key, sorted by key. Takes short forms as the command line does.
+        """Return the latest value of every matching key, sorted by key. Accepts short forms as the command line does.
 
         Raises keys.BadKey for a key that no topic has. A car that is not on the bus has no readings.
         """
@@ -206,7 +207,7 @@ class Fleet:
         """Return the last `last` values of every matching key, or those of the last `since_s` seconds, or both.
 
         They are sorted by key and time. A gateway stores 1500 values of each reading and the latest of each state.
-        `history_query.describe_shortfalls` tells what is missing. Raises ValueError.
+        `history_query.describe_shortfalls` says what is missing. Raises ValueError.
         """
         selector = history_query.selector(self.expression(expression), last=last, since_s=since_s)
         found: list[Reading] = []
@@ -237,7 +238,8 @@ class Fleet:
         """Subscribe to readings: `for reading in fleet.watch("*/sensor/range")`.
 
         `when` is a condition on the fields of one message, such as `range_m < 0.3`. Raises conditions.BadExpression.
-        Use it with `with` if the fleet stays open longer. Otherwise it receives readings until the fleet is closed.
+        Use it with `with` if you need it for a shorter time than the fleet. Otherwise it receives readings until the
+        fleet is closed.
         """
         written = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, written).holds
@@ -251,9 +253,9 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until `when` holds of a fresh reading and return that reading. The current one counts.
+        """Wait until `when` holds for a fresh reading and return that reading. The current reading counts, too.
 
-        With `for_s`, the condition must have held for this time in all readings, by stamp. Without
+        With `for_s`, the condition must have held for this time in all readings, measured by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
         """
         written = self.expression(expression)
@@ -263,7 +265,7 @@ class Fleet:
         def left_s() -> float:
             return _NO_TIMEOUT_POLL_S if timeout_s is None else began + timeout_s - time.monotonic()
 
-        with self.watch(expression) as stream:  # before the query of the current values, so that none is missed
+        with self.watch(expression) as stream:  # before the query of the current values: none is missed
             for reading in self._read(written, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
                 if waiting.ends(reading, datetime.now(UTC)):
                     return reading
@@ -287,12 +289,12 @@ class Fleet:
         xy_std_m: float | None = None,
         heading_std_rad: float | None = None,
     ) -> None:
-        """Publish where a car is, as this program has measured it from outside: `sensor/pose` (REP-103).
+        """Publish where a car is, as this program has measured it from outside the car: `sensor/pose` (REP-103).
 
-        Cars of one `frame` are on one map. heading_rad: counter-clockwise from the x axis, any number. at: when it was
-        measured (default: now), with its time zone. xy_std_m, heading_std_rad: standard deviations, if they are known.
-        Raises ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with
-        certificates unless this is that of `service.locator`.
+        Cars of one `frame` are on one map. heading_rad: counter-clockwise from the x axis, any number. at: the time of
+        the measurement (default: now), with its time zone. xy_std_m, heading_std_rad: standard deviations, if they are
+        known. Raises ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with
+        certificates, unless this client has the certificate of `service.locator`.
         """
         self._check_open()
         message = pose_message(x_m, y_m, heading_rad, frame, xy_std_m, heading_std_rad)
@@ -311,7 +313,7 @@ class Fleet:
     # ------------------------------------------------------------------ commands
 
     def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Stop these cars, or the car with this name. Without an argument, stop every car with one query."""
+        """Stop these cars, or one car (a str). Without an argument, stop every car with one query."""
         return self.ask(stop_request(), cars)
 
     def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
@@ -319,9 +321,10 @@ class Fleet:
         return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
-        """End the e-stops with these ids, or without ids the hold. If `cars` is None, do so for every car.
+        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do so for every car.
 
-        With `everything`, end the hold and every e-stop that this sender may end. The outcome is not ok if some stay.
+        With `everything`, end the hold and every e-stop that this sender may end. If an e-stop or a hold remains, the
+        outcome is not ok.
         """
         return self.ask(resume_request(ids, everything=everything), cars)
 
@@ -330,11 +333,11 @@ class Fleet:
         return self.ask(pause_request(why))
 
     def unpause(self) -> list[Outcome]:
-        """End the pause of the fleet. No car moves."""
+        """End the pause of the fleet. No car starts to move by that."""
         return self.ask(plain_request(Verb.UNPAUSE))
 
     def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
-        """Lend these cars to a person: until then only that person and leads drive them."""
+        """Lend these cars to a person for `duration_s`: only that person and leads can drive them meanwhile."""
         return self.ask(lend_request(to, duration_s), cars)
 
     def end_loan(self, cars: Iterable[str]) -> list[Outcome]:
@@ -369,7 +372,7 @@ class Fleet:
         try:
             command.queries = [pool.submit(self._query, target, command, payload) for target in command.targets]
             if command.is_stop:
-                with suppress(RuntimeError):  # the fleet is closed meanwhile, which ends the command
+                with suppress(RuntimeError):  # the fleet was closed meanwhile, which ends the command
                     pool.submit(self._query_supervisor, command)
         except BaseException:
             del self._pending[command_id]
@@ -377,7 +380,7 @@ class Fleet:
         return command
 
     def outcomes(self, command: PendingCommand) -> list[Outcome]:
-        """Wait and return the outcomes of a command that was sent."""
+        """Wait for the outcomes of a command that was sent, and return them."""
         try:
             command.wait()
             for query in command.queries:
@@ -409,9 +412,9 @@ class Fleet:
         return message, message.id
 
     def _query(self, target: str, command: PendingCommand, payload: bytes) -> None:
-        """Query one car, or all. Runs on a thread of the pool."""
+        """Send the command to one car, or to all, and queue the answers. Runs on a thread of the pool."""
         verb = command.request.verb
-        words = f"{target} may or may not do it: its gateway ended without an answer. Look at the car."
+        words = f"{target} may or may not carry it out: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(
                 keys.command_key(self.name, target, verb, self.bus.identity),
@@ -428,7 +431,7 @@ class Fleet:
             command.inbox.put((time.monotonic(), QueryEnded(target, words)))
 
     def _query_supervisor(self, command: PendingCommand) -> None:
-        """Query the names of the cars that a supervisor starts gateways for. Runs on a thread of the pool."""
+        """Ask the supervisor for which cars it runs gateways, and queue their names. Runs on a thread of the pool."""
         names: set[str] = set()
         try:
             for status in ask_status(self.bus, self.name, ANSWER_TIMEOUT_S):
@@ -500,6 +503,6 @@ class LeasedCar(Car):
         self._lease = lease
 
     def do(self, request: CommandRequest) -> Outcome:
-        """Send one command. Raises NotCarriedOut, or LeaseLost if another sender has the car."""
+        """Send one command. Raises NotCarriedOut, or LeaseLost if another sender has taken or stopped the car."""
         self._lease.check()
         return self._lease.checked(super().do(request))

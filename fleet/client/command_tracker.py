@@ -15,14 +15,15 @@ from schemas.bus import Sample
 from schemas.commands import STOPPING_VERBS
 
 ANSWER_TIMEOUT_S: Final = 2.0
-"""Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
+"""Timeout for a gateway's answer on a machine that is not overloaded. It does not depend on the car."""
 WAIT_SAID_S: Final = 1.0
-"""Time until the message that a command waits for a busy car."""
+"""Time after which the user is told that a command waits for a busy car."""
 SEND_AGAIN_INTERVAL_S: Final = 0.5
-"""Interval at which a stop without an answer is sent again: the longest pause between two tries of a lost session."""
+"""Interval at which a stop without an answer is sent again. A lost session tries to connect again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval at which a stop without an answer looks for the bus: half the shortest time for which a session is lost."""
-_MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of some hundred cars
+"""Interval of looking whether the bus is there while a stop has no answer. A session is lost for at least twice as
+long."""
+_MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of up to some hundred cars
 
 
 log = logging.getLogger("fleet")
@@ -45,7 +46,7 @@ class PresenceChange:
 
 
 class SupervisedCars:
-    """The cars whose gateways a supervisor runs (none without a supervisor), and those on the bus at that time."""
+    """The cars whose gateways a supervisor runs (none without a supervisor), and the cars on the bus at that time."""
 
     def __init__(self, names: frozenset[str], present: frozenset[str]) -> None:
         self.names = names
@@ -61,12 +62,13 @@ Item = tuple[float, Any]
 class PendingCommand:
     """One command to some cars. `wait` runs on the caller's thread, other threads fill the inbox."""
 
-    # A stop must not miss a car whose gateway hangs: 2 s later its token is gone, and a plain wildcard query passes it
-    # by. Therefore a stop also concerns the cars that a supervisor knows, and is sent again to their new gateways.
-    #
-    # Nor must it be lost with the bus: a hub that hangs takes the query, and drops it when its links are cut after the
-    # lease. So a stop that a gateway has not answered is sent again when the bus is back, as long as a gateway takes it
-    # (STOP_TTL_S). No car gets it again that has answered: a person may have released it meanwhile.
+    # A stop must not miss a car whose gateway hangs: after 2 s its token is gone, and a wildcard query no longer
+    # reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent again to their new
+    # gateways.
+    # Nor must a stop be lost with the bus: a hub that hangs accepts the query, and drops it when its links are cut
+    # after Zenoh's lease. So a stop that a gateway has not answered is sent again when the bus is back, as long as
+    # gateways accept a stop of that age (STOP_TTL_S). A car that has answered does not get the stop again, because a
+    # person may have released the car meanwhile.
 
     def __init__(
         self,
@@ -87,13 +89,14 @@ class PendingCommand:
         self._hubs = hubs
         self._hubs_then = hubs()
         self.is_taken: Future[bool] = Future()
-        """True as soon as a gateway has answered, or there is none. False if the bus was lost and nobody has."""
+        """True as soon as a gateway has answered, or no gateway is there. False if no gateway has answered, and the bus
+        was lost or the Fleet closed."""
         self.lost_bus = False
         """True if the bus was lost before the stop was answered."""
         self._bus_back_at: float | None = None
-        """The time since which the bus is there again."""
+        """The time at which the bus came back. None while it is lost, or if it never was."""
         self._unanswered_at: dict[str, float] = {}
-        """When the last query of a stop to a car has ended without an answer."""
+        """By car: when the last query of a stop to it ended without an answer."""
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)
         self._asked_at = time.monotonic()
         self._is_closed = False
@@ -120,7 +123,7 @@ class PendingCommand:
             if self.is_stop:
                 self._look_for_bus(time.monotonic())
             waiting = [progress for progress in self._progress.values() if progress.outcome is None]
-            # A car without a token may answer a wildcard query, too. So wait for the end of the query.
+            # A car without a token may answer a wildcard query, too. So also wait for the end of the query.
             if not waiting and not self._open and not self._awaits_bus:
                 self._note_taken(taken=not self.lost_bus and not self._is_closed)
                 return
@@ -148,7 +151,10 @@ class PendingCommand:
             self._take(item, at)
 
     def abandon(self) -> None:
-        """Let `wait` return at once: nobody needs the outcome any more. What was sent is carried out."""
+        """Make `wait` return at once, because nobody needs the outcome any more.
+
+        The command itself is still carried out.
+        """
         with suppress(queue.Full):
             self.inbox.put_nowait((time.monotonic(), CLOSED))
 
@@ -165,7 +171,10 @@ class PendingCommand:
         return self._bus_back_at is None or now < self._bus_back_at + GATEWAY_RETURN_TIMEOUT_S
 
     def _look_for_bus(self, now: float) -> None:
-        """Note a loss of the bus before all have answered. Send the stop again to those who have not."""
+        """Note if the bus was lost before all gateways have answered.
+
+        Send the stop again to the cars without an answer.
+        """
         unanswered = [each for each in self._progress.values() if each.outcome is None and not each.answered]
         if not (hubs := self._hubs()):
             if unanswered or not self._progress:
@@ -224,7 +233,8 @@ class PendingCommand:
             self._on_supervised(item, at)
         elif self._named is None or self.concerns(item.car):
             self._note_taken(taken=True)
-            # A gateway forwards the end of an e-stop of the fleet under the same id. Those cars were not asked.
+            # If a resume ends an e-stop of the whole fleet, gateways tell each other under the same id. So this event
+            # may be of a car to which the command was not sent.
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _on_presence(self, change: PresenceChange, at: float) -> None:
@@ -240,7 +250,7 @@ class PendingCommand:
             self._stop_again(progress)
 
     def _on_supervised(self, supervised: SupervisedCars, at: float) -> None:
-        """Wait for the new gateways of these cars. Give up named cars that nobody knows."""
+        """Wait for the new gateways of these cars. Give up on named cars that nobody knows."""
         queried = set(self._progress) if self._named is None else set(self.targets)
         present = self._present | supervised.present
         for car in supervised.names if self._named is None else self._named:

@@ -23,12 +23,13 @@ MAX_DRIVE_S: Final = 3600.0
 """Maximum duration of a drive. A gateway allows 10 s unless it was started with a longer `--longest-drive`."""
 
 STOP_TTL_S: Final = 10.0
-"""Maximum age of a stop when it arrives. A delayed drive is rejected after 0.5 s, a delayed stop is still useful."""
+"""Maximum age of a stop when it arrives. A drive is rejected if it is delayed by 0.5 s, but a delayed stop is still
+useful."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRequest:
-    """One command without an id and a time."""
+    """One command that has no id and no time yet."""
 
     verb: str
     message: Any
@@ -66,12 +67,12 @@ class CommandRequest:
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
     """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). With `wait`, wait until it ends."""
-    if not hasattr(duration_s, "__float__"):  # text, of a caller without a type checker
+    if not hasattr(duration_s, "__float__"):  # text, from a caller without a type checker
         raise TypeError(f"duration {duration_s!r} is not allowed: write a number of seconds, such as 1.5")
     if not (math.isfinite(duration_s) and 0 < duration_s <= MAX_DRIVE_S):
         raise ValueError(
             f"duration {duration_s:g} s is not allowed: more than 0 and at most {MAX_DRIVE_S:g} s; "
-            "to go on, drive again"
+            "for a longer drive, send the motion again"
         )
     message = pb.DriveCommand(motion=motion, duration_s=duration_s)
     if motion == Motion.STOP:
@@ -116,7 +117,7 @@ def light_request(light: str) -> CommandRequest:
 
 
 def plain_request(verb: str, **fields: Any) -> CommandRequest:
-    """Request a command of `schemas.commands` that needs no rule here, with the fields of its message."""
+    """Request a command of `schemas.commands` whose fields need no check here. `fields` are those of its message."""
     return CommandRequest(verb, messages.message_class(COMMANDS[verb].message)(**fields))
 
 
@@ -146,7 +147,7 @@ def estop_request(why: str, scope: str) -> CommandRequest:
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
-    """Request the end of the e-stops with these ids, or without ids of the hold. With `everything`, of both."""
+    """Request the end of the e-stops with these ids. Without ids: of the hold. With `everything`: of both."""
     return CommandRequest(Verb.RESUME, pb.ResumeCommand(ids=ids, all=everything))
 
 
@@ -156,7 +157,7 @@ def pause_request(why: str = "") -> CommandRequest:
 
 
 def lend_request(to: str, duration_s: float) -> CommandRequest:
-    """Request that of all persons and scripts only this person and leads drive the car, for `duration_s`."""
+    """Request a loan of the car for `duration_s`: only this person, that person's scripts, and leads may drive it."""
     return CommandRequest(Verb.LEND, pb.LendCommand(to=keys.check_name(to, "person"), duration_s=duration_s))
 
 
@@ -194,7 +195,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(drive_request(motion, duration_s, wait=wait))
 
     def mode(self, mode: str) -> R:
-        """Set the mode, a word of `schemas.words.Mode`: `manual` to steer the car, or `tracking` and others."""
+        """Set the mode, a word of `schemas.words.Mode`: `manual` to steer the car, or another such as `tracking`."""
         return self.do(mode_request(mode))
 
     def led(self, r: int, g: int, b: int) -> R:
@@ -221,7 +222,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(plain_request(Verb.WHISTLE))
 
     def speed(self, step: str) -> R:
-        """Change the speed by one step `up` or `down`: the car has no absolute speed."""
+        """Change the speed by one step `up` or `down`. The car does not accept an absolute speed."""
         return self.do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
@@ -237,11 +238,14 @@ class CarCommands(ABC, Generic[R]):
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
-        """End the e-stops with these ids, or without ids the hold. With `everything`, end all that the sender may."""
+        """End the e-stops with these ids. Without ids, end the hold.
+
+        With `everything`, end all that the sender may end.
+        """
         return self.do(resume_request(ids, everything=everything))
 
     def lend(self, to: str, duration_s: float) -> R:
-        """Lend the car to a person: until then only that person and leads drive it."""
+        """Lend the car to a person for `duration_s`: only that person and leads can drive it meanwhile."""
         return self.do(lend_request(to, duration_s))
 
     def end_loan(self) -> R:

@@ -1,6 +1,6 @@
-"""A condition on the messages that a key expression can match: `range_m < 0.3` of `*/sensor/range`.
+"""A condition on the messages that a key expression can match, such as `range_m < 0.3` for `*/sensor/range`.
 
-It is checked before the first query. Unknown fields and conditions that can never hold are errors.
+The condition is checked before the first query. Unknown fields and conditions that can never hold are errors.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ def known_topics_under(written: str) -> list[topics.Topic]:
     begin = f"{car}/"
     if car.startswith("@"):
         if car not in _SERVICES and not nearest(car, _SERVICES):
-            raise keys.BadKey(f"{short}: a key names one car, or all (*), but no group. Such as '*/{name}'.")
+            raise keys.BadKey(f"{short}: a key names one car, or all (*), but not a group. For all cars: '*/{name}'.")
         begin, name = "", short
     likely = topics.likely_name(name)
     near = f"Did you mean {begin}{likely}?" if likely else "`fleet keys` lists what is published."
@@ -54,7 +54,7 @@ def check_key(written: str) -> str:
 def check_car(name: str) -> str:
     """Return the name of one car. Raises BadKey."""
     if name.startswith("@"):
-        raise keys.BadKey(f"{name} is a group, and this accepts one car. `fleet.cars()` are the names of all cars.")
+        raise keys.BadKey(f"{name} is a group, but this needs one car. `fleet.cars()` returns the names of all cars.")
     return keys.check_name(name)
 
 
@@ -84,7 +84,11 @@ class KeyCondition:
             every = {name: kind for fields in names.values() for name, kind in fields.items()}
             aliases = {a: f for message in names for a, f in topic_aliases_of(short[message], names[message]).items()}
             parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)}, aliases)
-            raise BadExpression(text, 1, f"no message under {written} has all of its fields: it is about one message")
+            raise BadExpression(
+                text,
+                1,
+                f"no message under {written} has all of its fields: a condition is about one message",
+            )
         if len(never) == len(found):
             raise BadExpression(text, 1, never[0])
         return cls(str(next(iter(found.values()))), found)
@@ -93,12 +97,12 @@ class KeyCondition:
         return self.text
 
     def holds(self, reading: Reading) -> bool | None:
-        """Return True if it holds of this reading. None if the message lacks a field or it was not measured."""
+        """Return True if the condition holds for this reading. None if a field is missing or was not measured."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         return None if expression is None else expression.value(compared_in(reading.value))
 
     def read(self, reading: Reading) -> list[str]:
-        """Return the values that it reads in a message, such as `range_m=0.5`. Empty if the message lacks a field."""
+        """Return the values that the condition looks at, such as `range_m=0.5`. Empty if the message lacks a field."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         if expression is None:
             return []

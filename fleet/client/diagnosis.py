@@ -1,6 +1,7 @@
 """Finds the likely causes of a car that behaves oddly, and the facts behind them. Pure.
 
-`CHECKS` is the table of findings: condition, cause, and what to type. The likeliest cause comes first.
+`CHECKS` is the table of findings. Each has a code, a function that finds the cause, and a command to type. The
+likeliest cause comes first.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +46,7 @@ _OUT_OF_RANGE: Final = {
     "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
     "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
 }
-"""The likely cause by field, if its values are always out of range."""
+"""By field: the likely cause if its values are always out of range."""
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are not rejected frames."""
@@ -53,16 +54,16 @@ FAILED_PHASES: Final = (Phase.REJECTED, Phase.FAILED, Phase.EXPIRED)
 """Phases of a command that was not carried out."""
 _CARRIED_OUT: Final = (Phase.SENT, Phase.EFFECT_SEEN, Phase.COMPLETE)
 _NO_TROUBLE: Final = (Reason.SUPERSEDED, Reason.DUPLICATE)
-"""Reasons of commands that ended early as somebody intended."""
+"""Reasons of commands that ended early because somebody intended it."""
 
 
 @dataclass(frozen=True, slots=True)
 class CarEvidence:
-    """Everything that is known of one car now."""
+    """Everything that is known about one car now."""
 
     state: CarState
     now: float
-    """The time by the clock of the state."""
+    """The time, by the clock that the state uses."""
     commands: Sequence[tuple[float, Any]] = ()
     """Age (s) and CommandEvent, the newest last."""
     process: Any = None
@@ -78,11 +79,12 @@ class CarEvidence:
     runs_here: bool = False
     """True if a gateway of the car runs on this computer, on the bus or not."""
     asked: bool = False
-    """True if the states are answers. Then a gateway answers, also one that says old things, such as a replay."""
+    """True if the states are answers to a query. Then something answers for the car, even if the states are old, as
+    those of a replay."""
 
     @property
     def failed(self) -> list[tuple[float, Any]]:
-        """The refused and failed commands, the newest last."""
+        """The commands that were refused, failed or expired, the newest last."""
         return [
             (age, event)
             for age, event in self.commands
@@ -117,7 +119,7 @@ class DoctorCheck:
     code: str
     cause: Callable[[CarEvidence], str]
     todo: str
-    """`{car}` stands for the car."""
+    """The command to type. `{car}` stands for the car's name."""
     of_fleet: bool = False
 
 
@@ -147,13 +149,13 @@ def _hung(e: CarEvidence) -> str:
     said = [topic for topic in e.state.states() if e.asked or not e.state.is_stale(topic, e.now)]
     if said or not e.state.present:
         return ""
-    return "Its gateway is on the bus and does not answer. It may hang."
+    return "Its gateway is on the bus but does not answer. The gateway may hang."
 
 
 def _wrong_clock(e: CarEvidence) -> str:
     if not (words := describe_clock(e.state.car, e.clock_off_s)):
         return ""
-    return f"{words} Commands are refused as stale until both are set; stops, e-stops and pauses count."
+    return f"{words} Commands are refused as stale until both clocks are set. Stops, e-stops and pauses still work."
 
 
 def _adapter_full(e: CarEvidence) -> str:
@@ -178,7 +180,7 @@ def _doubted(e: CarEvidence) -> str:
         words = "It has shown its stops before, but did not show the last one. Plans leave it alone."
         return f"{words} {describe_end_of_doubt(e.state.car)}"
     if e.state.safety.trust == CarTrust.UNPROVEN:
-        return "Its reports do not show its last stop yet. Look at the car: it may be moving."
+        return "Its reports have not shown its last stop yet. Look at the car: it may be moving."
     return ""
 
 
@@ -193,16 +195,16 @@ def _out_of_range(e: CarEvidence) -> str:
 
 def _baud(e: CarEvidence) -> str:
     link = e.state.link
-    if link.rx_frames > sum(e.rejected.values()):  # a reading came
+    if link.rx_frames > sum(e.rejected.values()):  # at least one reading came
         return ""
     if link.rejects.get("wrong_baud", 0):
-        return "Bytes arrive, but never a frame. They look like a wrong baud rate: the log has both rates."
+        return "Bytes arrive, but never a frame. The bytes look like a wrong baud rate: the log has both rates."
     return "Bytes arrive, but never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
 
 
 def _silent_fan(e: CarEvidence) -> str:
     silent_by_fan = e.state.is_silent and e.state.motion.fan
-    return "It is silent, and its fan runs: some cars send nothing then." if silent_by_fan else ""
+    return "The car is silent, and its fan runs: some cars send nothing while the fan runs." if silent_by_fan else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
@@ -213,23 +215,23 @@ def _silent_car(e: CarEvidence) -> str:
     words = f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
     platform = e.state.health.platform.partition("+")[0]
     if e.state.link.rx_frames or (platform and platform not in tuple(Platform)):
-        return words  # it sends readings, or is of another family
-    return f"{words} If it drives and never sends readings: `platform: raspberry_pi+no_readings` in the fleet file."
+        return words  # it has sent readings, or is of another family
+    return f"{words} If it drives but never sends readings, set `platform: raspberry_pi+no_readings` in the fleet file."
 
 
 def _shared(e: CarEvidence) -> str:
     if not e.state.link.rejects.get(_PORT_SHARED, 0):
         return ""
-    return "Another program has its port open, too, or had it: bytes may be missing. The log names it."
+    return "Another program has its port open, or had it open: bytes may be missing. The log names the program."
 
 
 def _damaged(e: CarEvidence) -> str:
     link, count = e.state.link, sum(e.rejected.values())
-    # The rejected frames are among those that came.
+    # rx_frames also counts the rejected frames.
     if _baud(e) or count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * link.rx_frames:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
-    return f"{count} of {link.rx_frames} frames were not readings, most of them {worst}: a bad wire or radio."
+    return f"{count} of {link.rx_frames} frames were not readings, most of them {worst}. The wire or the radio is bad."
 
 
 def _estopped(e: CarEvidence) -> str:
@@ -269,7 +271,7 @@ def _held(e: CarEvidence) -> str:
     safety = e.state.safety
     if not safety.HasField("hold"):
         return ""
-    return f"On hold: {name_of(safety.hold.by)} sent it a stop. No plan moves it until someone resumes it."
+    return f"On hold: {name_of(safety.hold.by)} sent it a stop. No plan moves the car until someone resumes it."
 
 
 def _leased(e: CarEvidence) -> str:
@@ -307,7 +309,7 @@ def _refused(e: CarEvidence) -> str:
         return ""
     age, event = e.failed[-1]
     is_over = event.reason == Reason.WRONG_MODE and e.state.mode.asked == Mode.MANUAL
-    # Or the car has done since then what was refused.
+    # It is also over if the car has carried out such a command since then.
     if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
         return ""
     return f"{name_of(event.sender)}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
@@ -365,7 +367,7 @@ CHECKS: Final = (
 
 
 def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
-    """Return what is odd, the likeliest cause first. Empty if nothing is. `options` is what proposed commands need."""
+    """Return the findings, the likeliest cause first. `options` are added to the commands that they propose."""
     found = [
         DoctorFinding(
             check.code,
@@ -377,13 +379,13 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
         if (cause := check.cause(evidence))
     ]
     last = evidence.failed[-1][1].reason if evidence.failed else ""
-    # The reason of the last refusal is the cause: it need not be listed twice.
+    # If another finding has the code of the last refusal, it explains the refusal: do not list that as well.
     known = any(each.code == last for each in found)
     return [each for each in found if not (known and each.code == "refused")]
 
 
 def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
-    """Yield what is known of the car, as names and texts."""
+    """Yield the facts known about the car, as names and texts."""
     state, claims = evidence.state, evidence.state.claims(evidence.now)
     link, mode, safety, health = (state.of(f"state/{name}") for name in ("link", "mode", "safety", "health"))
     battery = state.of("sensor/battery")
@@ -414,7 +416,7 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
 
 
 def doubtful(evidence: CarEvidence) -> set[str]:
-    """Return the names of what `describe` says and the car has not shown: it may be otherwise."""
+    """Return the names of the facts of `describe` that the car has not shown, and that may be wrong."""
     state = evidence.state
     if not state.present:
         return set(state.claims(evidence.now).by_name)
@@ -433,7 +435,7 @@ def doubtful(evidence: CarEvidence) -> set[str]:
 
 
 def describe_reports(health: Any) -> str:
-    """Return what was learned of a car's reports: their rhythm, and whether they show that a stop arrived."""
+    """Return in words what is known about a car's reports: their rhythm, and whether they show that a stop arrived."""
     rhythm = ""
     if health.HasField("interval_s"):
         blocks = "".join(
@@ -441,13 +443,13 @@ def describe_reports(health: Any) -> str:
         )
         rhythm = f"every {health.interval_s:.2f} s (spread {health.interval_spread_s:.2f} s{blocks}); "
     words = f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
-    # The reports of most arduino programs react, if the frames arrive.
+    # The reports of most arduino programs show a stop, if the frames arrive.
     is_odd = health.shows_stops == Shows.NO and health.platform.partition("+")[0] == Platform.ARDUINO
     return f"{words}. If it obeys nothing: look at the wire to its RX pin" if is_odd else words
 
 
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:
-    """Return the findings and what is known, for JSON. `options` are those of `diagnose`."""
+    """Return the findings and the facts, for JSON. `options` as in `diagnose`."""
     found = [asdict(finding) for finding in diagnose(evidence, options)]
     return {"car": evidence.state.car, "findings": found, "facts": dict(describe(evidence))}
 
@@ -465,7 +467,8 @@ def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
         left = f"for another {loan.expires_in_s:.0f} s"
         yield f"lent to {loan.to} by {_who(loan, loan.since)}, {left}", f"fleet lend {car} --end"
     if safety.HasField("lease"):
-        # `--take` would move the car, and takes nothing from a lead. A stop is everybody's, and ends the lease in 2 s.
+        # Do not propose `--take`: it would move the car, and does not work against a lead. Everybody may send a stop,
+        # and the lease then ends in 2 s.
         yield f"driven by {name_of(safety.lease.holder)} ({safety.lease.kind})", f"fleet stop {car}"
 
 

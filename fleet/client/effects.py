@@ -11,7 +11,7 @@ UNCONFIRMED: Final = "unconfirmed"
 """The result of a stop or a drive whose basis is `sent`."""
 RELEASE: Final = "release"
 ESTOP_FLEET: Final = "estop_fleet"
-"""Verbs of this module: a drive with motion stop, and an e-stop of all cars."""
+"""Verbs that exist only in this module: a drive with motion stop, and an e-stop of all cars."""
 _ESTOP: Final[dict[str, str]] = {
     Basis.SHOWN: "emergency-stopped ({took_s:.1f} s)",
     Phase.COMPLETE: "emergency-stopped ({took_s:.1f} s)",
@@ -60,12 +60,12 @@ _STOP_FAILURES: Final = {
     Phase.REJECTED: "{words}",
     Phase.FAILED: "{words}",
 }
-"""The gateway's words of a stop that failed begin with the fact for the car."""
+"""Text of a stop that failed, by result. The gateway's words begin with the consequence for the car."""
 STOP_VERBS: Final = STOPPING_VERBS | {RELEASE, ESTOP_FLEET}
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:
-    """Return what a command did. `results` is the most specific one first, such as reason and phase."""
+    """Return in words what a command did. `results` are ordered, the most specific first, such as reason and phase."""
     tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
     template = next((table[result] for result in results for table in tables if result in table), "{words}")
     shown = f" {detail}" if detail else ""

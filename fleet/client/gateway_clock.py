@@ -1,21 +1,22 @@
-"""How far the clock of a gateway's computer is from ours. Two computers that differ by minutes look odd everywhere.
+"""How far the clock of a gateway's computer is from ours. Clocks that differ by minutes have odd effects everywhere.
 
-Answers of such a gateway look old, or from the future; commands to it are `stale`. Stops, e-stops and pauses look at no
-clock. What tells is a state that was published just now: its stamp is of the gateway's clock, and it came now. On its
-way it can only have become older, so of several messages the one with the newest stamp tells best. One message is not
-enough: it may be the last one before a pause of a network or a process.
+Answers of such a gateway look old, or from the future, and commands to it are `stale`. Stops, e-stops and pauses do not
+depend on a clock. A state that was published just now shows the difference: its stamp is by the gateway's clock, and it
+came at a time by our clock. A delay on the way makes the gateway's clock look later than it is, so the message with the
+largest lead over our clock counts. One message is not enough, because it may have been delayed by a pause of the
+network or of a process.
 
-A gateway that hangs publishes nothing, so nothing is said of its clock. A replay publishes old stamps at the usual
-rate, and is not a gateway: whoever asks leaves it out. Pure.
+A gateway that hangs publishes nothing, so nothing is known about its clock. A replay publishes old stamps at the usual
+rate, but is not a gateway: the caller must leave it out. Pure.
 """
 
 from collections import deque
 from typing import Final
 
 MAX_CLOCK_OFF_S: Final = 5.0
-"""Maximum difference of two clocks that nobody is told of. A gateway refuses a command from further in the future."""
+"""Maximum difference of two clocks that is not reported. A gateway refuses a command from further in the future."""
 _KEPT: Final = 8
-"""Messages that are remembered: two seconds of four states."""
+"""Number of messages that are remembered: two seconds of four states."""
 _MIN_STAMPS: Final = 2
 _NS: Final = 1e9
 
@@ -29,7 +30,7 @@ class GatewayClock:
         """Stamp (ns), and how far it was ahead of our clock when it came (s)."""
 
     def take(self, boot_id: str, stamp_ns: int, now_ns: int) -> None:
-        """Take in a state. `now_ns` is our wall clock when it came."""
+        """Add a state. `now_ns` is the time by our wall clock at which it came."""
         if boot_id != self._boot_id:  # another process, perhaps elsewhere
             self._boot_id = boot_id
             self._leads.clear()
@@ -37,14 +38,14 @@ class GatewayClock:
 
     @property
     def off_s(self) -> float | None:
-        """Return how far it is ahead of ours, s. The result is negative if it is behind, and None if not known yet."""
+        """How far the gateway's clock is ahead of ours, s. Negative if it is behind, None if not known yet."""
         if len({stamp for stamp, _ in self._leads}) < _MIN_STAMPS:
             return None
         return max(lead for _, lead in self._leads)
 
 
 def describe_clock(car: str, off_s: float | None) -> str:
-    """Return words about a clock that is wrong by more than MAX_CLOCK_OFF_S. Empty for any other."""
+    """Return a text about a clock that is off by more than MAX_CLOCK_OFF_S. Empty otherwise."""
     if off_s is None or abs(off_s) <= MAX_CLOCK_OFF_S:
         return ""
     side = "ahead of" if off_s > 0 else "behind"

@@ -55,7 +55,7 @@ def complete_hints(words: str, options: str) -> str:
 def complete_command(command: str, options: str) -> str:
     """Add the options to a command such as `fleet stop red`.
 
-    A command that accepts no such option, or has one already, stays as it is.
+    A command that accepts no such option, or already has one, is returned unchanged.
     """
     _, verb, *arguments = command.split()
     has_no_bus = verb in WITHOUT_BUS or f"{verb} {arguments[0] if arguments else ''}" in WITHOUT_BUS

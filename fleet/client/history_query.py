@@ -16,11 +16,14 @@ MAX_HISTORY_S: Final = 7 * 86_400.0
 
 
 def selector(written: str, *, last: int | None = None, since_s: float | None = None) -> str:
-    """Return the selector for the last values of each key, or those of the last `since_s`. Raises ValueError."""
+    """Return the selector for the last `last` values of each key, for the last `since_s` seconds, or for both.
+
+    Raises ValueError.
+    """
     if last is None and since_s is None:
         raise ValueError("a history needs last (how many), since_s (how far back), or both")
     if last is not None and last < 1:
-        raise ValueError(f"last {last} is not allowed: a whole number from 1 on")
+        raise ValueError(f"last {last} is not allowed: it must be a whole number, at least 1")
     if since_s is not None and not 0 < since_s <= MAX_HISTORY_S:
         raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {MAX_HISTORY_S:g} s")
     parameters = [] if since_s is None else [f"_time=[now(-{since_s:f}s)..]"]
@@ -29,7 +32,7 @@ def selector(written: str, *, last: int | None = None, since_s: float | None = N
 
 def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
     """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
-    # A gateway drops answers if a link's queue is full, rather than to block. So a client with gaps queries again.
+    # If a link's queue is full, a gateway drops answers and does not block. So a client that finds gaps queries again.
     boots: dict[str, int] = {}
     found: dict[tuple[str, int, int], Reading] = {}
     for reading in (*earlier, *more):
@@ -43,7 +46,10 @@ def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None 
 
 
 def gaps(readings: Iterable[Reading]) -> dict[str, int]:
-    """Return the number of missing readings for each key that has gaps. The readings are sorted as by `merge`."""
+    """Return the number of missing readings for each key that has gaps.
+
+    The readings must be sorted as `merge` sorts.
+    """
     missing: dict[str, int] = {}
     for one, other in itertools.pairwise(readings):
         if (one.key, one.value.boot_id) == (other.key, other.value.boot_id):

@@ -25,7 +25,7 @@ class JobThreads:
         self._closed = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run this on a thread. Raise RuntimeError after `shutdown`."""
+        """Run this on a thread. Raises RuntimeError after `shutdown`."""
         future: Future[Any] = Future()
         job = future, lambda: fn(*args, **kwargs)
         with self._lock:
@@ -40,7 +40,10 @@ class JobThreads:
         return future
 
     def shutdown(self, *, wait: bool = True, cancel_futures: bool = False) -> None:
-        """Take no new job. With `cancel_futures`, drop the jobs that wait. With `wait`, wait for all others."""
+        """Accept no new job. With `cancel_futures`, drop the jobs that wait for a thread.
+
+        With `wait`, wait until the others end.
+        """
         with self._lock:
             self._closed = True
             if cancel_futures:

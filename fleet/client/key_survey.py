@@ -57,7 +57,7 @@ class KeySurvey:
             self._newest[reading.key] = reading
 
     def keys(self, silent: Iterable[str], now: datetime) -> list[KeyInfo]:
-        """Return every key, sorted. `silent` has keys that are in use even without a reading."""
+        """Return every key, sorted. `silent` are keys that are in use even without a reading."""
         return [self._info(key, now) for key in sorted({*self._newest, *silent})]
 
     def _info(self, key: str, now: datetime) -> KeyInfo:

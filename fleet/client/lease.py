@@ -1,4 +1,4 @@
-"""The lease of a car: `with fleet.car("red").lease() as car`. The block's end stops the car if the lease is not lost.
+"""The lease of a car, `with fleet.car("red").lease() as car`. The block's end stops the car, if the lease is not lost.
 
 `Lease` acquires, renews and releases it. `LeaseMonitor` detects its loss from the gateway's messages (pure).
 """
@@ -91,7 +91,7 @@ class LeasingFleet(Protocol):
 
 
 class Lease(Generic[C_co]):
-    """A lease, made by `Car.lease`. Use it with `with`, which raises LeaseLost if another sender has the car."""
+    """A lease, made by `Car.lease`. Use it with `with`: entering raises LeaseLost if another sender has the car."""
 
     def __init__(self, fleet: LeasingFleet, name: str, leased: "Callable[[Lease[C_co]], C_co]", *, take: bool) -> None:
         """`leased` makes the car that the block gets."""
@@ -138,7 +138,7 @@ class Lease(Generic[C_co]):
         raise NotCarriedOut(outcome)
 
     def check(self) -> None:
-        """Raise LeaseLost if the lease is lost: leave the car to its new holder."""
+        """Raise LeaseLost if the lease is lost. The car then belongs to its new holder."""
         if self._monitor.lost:
             lost = self._monitor.lost
             raise LeaseLost(

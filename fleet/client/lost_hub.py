@@ -1,4 +1,7 @@
-"""Tells a hub that has ended from a fleet that does not run: gateways go on without a hub, and so may their cars."""
+"""Distinguishes a hub that has ended from a fleet that does not run.
+
+Gateways run on without a hub, and their cars may go on moving.
+"""
 
 from typing import Final
 
@@ -13,7 +16,7 @@ class LostHub(BusError):
 
 
 def describe_running(endpoint: str) -> str:
-    """Return a text that tells which gateways of this bus run on this computer, or an empty text if none does."""
+    """Return a text that names the gateways of this bus that run on this computer. Empty if none does."""
     cars = running_cars(endpoint)
     more = f" and {len(cars) - _MAX_CARS_NAMED} more" if len(cars) > _MAX_CARS_NAMED else ""
     return f"gateways run here ({', '.join(cars[:_MAX_CARS_NAMED])}{more}): cars may move" if cars else ""
@@ -25,6 +28,6 @@ def explained(error: NoFleet) -> BusError:
     if not running:
         return error
     return LostHub(
-        f"The hub at {error.endpoint} does not answer, but {running}. It is started again: repeat this in some "
-        "seconds. Else go to the cars, and restart `fleet up`."
+        f"The hub at {error.endpoint} does not answer, but {running}. The hub is being started again: repeat this in "
+        "a few seconds. Otherwise go to the cars, and restart `fleet up`."
     )

@@ -14,7 +14,7 @@ from schemas.words import Basis, Phase, Reason
 
 NO_ANSWER: Final = "no_answer"
 NO_RESULT: Final = "no_result"
-"""The code of a command whose last event is missing."""
+"""Code of a command whose last event is missing."""
 _STAYS: Final = (Reason.ESTOPPED, Reason.HELD)
 """Reasons of a resume after which the car is still stopped."""
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
@@ -22,9 +22,9 @@ _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED
 OUTCOME_MARGIN_S: Final = 5.0
 """Margin of the timeouts for a command's last event."""
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
-"""Timeout for a gateway to rejoin the bus: it tries twice a second."""
+"""Timeout for a gateway to rejoin the bus. A gateway tries to do so twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
-"""Timeout for the new gateway of a car, where a supervisor starts one: it takes 4 s to notice a hang."""
+"""Timeout for the new gateway of a car if a supervisor starts one. The supervisor takes 4 s to notice a hang."""
 OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
 """Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
 LATE_ANSWER_S: Final = 2.0
@@ -48,7 +48,7 @@ class Outcome:
 
     car: str
     ok: bool
-    """True if it was carried out: `sent`, or `complete` for commands that last."""
+    """True if the command was carried out: `sent`, or `complete` for commands that last."""
     phase: str
     """The last phase (`sent, complete, superseded, expired, failed, rejected, queued`), or `no_answer`."""
     reason: str = ""
@@ -60,7 +60,7 @@ class Outcome:
     took_s: float = 0.0
     """Time from the request until the outcome was known."""
     basis: str = ""
-    """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot.
+    """For a stop: `shown` if the car's readings show that it stands still, `sent` if they cannot.
 
     For a drive: `shown` if a reading shows that the car moved, `sent` if none does.
     """
@@ -105,7 +105,7 @@ class LeaseLost(NotCarriedOut):
 
 
 def bus_lost_words(car: str) -> str:
-    """Return the words of a stop that reached no gateway because the bus was lost."""
+    """Return the text for a stop that reached no gateway because the bus was lost."""
     return f"{NOT_STOPPED}: the fleet's bus does not answer. If {car} moves, go to the car."
 
 
@@ -129,15 +129,16 @@ class Progress:
         self._worst_case_s = 0.0
         self._queued = False
         self.waits = ""
-        """Why the command waits for its car, and how long at most, as the gateway said. Empty once its frame is out."""
+        """Why the command waits for its car, and for how long at most, in the gateway's words. Empty once its frame is
+        sent."""
         self._sent_event = False
         self._gone_at: float | None = None
         self._is_supervised = False
         self._foreign = ""
         self._unanswered = ""
-        """Why the last query of a stop has ended without an answer."""
+        """Why the last query of a stop ended without an answer."""
         self._bus_lost_until: float | None = None
-        """The time to give up a stop that nobody has answered since the bus was lost."""
+        """The time to give up on a stop without an answer after the bus was lost."""
 
     @property
     def is_awaited(self) -> bool:
@@ -152,7 +153,7 @@ class Progress:
     @property
     def _joined(self) -> bool:
         """True if the command extends a drive of the same sender. The end is then recorded under the earlier id."""
-        # Only the events tell, which come in order. The answer may arrive long before them.
+        # Decide by the events, because they come in order. The answer may arrive long before them.
         return self._until is Until.OVER and self._sent_event and not self._queued
 
     @property
@@ -190,7 +191,7 @@ class Progress:
             self._end(Phase.SENT, reason, words, at, ok=True)
 
     def on_event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float, basis: str = "") -> None:
-        """Handle one `event/command`. Only the last event of a stop or a drive has a basis."""
+        """Handle one `event/command`. `basis` is set only in the last event of a stop or a drive."""
         if phase == Phase.SENT and self._queued and not self._sent_event and self._until is Until.OVER:
             self._timeout_from = at
         self._sent_event = self._sent_event or phase == Phase.SENT
@@ -210,7 +211,7 @@ class Progress:
         self._end(NO_ANSWER, "", words, at, ok=False)
 
     def on_bus_lost(self, at: float, until: float) -> None:
-        """Note that the bus was lost before an answer to this stop. It is sent again until this time."""
+        """Note that the bus was lost before this stop was answered. The stop is sent again until the time `until`."""
         if self.outcome is None and not self.answered:
             self._bus_lost_until = until
             self.on_presence(at, alive=False)
@@ -226,10 +227,13 @@ class Progress:
         self._foreign = words
 
     def on_query_failed(self, words: str, at: float) -> None:
-        """Give up if the query has ended without an answer. Where a supervisor starts a new gateway, wait for that."""
+        """Give up if the query has ended without an answer.
+
+        If a supervisor starts a new gateway, wait for that gateway.
+        """
         if self._is_supervised and not self.answered:
             self.on_presence(at, alive=False)
-        elif self._verb in STOP_VERBS and not self.answered:  # gateway or bus may be back in a moment
+        elif self._verb in STOP_VERBS and not self.answered:  # the gateway or the bus may be back in a moment
             self._unanswered = f"{self._foreign}. {words}" if self._foreign else words
             self.on_presence(at, alive=False)
         else:
@@ -253,14 +257,14 @@ class Progress:
             self._give_up_unanswered(words, at)
 
     def on_presence(self, at: float, *, alive: bool) -> None:
-        """Note that the gateway's token came back, or disappeared: the gateway was killed or lost its bus."""
+        """Note that the gateway's token came back, or disappeared (the gateway was killed or lost its bus)."""
         if alive:
             self._gone_at = None
         elif self._gone_at is None:
             self._gone_at = at
 
     def give_up(self, at: float) -> None:
-        """End with an unknown outcome: the deadline has passed."""
+        """End because the deadline has passed. The outcome is unknown, except for a drive that was extended."""
         if self.awaits_bus:
             self._end(NO_ANSWER, "", bus_lost_words(self.car), at, ok=False)
             return
@@ -315,7 +319,8 @@ class Progress:
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop that no reading shows is in force, too
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if is_in_force else ""
-            # Of what was done, the gateway says only what is odd about it, often nothing. The effect has that, too.
+            # When a command was carried out, the gateway's words say only what is odd, and are often empty. The effect
+            # contains them.
             told = (effect or words) if ok else (words or effect)
             told = told or f"{self._verb or 'command'} {phase}"
             self.outcome = Outcome(

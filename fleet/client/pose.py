@@ -1,4 +1,4 @@
-"""Makes the message of a pose that a program has measured from outside of a car. Pure."""
+"""Makes the message of a pose that a program has measured from outside the car. Pure."""
 
 import math
 from typing import Any, Final
@@ -17,7 +17,7 @@ def pose_message(
     """Return a fleet.v1.Pose, with the heading between -pi and pi. Raises ValueError."""
     for name, value in {"x_m": x_m, "y_m": y_m}.items():
         low, high = _RANGES[name]
-        if not low <= value <= high:  # NaN is not, either
+        if not low <= value <= high:  # this also rejects NaN
             raise ValueError(f"{name} {value:g} is not allowed: {low:g} to {high:g} m from the origin of the frame")
     if not math.isfinite(heading_rad):
         raise ValueError(f"heading_rad {heading_rad:g} is not allowed: it is the direction of the car, rad")

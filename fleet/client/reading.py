@@ -27,10 +27,10 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def age_of_answer_s(stamp_s: float, now: float) -> float:
-    """Return the age of what a query returned, by its stamp. Both times: s since the epoch.
+    """Return the age of an answer to a query, by its stamp. Both times: s since the epoch.
 
-    At least 0, as clocks differ. Infinite if the stamp is far ahead: it is from before a wall clock was set back and
-    tells no age. The value may be old.
+    At least 0, as clocks differ. Infinite if the stamp is far ahead: then a wall clock was set back after it, and the
+    value may be of any age.
     """
     return inf if stamp_s - now > MAX_STAMP_AHEAD_S else max(0.0, now - stamp_s)
 
@@ -46,7 +46,7 @@ class Reading:
 
     key: str
     time: datetime
-    """The message's stamp, else its Zenoh timestamp, UTC."""
+    """The message's stamp, or its Zenoh timestamp if it has no stamp. UTC."""
     value: Any
     """The protobuf message, e.g. `fleet.v1.Range`. Optional fields that were not measured are not set."""
 

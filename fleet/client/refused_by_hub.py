@@ -1,4 +1,4 @@
-"""Tells whether a hub with certificates refuses us, which looks as if no car were connected."""
+"""Finds out whether a hub with certificates refuses us. To the client, this looks as if no car were connected."""
 
 from typing import Final
 
@@ -7,11 +7,11 @@ from schemas import keys
 from schemas.bus.passing_on import passes_on
 
 _LOOK_S: Final = 1.5
-"""Time for which the token is looked for: a hub whose rules have changed has everybody back after half a second."""
+"""Time to look for our token. After a change of its rules, a hub has everybody connected again within half a second."""
 
 
 def why_refused(client: Fleet) -> str:
-    """Return why the hub refuses everything to this client. Empty if it does not, or has no certificates."""
+    """Return why the hub refuses everything to this client. Empty if the hub does not, or has no certificates."""
     identity = client.bus.identity
     if not identity:
         return ""

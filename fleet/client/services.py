@@ -36,7 +36,7 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
 
 
 def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
-    """Yield the site and the fleet.v1.Recording of each recorder that says what it records. Strangers are skipped."""
+    """Yield the site and the fleet.v1.Recording of each recorder that answers. Skip answers of other programs."""
     for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
         if isinstance(answer, Failure) or not (site := keys.recorder_site(fleet, answer.key.removesuffix("/status"))):
             continue
@@ -45,7 +45,7 @@ def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
 
 
 def _recording(answer: Sample) -> Any:
-    """Return the fleet.v1.Recording in an answer. None if it is something else: on a plain bus, anybody may answer."""
+    """Return the fleet.v1.Recording in an answer. None for another answer: without certificates, anybody may answer."""
     with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
         found: Any = answer.message()
         return found if found.DESCRIPTOR.full_name == topics.TOPICS["@recorder/status"].message else None
@@ -60,9 +60,9 @@ def why_unrecorded(status: Any) -> str:
 
 
 def ask_coordinator(client: Fleet, verb: str, plan_text: str = "", sender: str = "") -> Any:
-    """Send a request to the coordinator. Return the first answer as of `send_command`, None if there is none.
+    """Send a request to the coordinator. Return the first answer that `send_command` yields, None if there is none.
 
-    verb: `plan`, with the text of the plan to set, or a PlanRequest. sender: if not the client.
+    verb: `plan`, with the text of the plan to set, or a PlanRequest. sender: who asks, if it is not the client.
     """
     by = sender or client.sender
     if verb == "plan":

@@ -12,7 +12,7 @@ from schemas.topics import Qos
 
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 MAX_GROUPS: Final = 64
-"""Maximum number of groups that are taken from a status: anybody may publish one."""
+"""Maximum number of groups that are used from a status. There is a limit because anybody may publish a status."""
 COLORS_TIMEOUT_S: Final = 0.5
 """Timeout for the colors of the cars: a supervisor that hangs must not delay a table."""
 
@@ -35,7 +35,7 @@ def fleets_on(bus: Bus) -> dict[str, set[str]]:
 
 
 def ask_cars(bus: Bus, fleet: str) -> list[Any]:
-    """Return the statuses as `ask_status` does, for the colors and groups of the cars: it waits for a short time."""
+    """Return the statuses as `ask_status` does, but wait only shortly. They have the colors and groups of the cars."""
     return ask_status(bus, fleet, COLORS_TIMEOUT_S)
 
 
@@ -45,7 +45,7 @@ def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
 
 
 def colors_of(status: Any) -> dict[str, Rgb]:
-    """Return the colors of the cars in a fleet.v1.Supervision. Skip what is not a color."""
+    """Return the colors of the cars in a fleet.v1.Supervision. Skip values that are not colors."""
     colors: dict[str, Rgb] = {}
     for car, color in status.colors.items():
         with suppress(ValueError):  # anybody may answer
@@ -54,6 +54,6 @@ def colors_of(status: Any) -> dict[str, Rgb]:
 
 
 def groups_of(status: Any) -> dict[str, Sequence[str]]:
-    """Return the cars of each group in a fleet.v1.Supervision, by name. Skip what is not a name."""
+    """Return the cars of each group in a fleet.v1.Supervision, by name. Skip invalid names."""
     named = sorted(name for name in status.groups if keys.is_name(name))
     return {name: [*filter(keys.is_name, status.groups[name].split(","))] for name in islice(named, MAX_GROUPS)}

@@ -1,4 +1,4 @@
-"""Waits until a condition holds of a reading, or has held for some time. Pure: readings and time are arguments."""
+"""Waits until a condition holds for a reading, or has held for some time. Pure: readings and time are arguments."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -27,11 +27,11 @@ class _LastMatch:
 
     at: datetime
     arrived_s: float | None
-    """When it was published, s, monotonic, or None if a query returned it."""
+    """When the reading was published, s, monotonic. None if a query returned it."""
     message: str
-    """Its type. Another one has other fields."""
+    """The message's type. Messages of another type have other fields."""
     holding: Holding | None
-    """Since when the condition holds. None if this type lacks its fields."""
+    """Measures for how long the condition has held. None if this type lacks the condition's fields."""
 
 
 class ConditionWait:
@@ -71,7 +71,8 @@ class ConditionWait:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
-        # What was published just now counts from when it came, as in `CarState`: clocks differ, and a replay is old.
+        # A reading that was published just now is fresh whatever its stamp, as in `CarState`: clocks differ, and the
+        # stamps of a replay are old.
         if holding is not None and arrived_s is None and reading.stale(now):
             holding.end()
         span = holding.span if holding is not None else None
