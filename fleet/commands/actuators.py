@@ -1,6 +1,6 @@
-"""`fleet led, light, servo, arm, speed, fan`, and the subcommands that a row of `schemas.commands` describes.
+"""`fleet led, light, servo, arm, speed, fan`, and subcommands that have no function here, such as `whistle`.
 
-Those of a row, such as `whistle` and `identify`, have no function here.
+The latter are made from their rows in `schemas.commands`.
 """
 
 import re
@@ -31,7 +31,7 @@ _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
 class _LightColor(Color):
-    """A color of the light, or any other color, which the LED has."""
+    """A color of the light, or any other color, which only the LED can show."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the request for the lamp that can show the color."""
@@ -47,12 +47,12 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Comman
         allowed = servo.moves
         words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo is Servo.FRONT else ''}"
         if action is None:
-            raise click.BadParameter(f"name what to do with {words}, as: fleet servo red {servo} {allowed[0]}")
+            raise click.BadParameter(f"say what {words} should do, as: fleet servo red {servo} {allowed[0]}")
         if action not in allowed:
             raise click.BadParameter(f"{action!r} is not allowed for {words}")
         return servo_request(servo, action)
     if servo is not Servo.FRONT:
-        raise click.BadParameter(f"{action!r} is not allowed: servo {servo} does not accept degrees, only front does")
+        raise click.BadParameter(f"{action!r} is not allowed: only servo front accepts degrees, servo {servo} does not")
     try:
         return servo_request(servo, deg=int(action))
     except ValueError as error:
@@ -65,7 +65,7 @@ def _arm(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tupl
     if not words:
         raise click.UsageError(missing_words(ctx), ctx)
     needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
-    if len(cars) > 1 and any(each.isdigit() for each in cars):  # rather a joint too many than a car of that name
+    if len(cars) > 1 and any(each.isdigit() for each in cars):  # a number among the cars is more likely a seventh joint
         cars, joints = words[:1], words[1:]
     for number, joint in enumerate(joints, start=1):
         if not re.fullmatch("[0-9]{1,3}", joint) or int(joint) > 180:
@@ -94,7 +94,7 @@ def _names(ctx: click.Context, words: tuple[str, ...]) -> tuple[str, ...]:
 @json_option
 @with_client
 def led(client: Fleet, cars: tuple[str, ...], color: tuple[int, int, int], *, as_json: bool) -> None:
-    """Set the color LED to any color. The light is another lamp with seven colors: see `fleet light`."""
+    """Set the color LED to any color. The light is a different lamp, with seven colors: see `fleet light`."""
     carry_out(client, led_request(*color), cars, as_json=as_json)
 
 
@@ -170,7 +170,7 @@ def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
 
 
 def _plain_command(row: CommandType) -> click.Command:
-    """Return the subcommand of a verb whose row in `schemas.commands` says all about it."""
+    """Return the subcommand of a verb. Its row in `schemas.commands` says everything that is needed."""
 
     @cars_argument
     @json_option
@@ -187,7 +187,7 @@ def _plain_command(row: CommandType) -> click.Command:
 
 
 def __getattr__(name: str) -> click.Command:
-    """Return the subcommand of that name that has no function here."""
+    """Return the subcommand of this name if it has no function here."""
     for row in COMMANDS.values():
         if row.subcommand == name:
             return _plain_command(row)

@@ -58,8 +58,8 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     found = [each for each in look_for(links, seconds) if each.verdict != LinkVerdict.BUSY and _unknown(each, fleet)]
     if not found:
         raise click.ClickException(
-            f"No new car found: all that answered are in {file} already. Is it switched on? "
-            "`fleet scan` shows what was seen."
+            f"No new car found: all cars that answered are in {file} already. Is the new car switched on? "
+            "`fleet scan` shows every link."
         )
     with (
         cli_errors(),
@@ -92,11 +92,11 @@ def _print_error(words: str) -> None:
 
 
 def _which(client: Fleet, name: str, file: Path) -> str:
-    """Make the car blink until the user types its name. Return the name, or `-` if the user gives it none."""
+    """Make the car blink, and ask for its name. Return the name, or `-` if the user gives none."""
     while True:
         outcome = client.car(name).find()
         if not outcome.ok:
-            click.echo(f"  it could not blink: {outcome.words or outcome.reason or outcome.phase}", err=True)
+            click.echo(f"  the car could not blink: {outcome.words or outcome.reason or outcome.phase}", err=True)
             return _NO_CAR
         fleet = read(file, unbound=True)
         listed = ", ".join([*fleet.unbound, *(car for car in fleet.cars if car not in fleet.unbound)])
@@ -107,13 +107,13 @@ def _which(client: Fleet, name: str, file: Path) -> str:
             continue
         if answer in fleet.cars:
             there = fleet.cars[answer].link
-            if not confirm(f"  {answer} has the link {there}. Give it this one?"):
+            if not confirm(f"  {answer} has the link {there}. Replace it with this one?"):
                 continue
         return answer
 
 
 def _write(file: Path, car: str, link: str) -> None:
-    """Write the link into the file as it is now."""
+    """Write the link into the file. Read the file again first, because somebody may have edited it."""
     try:
         write(file, set_link(read_text(file), file, car, link))
     except BadFile as error:

@@ -1,4 +1,4 @@
-"""`fleet check`: checks fleet files, plans and worlds, which it recognizes by their content."""
+"""`fleet check`: checks fleet files, plans and worlds. It recognizes the kind of a file by its content."""
 
 import json
 from collections.abc import Mapping
@@ -66,11 +66,11 @@ def check(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
 
     The command does not touch the cars. For a fleet file, it also checks the plan and the world in it, for the cars in
-    that file. It warns if a Bluetooth adapter has more cars than it can connect at once.
+    that file. It warns if a Bluetooth adapter has more cars than the adapter can connect at once.
     """
     checks = _Checks(as_json=as_json)
     kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}
-    for kind in FileKind:  # fleet files first: plans are checked for their cars
+    for kind in FileKind:  # fleet files first, because plans are checked for the cars in them
         for file in (each for each, its in kinds.items() if its is kind):
             checks.check(kind, file)
     raise SystemExit(int(checks.result))
@@ -84,7 +84,7 @@ class _Checks:
         self._as_json = as_json
         self._cars: _Cars = None
         self._simulated: list[str] = []
-        """The cars that can carry things of a world. If there are none here, any car can."""
+        """The cars that may carry things of a world. If the list is empty, any car may."""
         self._done: set[Path] = set()
 
     def recognize(self, file: Path) -> FileKind | None:
@@ -99,7 +99,7 @@ class _Checks:
         return recognize(text)
 
     def check(self, kind: FileKind, file: Path) -> None:
-        """Check one file, and those that it names."""
+        """Check one file, and the files that it names."""
         if file.resolve() in self._done:
             return
         self._done.add(file.resolve())
@@ -181,10 +181,17 @@ class _Checks:
 
 
 def recognize(text: str) -> FileKind:
-    """Return the kind of a file by its fields. Any other file counts as a fleet file, so that its errors are of one."""
+    """Return the kind of a file by its fields.
+
+    If no field is known, it counts as a fleet file, and is reported as one.
+    """
     try:
         found: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError):  # not a date, nested too deep: parsing names the place
+    except (
+        yaml.YAMLError,
+        ValueError,
+        RecursionError,
+    ):  # e.g. a bad date, or nested too deep: the parser will name the place
         found = None
     if not isinstance(found, dict):
         return FileKind.PLAN if text.lstrip().startswith(("roles:", "rules:")) else FileKind.FLEET

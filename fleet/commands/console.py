@@ -69,7 +69,7 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
 def listen_or_fail(port: int | None, other: str) -> socket.socket:
     """Return a socket that listens at this port, or at the default port if `port` is None. Raises ClickException.
 
-    other: this command, with `{other}` for the number of a neighboring port.
+    other: the command that the error proposes, with `{other}` in place of a free port's number.
     """
     port = DEFAULT_PORT if port is None else port
     try:
@@ -80,7 +80,7 @@ def listen_or_fail(port: int | None, other: str) -> socket.socket:
 
 
 async def _send_heartbeats(parent: int, address: str) -> None:
-    """Print the address each second for `fleet up`, and end with it."""
+    """Print the address each second for `fleet up`, and end when `fleet up` ends."""
     with suppress(OSError):  # nobody reads any more
         while not has_ended(parent):
             click.echo(json.dumps({"console": address}))
@@ -95,7 +95,7 @@ async def _send_heartbeats(parent: int, address: str) -> None:
     epilog="\b\nexamples:\n  fleet console --open\n  fleet console --as teacher --lan\n  fleet console pair group_a",
 )
 def console() -> None:
-    """Serve the fleet as a web page: watch, drive, STOP. Without a command, this is `fleet console serve`."""
+    """Serve the fleet as a web page: watch, drive, STOP. Without a subcommand: `fleet console serve`."""
 
 
 @console.command(
@@ -141,7 +141,7 @@ examples:
     type=click.Path(path_type=Path, dir_okay=False),
     default=Path("fleet.yaml"),
     show_default=True,
-    help="Let the page Set up write links into FILE.",
+    help="The page Set up writes links into FILE.",
 )
 @starter_option()
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
@@ -158,7 +158,7 @@ def serve_console(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Serve the page on this computer, until Ctrl-C. STOP is Escape on every page."""
+    """Serve the page on this computer, until Ctrl-C. On every page, the Escape key is STOP."""
     parent = watched_pid(starter)
     listener = listen_or_fail(port, "fleet console --port 0")
     address = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
@@ -212,13 +212,13 @@ examples:
 def pair(name: str | None, rank: str, connect: str | None, fleet: str) -> None:
     """Make a code that pairs one device with the console as the person NAME (default: you).
 
-    If the fleet file lists people, NAME must be one of them, and a lead only if the file says so. A console must
-    serve the network: `fleet console --lan`.
+    If the fleet file lists people, NAME must be one of them, and may be a lead only if the file says so. A console that
+    serves the network must be running: `fleet console --lan`.
     """
     person = PagePerson(name or _own_name(), rank)
     with cli_errors():
         people = PeopleFile(people_path(resolve_endpoint(connect), fleet))
-        if not people.is_served:  # a code would lead to a page that nobody serves
+        if not people.is_served:  # nobody serves the page to which the code would lead
             raise click.UsageError("No console serves the network now. `fleet console --lan` starts one.")
         try:
             _show_code(people, people.read().address, person)
@@ -268,19 +268,21 @@ def people(revoke: tuple[str, ...], *, as_json: bool, connect: str | None, fleet
 def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
     known = {word for each in file.read().devices for word in (each.id, each.person.name)}
     if missing := [name for name in names if name not in known]:
-        raise click.UsageError(f"No paired device is {missing[0]!r}. `fleet console people` lists them.")
+        raise click.UsageError(
+            f"No paired device has the id or person {missing[0]!r}. `fleet console people` lists them."
+        )
     for each in file.change(lambda book: book.revoke(names)):
         click.echo(f"{each.id} ({each.person.name}) is revoked. Its pages are closed.")
 
 
 def _network() -> Any:
-    from fleet.console import network_console  # its packages cost 0.1 s that only the network needs
+    from fleet.console import network_console  # importing its packages takes 0.1 s, and only --lan needs them
 
     return network_console
 
 
 def _people_of(file: Path) -> People:
-    """Return the people in a fleet file, none if it cannot be read."""
+    """Return the people in a fleet file. Nobody if the file cannot be read."""
     return people_table(read_people(file))
 
 
@@ -326,7 +328,7 @@ def _own_name() -> str:
 
 
 def _port_in_use(port: int, error: OSError) -> str:
-    """Return what uses a port of loopback, in words."""
+    """Return a text about the program that uses a port of loopback."""
     probe = http.client.HTTPConnection(LOOPBACK, port, timeout=_PROBE_TIMEOUT_S)
     try:
         probe.request("GET", "/hello")

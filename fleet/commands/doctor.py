@@ -23,9 +23,9 @@ from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean
 
 MAX_STOP_LINES: Final = 20
-"""Maximum stops that were not shown, a line each; --json lists all."""
+"""Maximum number of unshown stops that are printed, one per line. --json lists all."""
 MAX_FURTHER_FINDINGS: Final = 3
-"""Number of findings that stand on the line after the likely cause."""
+"""Maximum number of findings on the line after the likely cause."""
 
 
 @click.command(
@@ -45,14 +45,16 @@ Exit codes: 0 nothing is odd, 1 something is odd."""
 @json_option
 @bus_options
 def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Tell in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars.
+    """Say in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars.
 
     For a session, the command lists each stop that was not shown or did not stop its car: car, time and cause.
     """
     if name is not None and (session := _session_of(name)) is not None:
         _show_session(session, car or "", as_json=as_json)
     if car is not None:
-        raise click.UsageError(f'"{name}" is not a session, and a second name needs one: fleet doctor SESSION CAR')
+        raise click.UsageError(
+            f'"{name}" is not a session. Two names are a session and a car: fleet doctor SESSION CAR'
+        )
     named = (name,) if name is not None else ()
     with open_client(connect, fleet, named) as client:
         found = collect(client)
@@ -66,7 +68,7 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
     cars = list(found.values()) if name is None else [found[name]]
     odd = [diagnose(evidence, hint_options()) for evidence in cars]
     if name is None and not as_json:
-        # No finding of a car hides that nothing is recorded.
+        # Findings about the whole fleet come first, so that no finding about a car hides them.
         for finding in dict.fromkeys(each for findings in odd for each in findings if each.of_fleet):
             echo_safely(f"{fleet}: {finding}")
     for evidence, findings in zip(cars, odd, strict=True):

@@ -79,7 +79,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
 def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
     """Make cars act by themselves. `manual` ends every other mode, and the car waits for commands.
 
-    To stop cars, use `fleet stop`: after it a running plan leaves them alone.
+    To stop cars, use `fleet stop`: a running plan then leaves them alone.
     """
     carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
 
@@ -91,8 +91,8 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Stop these cars now, or all cars if you name none. A running plan leaves them alone until you drive or resume.
 
-    If there are several fleets on one bus, every fleet stops that could be meant. `fleet estop` also makes cars refuse
-    every command. `fleet mode CAR manual` stops without a hold.
+    If several fleets on the bus could be meant, all of them stop. `fleet estop` also makes cars refuse every command.
+    `fleet mode CAR manual` stops a car without a hold, so a plan may use it at once.
     """
     _stop(connect, fleet, cars, lambda _: stop_request(), as_json=as_json)
 
@@ -105,8 +105,8 @@ def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: boo
 def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
 
-    If there are several fleets on one bus, every fleet stops that could be meant. `fleet resume --estops` releases the
-    cars. For everyday use there is `fleet stop`, after which cars obey again at once.
+    If several fleets on the bus could be meant, all of them stop. `fleet resume --estops` releases the cars. For
+    everyday use there is `fleet stop`: after it, cars obey again at once.
     """
     _stop(
         connect,
@@ -118,7 +118,7 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
 
 
 def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
-    """Open the client. A hub that hangs must not read as a stop that was carried out."""
+    """Open the client. If that fails, say first that nothing was stopped."""
     try:
         return client_in(connect, fleet)
     except (LostHub, HubUnreachable) as error:
@@ -170,7 +170,7 @@ examples:
     "--all",
     "everything",
     is_flag=True,
-    help="End the hold and every emergency stop that you may end. Print what stays.",
+    help="End the hold and every emergency stop that you may end. Print which ones remain.",
 )
 @json_option
 @with_client
@@ -180,7 +180,7 @@ def resume(
     """Let the plan use stopped cars again: these cars, or all cars if you name none.
 
     --estops also releases emergency stops. The cars stay stopped and wait for a second `fleet resume`. An emergency
-    stop of the whole fleet ends for every car when it ends for one. Only a lead can end what a lead stopped.
+    stop of the whole fleet ends for every car when it ends for one. Only a lead can end a stop by a lead.
     """
     if estops and ids:
         raise click.UsageError("--estops releases every emergency stop: leave --id out")
@@ -192,10 +192,10 @@ def resume(
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)
     connected, by_ids = client.cars(), dict[tuple[str, ...], list[str]]()
-    for car in named:  # look at all before the first release: the release of one car may free the others
+    for car in named:  # look at all cars before the first release, because the release of one car may free the others
         in_force = _in_force(client, car)
         chosen = tuple(in_force if estops else [_complete_id(car, prefix, in_force) for prefix in ids])
-        if chosen or car not in connected:  # the outcome says that the car is missing
+        if chosen or car not in connected:  # for a missing car, the outcome says so
             by_ids.setdefault(chosen, []).append(car)
         else:
             click.echo(f"{car}: no e-stop is in force", err=True)
@@ -211,20 +211,20 @@ def _in_force(client: Fleet, car: str) -> list[str]:
 
 
 def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
-    """Return the id with this prefix. The gateway rejects an id that is not an e-stop of its car."""
+    """Return the id with this prefix, or the prefix itself if none has it. The gateway then rejects it."""
     found = [each for each in in_force if each.startswith(prefix)]
     if len(found) > 1 and prefix not in found:
-        raise click.UsageError(f"--id {prefix}: several e-stops of {car} begin so: {', '.join(found)}")
+        raise click.UsageError(f"--id {prefix}: several e-stops of {car} begin with that: {', '.join(found)}")
     return prefix if prefix in found or not found else found[0]
 
 
 def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
-    """Return the cars. None for all: one query reaches them at once, also cars that have just connected."""
+    """Return the cars, or None for all. One query then reaches all at once, also cars that have just connected."""
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
 
 
 def _strangers(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
-    """Ask the cars that are named beside `all` and are not connected. The outcome names the likely car."""
+    """Send the request to cars that are named beside `all` but are not connected. The outcome names the likely car."""
     wrong = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
     connected = client.cars() if wrong else ()
     wrong = [each for each in wrong if each not in connected]

@@ -16,7 +16,7 @@ from schemas.suggestion import did_you_mean
 
 _KINDS: Final = ("programs", "fleets", "plans", "worlds")
 _SUFFIXES: Final = (".py", ".ipynb", ".yaml")
-# A fleet file names its plan and world in the folders beside its own. All copies lie in one folder.
+# A fleet file names its plan and world by folders beside its own. The copies all lie in one folder, without these.
 _OTHER_FILE: Final = re.compile(r"\.\./((?:plans|worlds)/[\w.-]+\.yaml)")
 
 
@@ -36,7 +36,7 @@ def summary(path: Path) -> str:
 
 
 class ExampleName(click.ParamType[Path]):
-    """The name of an example: `1-patrol`, or the file's: `1-patrol.yaml`, `plans/1-patrol.yaml`."""
+    """The name of an example, such as `1-patrol`. The name of its file is accepted, too: `plans/1-patrol.yaml`."""
 
     name = "NAME"
 
@@ -95,8 +95,8 @@ def show(path: Path) -> None:
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
 def copy(path: Path, directory: Path, *, force: bool) -> None:
     """Copy an example into DIR (default: here), with the plan and the world that a fleet file names."""
-    if directory.suffix == path.suffix:  # or a directory of the name plan.yaml would be created
-        raise click.UsageError(f"{directory} is the name of a file: give a directory, or nothing for this one")
+    if directory.suffix == path.suffix:  # otherwise a directory with the name plan.yaml would be created
+        raise click.UsageError(f"{directory} is the name of a file: give a directory, or nothing for the current one")
     text = path.read_text(encoding="utf-8")
     copies = {directory / path.name: _OTHER_FILE.sub(lambda match: Path(match[1]).name, text)}
     for other in _OTHER_FILE.findall(text) if path.parent.name == "fleets" else ():

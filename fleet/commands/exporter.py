@@ -20,8 +20,8 @@ examples:
   fleet exporter --address 192.168.1.2 --port 9478
   fleet exporter --dashboard > grafana.json
 
-Prometheus reads http://127.0.0.1:9478/metrics. Everyone who reaches the address may read the metrics, and nobody can
-command a car there."""
+Prometheus reads http://127.0.0.1:9478/metrics. Everyone who can reach the address may read the metrics.
+Nobody can command a car there."""
 )
 @serving_options(DEFAULT_EXPORTER_PORT)
 @click.option("--dashboard", "prints_board", is_flag=True, help="Print a dashboard for Grafana, and exit.")
@@ -38,7 +38,7 @@ def exporter(*, port: int, address: str, prints_board: bool, connect: str | None
         try:
             port, close = served.serve(address, port)
         except OSError as error:
-            hint = " `fleet exporter --port 0` takes any." if error.errno == errno.EADDRINUSE else ""
+            hint = " `fleet exporter --port 0` uses any free port." if error.errno == errno.EADDRINUSE else ""
             words = f"{address}:{port} cannot be used: {error.strerror or error}.{hint}"
             raise click.ClickException(words) from None
         click.echo(f"Metrics: http://{address}:{port}/metrics (Ctrl-C ends it)")

@@ -1,4 +1,4 @@
-"""`fleet find`: when a condition held, in all sessions."""
+"""`fleet find`: searches all sessions for the times at which a condition held."""
 
 import json
 import shlex
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fleet.recording.tools.find import Found, Hit
 
 MAX_FOR_S: Final = 86_400.0
-"""Maximum of --for: recordings of lessons and demos are no longer than a day."""
+"""Maximum of --for. Recordings of lessons and demos are not longer than a day."""
 FIELDS: Final = ("session", "path", "car", "from", "to", "length_s", "mode", "command", "open", "link")
 """Fields of a hit as JSON and CSV."""
 _COLUMNS: Final = ("session", "car", "from", "to", "length", "mode", "last command")
@@ -49,7 +49,7 @@ Exit codes: 0 there is a hit, 1 there is none, or a session with a hit could not
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @car_option
 @click.option(
-    "--for", "for_s", type=Duration(MAX_FOR_S), default=None, help="Print a hit only if it lasted for so long."
+    "--for", "for_s", type=Duration(MAX_FOR_S), default=None, help="Print a hit only if it lasted at least this long."
 )
 @click.option(
     "--since", metavar="TIME", help="Search from TIME on: monday, yesterday 14:05, 14:05, a date, or 1h (one hour ago)."
@@ -71,8 +71,8 @@ def find(
     """Find when CONDITION held, in every session in DIR (default: sessions).
 
     CONDITION is written as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is
-    unknown. A hit lasts from the first reading that shows it to the last one. The quota does not remove
-    marked sessions.
+    unknown. A hit lasts from the first reading for which CONDITION is true to the last one. With --mark, the quota does
+    not remove the sessions.
     """
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")
@@ -101,13 +101,13 @@ def find(
         most_s = max((answer.longest_s for _, answer in answers), default=-1.0)
         how_long = "" if most_s < 0 else f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)}"
         after = f" since {since}" if since is not None else ""
-        raise click.ClickException(f"{expression} was never true{how_long} in the sessions of {place}{after}.")
+        raise click.ClickException(f"{expression} was never true{how_long} in the sessions in {place}{after}.")
 
 
 def _answers(
     place: Path, expression: "Expression", cars: tuple[str, ...], for_s: float, since_ns: int
 ) -> Iterator[tuple[Path, "Found"]]:
-    """Yield each session with what was found in it. What could not be searched is named on stderr."""
+    """Yield each session with its hits. Print on stderr what could not be searched."""
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.find import find_in
     from fleet.recording.tools.summary import of_session
@@ -131,7 +131,7 @@ def _answers(
             yield path, found
             for words in found.left_out.words():
                 echo_safely(f"{path.name}: not searched: {words}", err=True)
-        # A file that cannot be read may be younger than the rest.
+        # A file that cannot be read may be newer than the others, so report it even if the session was not searched.
         if words := session.damage_words or (about.words if is_searched else ""):
             echo_safely(f"{path.name}: only what is intact was searched: {words}", err=True)
     if there and (missing := sorted({*cars} - there)):
@@ -148,7 +148,7 @@ def _marked(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
         count = "1 hit" if len(some) == 1 else f"{len(some)} hits"
         text = f"{expression}: {some[0].car}, {count}"[:MAX_MARK_CHARACTERS]
         try:
-            # The same question tomorrow finds its mark: so the author is the person, without the process.
+            # The author is the person without the process, so that the same search finds its own mark again tomorrow.
             add_mark(path, some[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
         except (NoMark, OSError) as error:
             words = error.strerror if isinstance(error, OSError) else error
@@ -176,13 +176,13 @@ def _to_dict(path: Path, hit: "Hit") -> dict[str, object]:
 
 
 def _link(path: Path, hit: "Hit") -> str:
-    """Return where a running `fleet console` with its usual port shows the hit on the time line."""
+    """Return the address at which a running `fleet console` with its default port shows the hit on the time line."""
     at = time_spec.iso(hit.begin_ns)
     return f"http://127.0.0.1:{DEFAULT_PORT}/#/time?session={quote(path.name, safe='')}&at={at}"
 
 
 def _open_command(path: Path, hit: "Hit") -> str:
-    """Return a command that a person may paste. It leaves out a name that no car can have, whoever recorded it."""
+    """Return a command that a person may paste. Leave out a recorded name that no car can have: it may be an attack."""
     place = str(path) if not str(path).startswith("-") else f"./{path}"
     car = f" --car {hit.car}" if keys.is_name(hit.car) else ""
     return f"fleet replay {shlex.quote(place)}{car} --from {with_offset(hit.begin_ns)}"

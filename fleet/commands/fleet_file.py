@@ -1,4 +1,4 @@
-"""`fleet init, check, schema`: writes, checks and describes fleet files. Nothing here moves a car."""
+"""`fleet init, schema`: writes and describes fleet files. Has parts for commands that read them. Moves no car."""
 
 import json
 import re
@@ -113,7 +113,7 @@ def init(
 ) -> None:
     """Write a fleet file: look for cars and ask for their names, or simulate cars."""
     if simulated and links:
-        raise click.UsageError("--sim and --link do not go together: name one")
+        raise click.UsageError("--sim and --link exclude each other: give one of them")
     with cli_errors():
         for link in links:
             validate_link(link)
@@ -136,7 +136,7 @@ def init(
         cars = _likely_cars(found) if yes else _prompt_cars(found)
     if not cars:
         raise click.ClickException(
-            "No car found. Is it on and in range? `fleet scan` shows what was seen.\n"
+            "No car found. Is the car on and in range? `fleet scan` shows every link.\n"
             "Wi-Fi cars: add --link tcp://HOST:8888. No car at hand? `fleet init --sim 3`"
         )
     text = format_new_file(cars)
@@ -144,7 +144,7 @@ def init(
         parse_fleet(text, out)
     except BadFile as error:
         print_errors(error)
-        raise click.ClickException("nothing was written: two links may be one port") from None
+        raise click.ClickException("nothing was written: two of the links may be the same port") from None
     write(out, text)
     names = list_words([car.name for car in cars])
     click.echo(f"Wrote {out}{f' and {plan}' if simulated else ''} with {names}. Next, type:")
@@ -206,15 +206,15 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
 
 
 def prompt_name(words: str, offered: str | None, taken: set[str], instead: str = "") -> str:
-    """Prompt for an unused name of a car, or `-`. `instead` is what to type where nobody can answer."""
+    """Prompt for an unused name of a car, or `-`. `instead` is the command to propose if nobody can answer."""
 
     def check_name(name: str) -> str:
         name = name.strip()
         if name in taken:
-            raise click.UsageError(f"{name} is another car's name already")
+            raise click.UsageError(f"{name} is already the name of another car")
         likely = re.sub("[^a-z0-9_]+", "-", name.lower()).strip("-_")
         if name != likely and name != _SKIP and keys.is_name(likely):
-            raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}. Such as {likely}.')
+            raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}, such as {likely}.')
         return name if name == _SKIP else _checked(validate_car_name)(name)
 
     name: str = prompt(words, default=offered, value_proc=check_name, instead=instead)
@@ -222,7 +222,7 @@ def prompt_name(words: str, offered: str | None, taken: set[str], instead: str =
 
 
 def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str], instead: str = "") -> str:
-    """Prompt until the answer is valid. Raises click's error, with `instead` as the way out, if the input ends."""
+    """Prompt until the answer is valid. If the input ends, raise click's error, which proposes `instead`."""
     while True:
         try:
             return value_proc(click.prompt(words, default=default, type=str))
@@ -233,7 +233,7 @@ def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str],
 
 
 def confirm(words: str, instead: str = "") -> bool:
-    """Ask for yes or no. Raises click's error, with `instead` as the way out, if the input ends."""
+    """Ask for yes or no. If the input ends, raise click's error, which proposes `instead`."""
     try:
         return click.confirm(words)
     except click.Abort as error:
@@ -241,7 +241,7 @@ def confirm(words: str, instead: str = "") -> bool:
 
 
 def _unanswered(error: click.Abort, instead: str) -> click.Abort | click.ClickException:
-    """Return the error to raise where a question got no answer. Ctrl-C stays what it is."""
+    """Return the error for a question without an answer. After Ctrl-C, return the same Abort."""
     if isinstance(error.__context__, KeyboardInterrupt):
         return error
     click.echo()

@@ -1,4 +1,4 @@
-"""Which fleet a command means, where several are on one bus and nobody has named one."""
+"""Finds the fleet that a command means, if several are on one bus and the user has not named one."""
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -17,20 +17,20 @@ from schemas.words import Rank
 
 
 def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
-    """Return the fleets that a command for these cars could mean if it names none: at least `fleet`, the default."""
+    """Return the fleets that a command for these cars could mean if it names no fleet. The default is `fleet`."""
     found = fleets_on(bus)
     if len(found) < 2:
         return [fleet]
-    if click.get_current_context(silent=True) is not None:  # not in the thread of a stop
+    if click.get_current_context(silent=True) is not None:  # the thread of a stop has no context
         name_fleet_in_hints()
     wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
     return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
 
 
 def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
-    """Return the one fleet that a command means. If it could mean several, ask at a terminal, else fail.
+    """Return the one fleet that a command means. If it could mean several, ask the user at a terminal.
 
-    Raises click.UsageError.
+    Without a terminal, raise click.UsageError.
     """
     could = [fleet] if is_named() else candidates(bus, fleet, cars)
     if len(could) == 1:
@@ -60,7 +60,7 @@ def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
 
 
 def _opened(connect: str | None, fleet: str, choose: Callable[[Bus], str]) -> Fleet:
-    """Open a client in the fleet that is chosen by what is on the bus."""
+    """Open a client. `choose` gets its bus, and returns the name of the fleet to use."""
     client = client_in(connect, fleet)
     try:
         name = choose(client.bus)
@@ -75,7 +75,7 @@ def _opened(connect: str | None, fleet: str, choose: Callable[[Bus], str]) -> Fl
 
 
 def _only_fleet(bus: Bus, fleet: str, first: str) -> str:
-    """Return this fleet. Fail if a key expression that begins with this chunk could be of another one."""
+    """Return this fleet. Fail if a key expression that begins with `first` could mean another fleet, too."""
     if not (is_named() or first in ("**", fleet)):
         could = candidates(bus, fleet, [first] if first and not set(first) & set("*$") else ())
         if could != [fleet]:
@@ -112,6 +112,6 @@ def in_all_fleets(
     if found:
         name_fleet_in_hints()
     both = [*own, *found]
-    # A car that is in one fleet only is missing in the others.
+    # A car that is in only one fleet has no answer in the others. Leave these outcomes out.
     answered = {each.car.rpartition("/")[2] for each in both if each.phase != NO_ANSWER}
     return [each for each in both if each.phase != NO_ANSWER or each.car.rpartition("/")[2] not in answered]

@@ -1,4 +1,4 @@
-"""`fleet foxglove`: the fleet live in Foxglove."""
+"""`fleet foxglove`: shows the fleet live in Foxglove."""
 
 import threading
 from contextlib import closing
@@ -23,8 +23,8 @@ examples:
   fleet foxglove --layout > layout.json
   fleet foxglove --address 192.168.1.2 --port 8766
 
-In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. Everyone who reaches the address may look, and
-nobody can command a car there."""
+In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. Everyone who can reach the address may look.
+Nobody can command a car there."""
 )
 @serving_options(DEFAULT_FOXGLOVE_PORT)
 @click.option(
@@ -42,7 +42,7 @@ def foxglove(*, port: int, address: str, prints_layout: bool, connect: str | Non
         try:
             server = FoxgloveServer(client, address, port)
         except PortInUse as error:
-            hint = "`fleet foxglove --port 0` takes any port."
+            hint = "`fleet foxglove --port 0` uses any free port."
             raise click.ClickException(f"{address}:{port} cannot be used: {error}. {hint}") from None
         with closing(server):
             click.echo(f"Foxglove: ws://{address}:{server.port} (Ctrl-C ends it)")

@@ -15,8 +15,8 @@ examples:
   fleet scan --probe             # also send a stop, which wakes silent cars: every car that is found stops
   fleet scan --json > report.json
 
-Opening a USB port can reset an Arduino. `fleet scan` does not search for TCP cars, because the end of a connection
-ends their program."""
+Opening a USB port can reset an Arduino. `fleet scan` does not search for TCP cars, because their program ends
+when a connection to it ends."""
 )
 @click.option("--link", "links", multiple=True, metavar="URL", help="Look only at this link. Repeatable.")
 @click.option("--for", "listen", metavar="DURATION", help="How long to listen at each port (default: 6s).")

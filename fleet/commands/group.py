@@ -1,4 +1,4 @@
-"""Parts that the group of commands and the commands share. Imports no command and no bus, so that help is fast."""
+"""Parts that the group of commands and its commands share. Imports no command and no bus, so that help is fast."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +12,10 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.suggestion import did_you_mean
 
 PERSON: Final = "fleet.person"
-"""Key of the value of --as in the context."""
+"""Key in click's context under which the value of --as is stored."""
 _BUS: Final = "fleet.bus"
 _NAMED: Final = "fleet.named"
-"""Key of the chosen bus and fleet in the context."""
+"""Key in the context: True if proposed commands must name the fleet."""
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -37,7 +37,8 @@ class CommandGroup(click.Group):
 class DefaultCommandGroup(CommandGroup):
     """A group with a command that may be left out: `fleet sessions DIR` is `fleet sessions list DIR`.
 
-    A first word with another word behind it is a command, because a default command takes one word at most.
+    If another word follows the first one, the first one must be a command, because a default command accepts at most
+    one word.
     """
 
     def __init__(self, *arguments: Any, default_command: str, **settings: Any) -> None:
@@ -74,20 +75,20 @@ def connect_option(
 
 
 def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
-    """Return the option --fleet. Without a default the fleet file has the name."""
+    """Return the option --fleet. Without a default, the name comes from the fleet file."""
     words = "Name of the fleet." if default else f"Name of the fleet (default: the file's, or {DEFAULT_FLEET})."
     return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)
 
 
 def choose_fleet(connect: str | None, fleet: str) -> None:
-    """Remember by which options the user reaches the fleet, for the commands that messages propose."""
+    """Remember with which options the user reaches the fleet. Commands that messages propose get the same options."""
     click.get_current_context().meta[_BUS] = connect, fleet
     if is_named():
         name_fleet_in_hints()
 
 
 def name_fleet_in_hints() -> None:
-    """Name even the default fleet in the commands that messages propose: there are several, or the user named it."""
+    """From now on, name even the default fleet in proposed commands: there are several fleets, or the user named it."""
     click.get_current_context().meta[_NAMED] = True
 
 
@@ -102,7 +103,7 @@ def is_named() -> bool:
 
 
 def hint_options(fleet: str = "") -> str:
-    """Return the options that a proposed command needs. `fleet` is given if it is not that of the running command."""
+    """Return the options that a proposed command needs. `fleet` is empty for the running command's own fleet."""
     context = click.get_current_context(silent=True)
     known = context.meta if context is not None else {}
     connect, chosen = known.get(_BUS, (None, DEFAULT_FLEET))
@@ -110,18 +111,18 @@ def hint_options(fleet: str = "") -> str:
 
 
 def say(words: str, *, err: bool = False, fleet: str = "") -> None:
-    """Print words for a person. Each command that they propose gets the options that it needs."""
+    """Print a text for a person. Add to each command that it proposes the options that the command needs."""
     click.echo(complete_hints(words, hint_options(fleet)), err=err)
 
 
 def starter_option() -> _Decorator:
     """Return the hidden option of `schemas.process.parent.parent_option`."""
-    words = "End with this process, which started this one."
+    words = "End when this process ends: it started this one."
     return click.option("--parent", "starter", metavar="PID", type=int, hidden=True, help=words)
 
 
 def as_option(complete: Callable[..., list[str]] | None = None) -> _Decorator:
-    """Return the option --as. `chosen_person` has its value, before the command and after it."""
+    """Return the option --as, which may stand before or after the command. `chosen_person` returns its value."""
     return click.option(
         "--as",
         metavar="PERSON",

@@ -35,9 +35,10 @@ DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
 MAX_JOIN_LINE: Final = 500
 """Maximum characters of the line that `fleet join -` reads."""
 HUB_RESTART_S: Final = 2.0
-"""Time in which gateways are back after a restart of the hub: half a second for it to look, and 0.5 s for a retry."""
+"""Time within which gateways are back after new rules: the hub looks for them every 0.5 s, gateways retry every 0.5
+s."""
 SITE_RULES_S: Final = 5.0
-"""The same at another site, whose hub asks for the rules every two seconds."""
+"""The same at another site. Its hub asks for the rules every two seconds."""
 
 
 @click.group(
@@ -51,7 +52,7 @@ examples:
 """,
 )
 def hub() -> None:
-    """Make this computer the hub of several computers. Certificates prove who everybody is."""
+    """Make this computer the hub of several computers. Certificates prove the identity of everybody."""
 
 
 @hub.command(epilog="\b\nexamples:\n  fleet hub init\n  fleet hub init --car red")
@@ -63,7 +64,7 @@ def hub() -> None:
     "services",
     multiple=True,
     type=click.Choice([each.value for each in Service]),
-    help="Run this service here again, although another computer was invited for it.",
+    help="Run this service here again, although another computer was invited to run it.",
 )
 @click.option("--local", is_flag=True, help="Listen on loopback only, as `fleet up --secure` does.")
 def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> None:
@@ -81,9 +82,9 @@ def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> No
         store = local_hub.ensure_hub_here(endpoint, take=take, listens=(listens,))
     name = store.credentials.me.partition(".")[2]
     click.echo(
-        f"This computer is a hub now, and you are {name} there. Its authority is in {store.directory}: keep a copy of "
-        "ca.key and ca.pem in a safe place.\n`fleet up` starts it. `fleet hub invite NAME` lets the computer of a "
-        "person join, and `fleet hub invite --car NAME` one with a car."
+        f"This computer is a hub now, and you are {name} there. Its certificate authority is in {store.directory}: "
+        "keep a copy of ca.key and ca.pem in a safe place.\n`fleet up` starts it. `fleet hub invite NAME` lets "
+        "the computer of a person join, and `fleet hub invite --car NAME` a computer with a car."
     )
 
 
@@ -157,7 +158,7 @@ def invite(
         if car and invited in store.known:
             _stop_first(endpoint, car)
         with cli_errors(), _disk_errors():
-            store.reserve(invited)  # an earlier certificate ends, so not before this computer listens
+            store.reserve(invited)  # this ends an earlier certificate, so do it only when this computer listens
         if port != JOIN_PORT:
             here = f"{here}:{port}"
         if as_json:
@@ -207,18 +208,25 @@ def config() -> None:
 @hub.command(epilog="\b\nexamples:\n  fleet hub revoke person.mia\n  fleet hub revoke car.red")
 @click.argument("who", metavar="IDENTITY")
 def revoke(who: str) -> None:
-    """Deny everything to an identity from now on. The hub restarts, and all others are back after a second."""
+    """Deny everything to an identity from now on. The hub restarts.
+
+    Everybody else is connected again after a second.
+    """
     with cli_errors(), _disk_errors():
         store = _own_store(resolve_endpoint())
         if who == store.credentials.me:
-            raise click.UsageError(f"{who} is you, on the hub's own computer: nobody could undo it")
+            raise click.UsageError(f"{who} is you, on the hub's own computer: nobody could undo this")
         role, name = identity.parse(who) or (None, "")
         if role is IdentityRole.CAR and who in store.known:
             _stop_first(store.credentials.endpoint, name)
         if not store.revoke(who):
             there = ", ".join(name for name, each in sorted(store.known.items()) if not each.revoked)
             raise click.UsageError(f"{printable(who)} has no certificate. There are: {there}")
-    words = " What that person drove may still move: stop it with `fleet stop`." if role is IdentityRole.PERSON else ""
+    words = (
+        " Cars that this person drove may still move: stop them with `fleet stop`."
+        if role is IdentityRole.PERSON
+        else ""
+    )
     click.echo(f"{who} is revoked.{words}")
 
 
@@ -236,16 +244,15 @@ examples:
     "--at",
     "site",
     metavar="HOST[:PORT]",
-    help="Use the hub of a site at this address. On the computer of that hub it is 127.0.0.1.",
+    help="Use the hub of a site at this address. On that hub's own computer: 127.0.0.1.",
 )
 def join_hub(words: tuple[str, ...], site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.
 
-    Without HOST, the command searches for the hub in this network. It finds the right hub by the code. With -
-    instead of both, it reads HOST and CODE from stdin, for example from a camera: `fleet hub invite --qr` draws them.
-
-    From then on all your programs use that hub, until `fleet leave`. With the code of `fleet hub invite --site`, this
-    computer becomes the hub of another site, which is linked to the first one.
+    Without HOST, the command searches for the hub in this network. It finds the right hub by the code. With - instead
+    of HOST and CODE, it reads them from stdin, for example from a camera: `fleet hub invite --qr` draws them. All your
+    programs then use that hub, until `fleet leave`. With the code of `fleet hub invite --site`, this computer becomes
+    the hub of another site, which is linked to the first one.
     """
     with cli_errors(), _disk_errors():
         host, code = _host_and_code(words)
@@ -289,13 +296,13 @@ def leave() -> None:
             )
         endpoint, kept = local_hub.leave()
     if not endpoint:
-        raise click.ClickException("this computer has joined no hub")
+        raise click.ClickException("this computer has not joined a hub")
     words = f"; its authority stays in {kept}, for the next `fleet up --secure`" if kept else ""
     click.echo(f"{endpoint} is no longer used{words}")
 
 
 def _host_and_code(words: tuple[str, ...]) -> tuple[str, str]:
-    """Return host, empty if none was given, and code. Raises click.UsageError."""
+    """Return the host (empty if none was given) and the code. Raises click.UsageError."""
     if words == ("-",):
         words = tuple(sys.stdin.readline(MAX_JOIN_LINE).split())
     words = words[2:] if words[:2] == ("fleet", "join") else words
@@ -313,7 +320,7 @@ def _address(written: str, default: int) -> tuple[str, int]:
 
 
 def _describe_cars_on(endpoint: str, within_s: float) -> str:
-    """Return which cars are on, in a sentence. The hub may be restarting with its new rules just now, or be off."""
+    """Return a sentence about the cars that are on. Retry for `within_s`, because the hub may be restarting."""
     deadline = time.monotonic() + within_s
     while True:
         is_last = time.monotonic() > deadline
@@ -344,10 +351,10 @@ def _stop_first(endpoint: str, car: str) -> None:
             while not (outcome := client.car(car).stop()).ok and time.monotonic() < deadline:
                 time.sleep(0.1)
     except BusError as error:
-        click.echo(f"{car} was not stopped before: {error}", err=True)
+        click.echo(f"{car} was not stopped: {error}", err=True)
         return
     if outcome.ok:
-        click.echo(f"{car} is stopped first: its gateway loses the bus.", err=True)
+        click.echo(f"{car} was stopped first, because its gateway loses the bus now.", err=True)
     else:
         click.echo(f"NOT STOPPED: {car}: {outcome.words} Its gateway loses the bus now: go to the car.", err=True)
 
@@ -356,10 +363,10 @@ def _own_store(endpoint: str) -> HubStore:
     if not is_secure(endpoint) or not (store := HubStore.of(endpoint)).is_hub:
         if is_secure(endpoint) and (first := Credentials.of(endpoint).first_hubs):
             raise click.ClickException(
-                f"This computer is the hub of another site: these commands are for the computer of {first[0]}."
+                f"This computer is the hub of another site: use these commands on {first[0]}, the main hub."
             )
         raise click.ClickException(
-            f"This computer is not a hub ({endpoint}). `fleet hub init` makes it a hub. Only a hub has these commands."
+            f"This computer is not a hub ({endpoint}). `fleet hub init` makes it one. Only a hub has these commands."
         )
     return store
 
@@ -369,7 +376,7 @@ def _links(store: HubStore) -> dict[str, list[str]]:
     try:
         found = json.loads((store.directory / LINKS_FILE).read_text(encoding="utf-8"))
         return {str(name): [str(each) for each in addresses] for name, addresses in found.items()}
-    except (OSError, ValueError, AttributeError, TypeError):  # it only informs
+    except (OSError, ValueError, AttributeError, TypeError):  # the list is only for information
         return {}
 
 

@@ -28,11 +28,11 @@ from schemas.suggestion import did_you_mean
 from schemas.words import Phase, RecorderVerb, RunState
 
 FLEET_DOWN_TIMEOUT_S: Final = 120.0
-"""Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
+"""Timeout for the shutdown: enough for the longest stop of a car, and for a recorder that writes its buffers."""
 SUPERVISOR_LOST_S: Final = 10.0
-"""Time without a status and without a token after which the supervisor has ended.
+"""Time without a status and without a token after which the supervisor counts as ended.
 
-On a machine that stalls, Zenoh ends a session after 2 s, and its tokens are gone until it is open again.
+On a machine that stalls, Zenoh ends a session after 2 s. Its tokens are then gone until the session is open again.
 """
 FLEET_DOWN_POLL_S: Final = 0.2
 LOG_POLL_S: Final = 0.2
@@ -79,7 +79,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
 
 
 def _warning_of_recorder(bus: Bus, fleet: str) -> str:
-    """Return what the recorder warns of, such as a quota that marked sessions exceed. Empty if there is none."""
+    """Return the recorder's warning, such as that marked sessions exceed the quota. Empty if there is none."""
     found = ask_recorder(bus, fleet, RecorderVerb.STATUS)
     return "" if found is None or isinstance(found, Failure) else str(found.warning)
 
@@ -168,7 +168,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 
 def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return the cars and services that have a log, of the last run here, for the shell."""
+    """Return, for the shell, the cars and services that have a log of the last run here."""
     fleet = ctx.params.get("fleet") or ctx.find_root().params.get("fleet") or keys.DEFAULT_FLEET
     connect = ctx.params.get("connect") or ctx.find_root().params.get("connect")
     with suppress(click.ClickException, ValueError, OSError):
@@ -186,7 +186,7 @@ def _logged(directory: Path) -> list[str]:
 @json_option
 @bus_options
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:
-    """Show what a car's gateway or a service has logged, in the current or last run.
+    """Show the log of a car's gateway or of a service, from the current or the last run.
 
     Services: supervisor, hub, simulator, coordinator, recorder.
     """
@@ -214,7 +214,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
                 if Path(each.directory).is_dir():
                     return Path(each.directory)
     except BusError:
-        pass  # nothing is up: the logs are files
+        pass  # nothing runs, but the logs are files
     return _last_run(connect, fleet)
 
 

@@ -17,7 +17,7 @@ from fleet.commands.options import bus_options
 from fleet.commands.output import echo_safely
 
 PASSWORD_VARIABLE: Final = "FLEET_MQTT_PASSWORD"  # noqa: S105 - its name
-"""Not an option: everybody on this computer may read a command line."""
+"""The password is not an option, because everybody on this computer can read a command line."""
 
 
 @click.command(
@@ -26,7 +26,7 @@ examples:
   fleet mqtt
   FLEET_MQTT_PASSWORD=... fleet mqtt --broker mqtts://home.example --user cars
 
-Home Assistant shows each car by itself. Nothing that comes by MQTT commands a car."""
+Home Assistant adds a device for each car without any setup. No message over MQTT can command a car."""
 )
 @click.option(
     "--broker",
@@ -35,7 +35,7 @@ Home Assistant shows each car by itself. Nothing that comes by MQTT commands a c
     show_default=True,
     help="URL of the broker: mqtt://HOST[:PORT], or mqtts:// for TLS.",
 )
-@click.option("--user", metavar="NAME", help=f"User of the broker. {PASSWORD_VARIABLE} has the password.")
+@click.option("--user", metavar="NAME", help=f"User name at the broker. The password is read from {PASSWORD_VARIABLE}.")
 @click.option(
     "--ca",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -51,10 +51,15 @@ Home Assistant shows each car by itself. Nothing that comes by MQTT commands a c
 )
 @bus_options
 def mqtt(*, broker: str, user: str | None, ca: Path | None, discovery: str, connect: str | None, fleet: str) -> None:
-    """Publish what the cars measure and do to an MQTT broker, until Ctrl-C. Home Assistant finds them by itself."""
+    """Publish readings and states of the cars to an MQTT broker, until Ctrl-C.
+
+    Home Assistant finds the cars by itself.
+    """
     where = _broker(broker, user, ca)
     if not discovery or set(discovery) & set("+#") or discovery != discovery.strip("/"):
-        raise click.UsageError(f"--discovery {discovery!r} is not allowed: parts with one / between, no + and no #")
+        raise click.UsageError(
+            f"--discovery {discovery!r} is not allowed: write parts with one / between them, without + and #"
+        )
     with open_observer(connect, fleet) as client:
         plan = HomeAssistant(client.name, discovery, version("zenoh-car-fleet"))
         try:

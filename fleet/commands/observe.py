@@ -72,9 +72,9 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, cars: Sequence[str], *, as_json: bool) -> None:
-    """List cars: link, readiness, mode, motors and what shows their state, who is in control, battery.
+    """List cars: link, readiness, mode, motors with the basis of that claim, who is in control, battery.
 
-    SHOWS STOPS tells whether the car's reports show that a stop arrived. A car that cannot show this drives and stops
+    SHOWS STOPS says whether the car's reports show that a stop arrived. A car that cannot show this drives and stops
     like any other. On a narrow terminal, some columns are left out, such as platform, shows stops and verdict. --json
     prints all of them.
     """
@@ -85,7 +85,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
     """Print the table of cars. If `only` has names, the table has only these cars."""
     cars = client.cars()
     latest: dict[str, dict[str, Reading]] = {car: {} for car in cars}
-    for reading in client.get("*/*/*"):  # one query, so that a hung gateway delays it only once
+    for reading in client.get("*/*/*"):  # one query, so that a gateway that hangs delays the list only once
         key = keys.parse(reading.key)
         if key is not None:
             latest.setdefault(key.car, {})[key.topic] = reading
@@ -128,8 +128,8 @@ def row_of(
 ) -> dict[str, Any]:
     """Return the row of a car in `fleet list`, for the table and for JSON.
 
-    readings: its latest ones, by topic. present: True if its gateway is on the bus. clock_off_s: how far the clock of
-    its gateway's computer is ahead of ours, if it is off.
+    readings: the car's latest readings, by topic. present: True if its gateway is on the bus. clock_off_s: how far the
+    clock of the gateway's computer is ahead of ours. None if it is not off.
     """
     now = datetime.now(UTC).timestamp() + (clock_off_s or 0.0)
     state = CarState.of_answers(car, readings.items(), now, present=present)
@@ -223,7 +223,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
     type=Since(history_query.MAX_HISTORY_S),
     help="Print the values since TIME: 30s or 5m ago, a local time (14:05, yesterday 14:05), or a date.",
 )
-@click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must match only one type of message.")
 @json_option
 @bus_options
 def get(
@@ -243,7 +243,7 @@ def get(
     written = check_key(written_out(keyexpr, fleet))
     under = topics_under(written)
     if as_csv and as_json:
-        raise click.UsageError("--csv and --json: give one of them")
+        raise click.UsageError("--csv and --json exclude each other: give one of them")
     if as_csv and len(under) != 1:
         meant = ", ".join(topic.name for topic in under) or "no message"
         raise click.UsageError(f"--csv needs one message type, but {written} means {meant}.")
@@ -271,7 +271,7 @@ def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: 
 
 
 def _print_shortfalls(lines: Sequence[str]) -> None:
-    """Print why there are fewer readings than requested, for a few keys."""
+    """Print why there are fewer readings than requested, for at most a few keys."""
     limit = _MAX_SHORTFALL_LINES
     more = [f"and {len(lines) - limit} more likewise"] if len(lines) > limit + 1 else lines[limit : limit + 1]
     for words in (*lines[:limit], *more):
@@ -292,8 +292,9 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
 def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, connect: str | None, fleet: str) -> None:
     """Print new values as they come, until Ctrl-C.
 
-    CONDITION compares fields of one message (range_m < 0.3), with and, or, not and parentheses. A yes/no field stands
-    alone. A comparison with a value that was not measured is unknown. Only readings with a true CONDITION are shown.
+    CONDITION compares fields of one message (range_m < 0.3), with and, or, not and parentheses. A yes/no field needs no
+    comparison. A comparison with a value that was not measured is unknown. Only readings for which CONDITION is true
+    are shown.
     """
     written = check_key(written_out(keyexpr, fleet))
     if when is not None:
@@ -332,7 +333,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
 def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str | None, fleet: str) -> None:
     """List everything that is published now: message type, units, rate, and age of the newest value.
 
-    A rate is "-" if fewer than two messages came in that time. An age is "-" if no message came.
+    A rate is "-" if fewer than two messages came during the measurement. An age is "-" if no message came.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
@@ -402,7 +403,7 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
     "  fleet wait '*/sensor/light' 'left or right' --for 2s\n"
     "  fleet wait red/state/link \"state == 'online'\" --timeout 1m && fleet drive red forward\n"
     "  fleet wait --ready && fleet drive all forward\n\n\b\n"
-    "Exit codes: 0 it is true, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
+    "Exit codes: 0 the condition is true or the cars are ready, 1 timeout or no fleet, 2 wrong use, 130 Ctrl-C."
 )
 @click.argument("words", nargs=-1, metavar="KEY CONDITION | --ready [CAR...]", shell_complete=complete_cars)
 @click.option(
@@ -418,7 +419,7 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
     "--for",
     "for_s",
     type=Duration(_DAY_S),
-    help="How long the condition must be true at least. With --ready, the same as --timeout.",
+    help="Minimum time for which the condition must be true. With --ready, the same as --timeout.",
 )
 @json_option
 @bus_options

@@ -30,7 +30,7 @@ from_option = click.option(
     metavar="TIME",
     help="Begin at TIME: 90s after the start, -5m before the end, a local time (14:05), or a date.",
 )
-to_option = click.option("--to", "end", metavar="TIME", help="End before TIME, which is written as for --from.")
+to_option = click.option("--to", "end", metavar="TIME", help="End before TIME, written as for --from.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 
 
@@ -50,7 +50,7 @@ def bus_options(function: _Function) -> _Function:
 
 
 def serving_options(port: int) -> Callable[[_Function], _Function]:
-    """Add --port and --address of a program that serves others: this port, on this computer only."""
+    """Add --port and --address for a program that serves others. By default it serves `port` on this computer only."""
 
     def add(function: _Function) -> _Function:
         address = click.option(
@@ -82,7 +82,10 @@ def with_client(function: _Function) -> _Function:
 
 
 def not_running(fleet: str, connect: str | None) -> click.ClickException:
-    """Return the error that no supervisor answers. Gateways may run all the same, and their cars may move."""
+    """Return the error that no supervisor answers.
+
+    It warns if gateways run nevertheless, because their cars may move.
+    """
     if running := describe_running(resolve_endpoint(connect)):
         words = f"No `fleet up` of {keys.describe_fleet(fleet)} answers, but {running}. Repeat this in a few seconds."
         return click.ClickException(f"{words} `fleet list` shows the cars.")
@@ -98,11 +101,11 @@ class WrongFile(click.ClickException):
 
 @contextmanager
 def cli_errors() -> Iterator[None]:
-    """Turn errors of a user into click's errors: exit code 2 for wrong use, 1 for a failure."""
+    """Turn expected errors into click's errors: exit code 2 for wrong use, 1 for a failure."""
     try:
         yield
     except click.ClickException as error:
-        vars(error)["message"] = complete_hints(error.message, hint_options())  # click declares it final
+        vars(error)["message"] = complete_hints(error.message, hint_options())  # click declares `message` final
         raise
     except (BadEndpoint, ValueError) as error:  # BadKey is a ValueError
         # A BadFile of schemas.yaml_document. Its import would slow down every other command.
@@ -125,16 +128,16 @@ def carry_out(
 
 
 def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
-    """Print each outcome. Exit with code 0 if all cars have carried out the command, 2 for a bad value, else 1.
+    """Print each outcome. Exit with code 0 if all cars have carried out the command, 2 for a bad value, 1 otherwise.
 
-    Fail if there is no outcome, because no car is connected.
+    Fail if there is no outcome, which means that no car is connected.
     """
     if not outcomes:
         raise no_cars(client)
     print_outcomes(outcomes, as_json=as_json)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     unanswered = all(outcome.phase == NO_ANSWER for outcome in outcomes)
-    # --fleet may be wrong, or our certificate.
+    # --fleet may be wrong, or our certificate may have been revoked.
     if unanswered and (words := describe_other_fleets(client) or (not client.cars() and why_refused(client))):
         say(words, err=True)
     wrong = bool(failed) and all(outcome.reason == Reason.BAD_VALUE for outcome in failed)

@@ -26,9 +26,10 @@ from schemas.process import stdio
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
 ROWS_AT_ONCE: Final = 1024
-"""Rows of a table that are Python's objects at the same time."""
+"""Maximum number of rows of a table that are Python objects at the same time."""
 MAX_CELL: Final = 60
-"""Maximum characters of a cell. Names and texts of a recording are anybody's."""
+"""Maximum characters of a cell. There is a limit because anybody may have written the names and texts of a
+recording."""
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -61,9 +62,9 @@ def show_table(
     optional: Sequence[str] = (),
     colors: Sequence[str] = (),
 ) -> None:
-    """Print a table with aligned columns and a bold header. On a terminal it is no wider than that.
+    """Print a table with aligned columns and a bold header. On a terminal, it is not wider than the terminal.
 
-    colors: of each row, as #rrggbb. On a terminal a dot of this color begins the row.
+    colors: the color of each row, as #rrggbb. On a terminal, each row begins with a dot of its color.
     """
     dots = [f"{_dot(color)} " for color in colors] if stdio.shows_colors(sys.stdout) else []
     dots = dots or [""] * len(rows)
@@ -80,8 +81,8 @@ def show_table(
 def aligned(rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield one line for each row, with aligned columns.
 
-    It looks at a block of rows at a time: a million rows would not fit into memory. A later block widens a column if it
-    must, and narrows none.
+    The rows are read in blocks, because a million rows would not fit into memory. A later block may make a column
+    wider, but never narrower.
     """
     left = iter(rows)
     widths: Iterable[int] = repeat(0)
@@ -94,7 +95,7 @@ def aligned(rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 
 def _width(text: str) -> int:
-    """Return the number of columns of a terminal that a text takes. Chinese characters and emoji take two."""
+    """Return the number of terminal columns that a text fills. A Chinese character or an emoji fills two."""
     if text.isascii():
         return len(text)
     wide = sum(unicodedata.east_asian_width(each) in "WF" for each in text)
@@ -102,14 +103,14 @@ def _width(text: str) -> int:
 
 
 def echo_safely(text: str, *, err: bool = False) -> None:
-    """Print text that may have names and words of strangers in it, with control characters as escapes."""
+    """Print text that strangers may have written in part. Control characters are printed as escapes."""
     click.echo(printable_lines(text), err=err)
 
 
 def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Print a CSV table (RFC 4180), a block of rows at a time. None is an empty cell.
 
-    A terminal gets control characters as escapes. Files and pipes get the cells as they are.
+    On a terminal, control characters are printed as escapes. Files and pipes get the cells unchanged.
     """
     on_terminal = sys.stdout.isatty()
     left = chain((header,), rows)
@@ -121,7 +122,7 @@ def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
 
 
 def _dot(color: str) -> str:
-    """Return a colored dot. Not each terminal has 24-bit colors, so it has one of the 6 x 6 x 6 that all have."""
+    """Return a colored dot. It has one of 6 x 6 x 6 colors, because not every terminal has 24-bit colors."""
     red, green, blue = (round(part / 51) for part in parse_color(color))
     return click.style("●", fg=16 + 36 * red + 6 * green + blue)
 
@@ -134,7 +135,7 @@ def _shortened(text: str, width: int) -> str:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on a terminal after a second, if the total is known.
 
-    Yield the function that takes the number of newly done items.
+    Yield the function to call with the number of newly done items.
     """
     bar: Any = None
     began = time.monotonic()

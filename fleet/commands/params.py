@@ -1,4 +1,4 @@
-"""Types of arguments and options that several subcommands take, and key expressions."""
+"""Types of arguments and options that several subcommands accept, and key expressions."""
 
 import logging
 import threading
@@ -33,7 +33,7 @@ N = TypeVar("N", bound=float)
 ALL_CARS: Final = "all"
 COMPLETION_TIMEOUT_S: Final = 0.3
 _PLACE: Final = "fleet.sessions"
-"""Key of the value of --sessions in the context."""
+"""Key in click's context under which the value of --sessions is stored."""
 
 
 class Duration(click.ParamType[float]):
@@ -61,7 +61,7 @@ class Since(click.ParamType[float]):
         self._max_s = max_s
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return how long ago it was, s. Fail if it was not, or longer ago than the maximum."""
+        """Return how long ago the time was, s. Fail for a time in the future, or longer ago than the maximum."""
         text = str(value)
         ago = text.removeprefix("-")
         if duration_s(ago) is not None:
@@ -71,7 +71,7 @@ class Since(click.ParamType[float]):
         except ValueError as error:
             self.fail(str(error), param, ctx)
         if found_s > self._max_s:
-            self.fail(f"{text} is too long ago: at most {format_duration(self._max_s)}.", param, ctx)
+            self.fail(f"{text} is too long ago: the maximum is {format_duration(self._max_s)}.", param, ctx)
         return found_s
 
 
@@ -89,25 +89,25 @@ class Number(click.ParamType[N]):
         except ValueError:
             self.fail(f'"{value}" is not a {"whole " if self._kind is int else ""}number.', param, ctx)
         if not number >= self._least:
-            self.fail(f"{value} is too small: at least {self._least:g}.", param, ctx)
+            self.fail(f"{value} is too small: the minimum is {self._least:g}.", param, ctx)
         if self._most is not None and number > self._most:
-            self.fail(f"{value} is too large: at most {self._most:g}.", param, ctx)
+            self.fail(f"{value} is too large: the maximum is {self._most:g}.", param, ctx)
         return number
 
 
 class Choice(click.Choice[str]):
-    """A word of a closed set, such as a motion. A wrong word names the likely one."""
+    """A word of a fixed list, such as a motion. The error for another word names the likely one."""
 
     def __init__(self, what: str, choices: Iterable[str], hints: Mapping[str, str] | None = None) -> None:
         super().__init__([str(each) for each in choices])
         self._what, self._hints = what, hints or {}
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:
-        """Return the name of the argument; its choices for an option."""
+        """Return the name of an argument, or the choices of an option."""
         return (param.name or "").upper() if isinstance(param, click.Argument) else super().get_metavar(param, ctx)
 
     def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
-        """Return the likely word, or else all."""
+        """Return the error text, with the likely word, or with all words if none is likely."""
         near = self._hints.get(value) or did_you_mean(str(value), self.choices)
         if ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
             near = f"Write the {self._what} last."
@@ -148,7 +148,7 @@ class CarNames(click.ParamType[tuple[str, ...]]):
 
 
 def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return connected cars for the shell, also after a comma, and groups. Never fails, prints, or takes long."""
+    """Return connected cars for the shell, also after a comma, and groups. It never fails, prints, or takes long."""
     earlier, comma, begin = incomplete.rpartition(",")
     named = earlier.split(",")
     if begin.startswith("@"):
@@ -160,7 +160,7 @@ def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) 
 
 
 def complete_car(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return connected cars for the shell, where neither `all` nor a group has a meaning."""
+    """Return connected cars for the shell, for arguments that accept neither `all` nor a group."""
     return [name for name in _connected(ctx) if name.startswith(incomplete)]
 
 
@@ -171,9 +171,9 @@ def _connected(ctx: click.Context) -> list[str]:
 
 
 def _ask_bus(ctx: click.Context, ask: Callable[[Bus, str], Iterable[str]]) -> list[str]:
-    """Return the sorted names that the bus has for the fleet. Empty if it does not answer in time."""
+    """Return the names that `ask` finds on the bus, sorted. Empty if the bus does not answer in time."""
     values = {**ctx.find_root().params, **{name: value for name, value in ctx.params.items() if value}}
-    fleet = values.get("fleet") or keys.DEFAULT_FLEET  # click sets no defaults while it completes
+    fleet = values.get("fleet") or keys.DEFAULT_FLEET  # click does not set defaults during completion
     found: list[str] = []
 
     def look() -> None:
@@ -205,12 +205,12 @@ class Color(click.ParamType[tuple[int, int, int]]):
 
 
 class SessionPath(click.ParamType[Path]):
-    """A session: its directory, its name below the place of sessions, `latest`, or `latest~1` for the one before."""
+    """A session: its directory, its name in the directory of sessions, `latest`, or `latest~1` for the one before."""
 
     name = "SESSION"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path. Fail if there are not so many sessions."""
+        """Return the path. Fail if there are fewer sessions than `latest~N` needs."""
         place = (ctx.meta.get(_PLACE) if ctx is not None else None) or sessions_place()
         try:
             return find_session(value, place)
@@ -240,7 +240,7 @@ def _needed(ctx: click.Context, param: click.Parameter, value: tuple[tuple[str, 
 
 
 def missing_words(ctx: click.Context) -> str:
-    """Return what to write if words are missing, with the first example of the command."""
+    """Return the error text for missing words: what to write, with the first example of the command."""
     pieces = [each for each in ctx.command.collect_usage_pieces(ctx) if each != "[OPTIONS]"]
     example = next(line.strip() for line in (ctx.command.epilog or "").splitlines() if line.startswith("  fleet"))
     return f"Write: {ctx.command_path} {' '.join(pieces)}, such as: {example}"
@@ -294,8 +294,8 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
         there = f"Groups: @{', @'.join(sorted(groups))}." if groups else ""
         if not groups:
-            whose = "The running fleet has none: its file" if status else "fleet.yaml"
-            there = f"{whose} can have some, `groups: {{a: [red, blue]}}`."
+            whose = "The running fleet has none. Its file" if status else "fleet.yaml"
+            there = f"{whose} can define groups, such as `groups: {{a: [red, blue]}}`."
         raise click.ClickException(f'There is no group "@{group}". {near or there}')
     return groups[group]
 
@@ -333,19 +333,19 @@ def written_out(keyexpr: str, fleet: str) -> str:
 
 
 def no_cars(client: Fleet) -> click.ClickException:
-    """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
+    """Return the error that no car is connected. It names the other fleets if this fleet is not on the bus."""
     if others := describe_other_fleets(client):
         return click.ClickException(others)
     if refused := why_refused(client):
         return click.ClickException(refused)
     words = "No car is connected."
-    if running := describe_running(client.bus.endpoint):  # on their way back to a hub that was restarted
+    if running := describe_running(client.bus.endpoint):  # they may be about to reconnect to a restarted hub
         words = f"No car is connected, but {running}. Repeat this in a few seconds. Otherwise go to the cars."
     return click.ClickException(words)
 
 
 def describe_other_fleets(client: Fleet) -> str:
-    """Name the fleets on the bus. Empty if this one is among them, or if there is none."""
+    """Return a text that names the fleets on the bus. Empty if this fleet is among them, or if there is none."""
     there = fleets_on(client.bus)
     if not there or client.name in there:
         return ""
@@ -353,10 +353,10 @@ def describe_other_fleets(client: Fleet) -> str:
 
 
 def describe_missing(client: Fleet, written: str, what: str) -> str:
-    """Describe what is there instead of what a key names: the likely car, its readings, or the connected cars."""
+    """Return a text for a key without a value. It names the likely car, the car's readings, or the connected cars."""
     under = topics_under(written)
     if under and all(topic.family == "sim" for topic in under):
-        return f"{what}; a simulated car's truth is only published. Watch it: fleet watch {written.partition('/')[2]}"
+        return f"{what}; a simulated car's true state is not stored. Watch it: fleet watch {written.partition('/')[2]}"
     cars = client.cars()
     if not cars:
         return no_cars(client).message
@@ -364,14 +364,14 @@ def describe_missing(client: Fleet, written: str, what: str) -> str:
     if key is not None and key.car in cars:
         begin = len(f"{client.name}/{key.car}/")
         found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
-        return f"{what}; {key.car} has {', '.join(found)}" if found else f"{what}; {key.car} says nothing"
+        return f"{what}; {key.car} has {', '.join(found)}" if found else f"{what}; {key.car} publishes nothing"
     if key is not None and not set(key.car) & set("*$@"):
         return f'No car "{key.car}". {_likely_car(key.car, cars)}'
     return f"{what}; connected: {', '.join(cars)}"
 
 
 def _likely_car(name: str, cars: Sequence[str]) -> str:
-    """Return words about the likely car, the topic of that name, or the connected cars."""
+    """Return a text about the likely car, the topic with this name, or the connected cars."""
     topic = None if (near := did_you_mean(name, cars)) else likely_name(name)
     return near or (f"Did you mean '*/{topic}'?" if topic else f"Connected: {', '.join(cars)}.")
 
@@ -380,16 +380,16 @@ def warn_if_missing(written: str, cars: Sequence[str]) -> None:
     """Warn if the named car is not on the bus: the name may be misspelled."""
     key = keys.parse(written)
     if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
-        there = _likely_car(key.car, cars) if cars else "No car is."
+        there = _likely_car(key.car, cars) if cars else "No car is connected."
         click.echo(f'fleet: No car "{key.car}" is connected yet. {there} Waiting.', err=True)
 
 
 def existing_sessions_place(directory: Path | None) -> Path:
-    """Return the directory of sessions that was named, or the usual one. Raises a ClickException if there is none."""
+    """Return this directory of sessions, or the default one. Raises a ClickException if it does not exist."""
     place = directory or sessions_place()
     try:
         is_there = place.is_dir()
-    except OSError as error:  # a directory on the way is closed to us
+    except OSError as error:  # we may not enter a directory on the way
         raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
     if not is_there:
         raise click.ClickException(f"There is no directory {place}. `fleet up` records everything.")

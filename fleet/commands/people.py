@@ -9,13 +9,13 @@ from schemas.commands import COMMANDS, Verb
 
 
 @click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")
-@click.option("--why", default="", metavar="WORDS", help="Reason, which everyone sees whose command is refused.")
+@click.option("--why", default="", metavar="WORDS", help="The reason. Everyone whose command is refused sees it.")
 @json_option
 @with_client
 def pause(client: Fleet, why: str, *, as_json: bool) -> None:
-    """Stop all cars. Until `fleet unpause` nobody but a lead moves a car, even after a restart.
+    """Stop all cars. Until `fleet unpause` only a lead can move a car, even after a restart.
 
-    Without leads in the fleet file, any person may pause, and until the end of the pause nobody moves a car.
+    If the fleet file has no leads, any person may pause, and nobody can move a car until the end of the pause.
     """
     end_with(client, client.pause(why), as_json=as_json)
 
@@ -24,7 +24,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 @json_option
 @with_client
 def unpause(client: Fleet, *, as_json: bool) -> None:
-    """End the pause of the fleet. This does not move a car, and a stopped car stays on hold."""
+    """End the pause of the fleet. This does not move a car: a stopped car stays on hold."""
     end_with(client, client.unpause(), as_json=as_json)
 
 
@@ -48,9 +48,9 @@ examples:
 def lend(
     client: Fleet, cars: tuple[str, ...], *, to: str | None, duration_s: float | None, end: bool, as_json: bool
 ) -> None:
-    """Lend cars to a person. During the loan only that person and leads drive them.
+    """Lend cars to a person. During the loan, only that person and leads can drive them.
 
-    Without leads in the fleet file, any person may lend. When the loan ends, a car stops that the borrower drives.
+    If the fleet file has no leads, any person may lend cars. When the loan ends, a car that the borrower drives stops.
     """
     if end and (to or duration_s):
         raise click.UsageError("--end ends the loan: leave --to and --for out")

@@ -55,8 +55,8 @@ def why(
 ) -> None:
     """Explain why a car does what it does: what the plan decided, from which readings, and what would change that.
 
-    Also tell who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at,
-    tell what happened to one car around that time of a recording, and why a stop was not shown.
+    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that. With --session and --at,
+    say what happened to one car around that time of a recording, and why a stop was not shown.
     """
     if session is not None or at is not None:
         from fleet.commands.why_session import explain_session
@@ -98,7 +98,10 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
 
 
 def _no_plan(client: Fleet) -> str:
-    """Return a text: no plan is running, and which command starts one. Name `fleet up` only if no supervisor runs."""
+    """Return a text that no plan is running, with the command that starts one.
+
+    Name `fleet up` only if it does not run.
+    """
     is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
     other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"
     return f"{NO_PLAN}{other}."
@@ -177,7 +180,7 @@ def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> N
     from schemas.yaml_document.document import read_text
 
     text = read_text(file)
-    parse(text, str(file))  # before it is sent, for errors with the position in this file
+    parse(text, str(file))  # parse before sending, so that errors name the position in this file
     with open_client(connect, fleet) as client:
         _request(client, "plan", text, source=str(file), as_json=as_json)
 

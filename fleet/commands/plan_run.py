@@ -28,7 +28,7 @@ from schemas.yaml_document.document import read_text
 example:
   fleet plan run plan.yaml
 
-`fleet up --plan FILE` runs a plan too. This command runs a separate coordinator.
+`fleet up --plan FILE` runs a plan together with the fleet. This command runs only a coordinator.
 
 \b
 a plan:
@@ -66,7 +66,7 @@ def run(
     starter: int | None,
     as_json: bool,
 ) -> None:
-    """Run a plan until Ctrl-C, and print one line per decision. It leaves cars alone that you have stopped."""
+    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves cars alone that you have stopped."""
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
     file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)

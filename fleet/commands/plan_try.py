@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     )
     from fleet.replay.analysis.replan import Replanning
 
-# States come once a second. So a replay notices up to a second later that a car has gone; its token shows it at once.
+# Live, a car's token shows at once that the car has gone. A recording has only its states, which come once a second. So
+# a replay notices this up to a second later.
 TOLERANCE_S: Final = 2.0
-"""Default time by which the same decision may come earlier or later."""
+"""Default time by which a decision may come earlier or later and still count as the same."""
 
 
 @click.command(
@@ -35,28 +36,28 @@ examples:
   fleet plan try latest~1
   fleet plan try latest~1 new.yaml
 
-Exit codes: 0 no differences, 1 differences, or nothing to compare, 2 no plan."""
+Exit codes: 0 no differences, 1 differences or nothing to compare, 2 wrong use or a wrong plan."""
 )
 @session_argument
 @click.argument("path", metavar="[PLAN]", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Read in FILE what the cars may do (default: the copy in the session, if there is one).",
+    help="Read the cars' capabilities and roles in FILE (default: the copy in the session, if there is one).",
 )
 @click.option(
     "--tolerance",
     default=f"{TOLERANCE_S:g}s",
     show_default=True,
     type=Duration(60.0, 0.1),
-    help="Let the same decision come earlier or later by this time.",
+    help="Time by which a decision may come earlier or later and still count as the same.",
 )
 @json_option
 def try_plan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
     """Replay the recorded sensor data through a plan and show where it would have decided differently.
 
-    Without PLAN, it uses the session's own plan. Whatever the plan decides, the cars' messages stay as recorded, with
-    the stops and drives by people.
+    Without PLAN, the command uses the session's own plan. The cars' messages stay as recorded whatever the plan
+    decides. The same is true for stops and drives by people.
     """
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
@@ -78,7 +79,7 @@ def try_plan(session: Path, path: Path | None, fleet_file: Path | None, toleranc
             if fleet_file is not None:
                 listed = listed_cars(read_fleet(fleet_file, unbound=True))
             elif found.path.is_dir() and own.is_file():
-                # The session keeps the plan as plan.yaml, whatever name it has in the copied fleet file.
+                # The session has the plan as plan.yaml, even if the copied fleet file gives it another name.
                 listed = listed_cars(read_fleet(own, unbound=True, moved=True))
             compared = _ReplanReport(found, plan, listed, round(tolerance * 1e9))
             compared.go()
@@ -140,7 +141,7 @@ class _ReplanReport:
                 else [(run.start_ns, self._plan)]
             )
             if not plans:
-                raise click.ClickException(f"{self._session.path} has no plan: name one after the session")
+                raise click.ClickException(f"{self._session.path} has no plan: give a plan file after the session")
             again = Replanning(run, plans, self._listed, persisted)
             persisted = self._one(run, again, tokens)
 
@@ -156,8 +157,8 @@ class _ReplanReport:
         }
         if others := sorted(decided - {*left, "phase"}):
             raise click.ClickException(
-                f"{self._session.path} was cut to {', '.join(left)}: what was decided then was decided with "
-                f"{', '.join(others)} too, and what they said is not in it; try the session it was cut from"
+                f"{self._session.path} was cut to {', '.join(left)}, but its decisions also depended on "
+                f"{', '.join(others)}, whose messages are not in it; try the session from which it was cut"
             )
 
     def _one(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
@@ -170,7 +171,7 @@ class _ReplanReport:
         self._decisions += sum(map(len, run.decisions.values()))
         for each in differences(run.decisions, again.decisions, run.start_ns, run.end_ns):
             if not run.whole and (each.then is None or (each.now is None and self._plan is None)):
-                continue  # from before the recording began
+                continue  # it may be from before the recording began
             if each.to_ns - each.from_ns > self._tolerance_ns:
                 self.found.append(each)
             else:
@@ -191,9 +192,11 @@ class _ReplanReport:
         found = f"{len(self.found)} differences" if self.found else "no difference"
         times = ", ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         echo_safely(f"{self._session.path}: {self._decisions} decisions from {times}: {found}")
-        click.echo(f"the same decisions came at most {late_s:.2f} s apart", err=True)
+        click.echo(f"equal decisions came at most {late_s:.2f} s apart", err=True)
         if partly:
-            click.echo("a coordinator began before the recording, which lacks its earlier knowledge", err=True)
+            click.echo(
+                "a coordinator started before the recording began: the recording lacks what it knew by then", err=True
+            )
         if self._session.damage:
             echo_safely(f"only the intact part was used: {self._session.damage_words}", err=True)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 PROGRESS_INTERVAL_S: Final = 0.5
 _DAY_S: Final = 86_400.0
 INITIAL_VALUES_NS: Final = 300_000_000_000
-"""Time before the start from which latest values are loaded, such as a plan or a battery voltage."""
+"""Time before the start that is searched for the latest values, such as a plan or a battery voltage."""
 
 
 @click.command(
@@ -35,7 +35,7 @@ examples:
   fleet play
   fleet play --as rehearsal --rate 4 --loop
   fleet play --car red --from=-60s
-  fleet play latest --skip-gaps 5s   # pauses of the recording take 5 s at most
+  fleet play latest --skip-gaps 5s # a pause in the recording lasts at most 5 s
 
 Look at it with `fleet list --fleet fleet-replay`, or run your own program on it."""
 )
@@ -50,7 +50,10 @@ Look at it with `fleet list --fleet fleet-replay`, or run your own program on it
 @click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
 @click.option("--offset", metavar="TIME", help="Start at this time. With --loop, only the first round starts there.")
 @click.option(
-    "--skip-gaps", "skip_gaps_s", type=Duration(_DAY_S), help="Shorten longer pauses to DURATION, such as 5s."
+    "--skip-gaps",
+    "skip_gaps_s",
+    type=Duration(_DAY_S),
+    help="Shorten pauses longer than DURATION to DURATION, such as 5s.",
 )
 @click.option(
     "--cars-only", is_flag=True, help="Leave out the messages of the coordinator, the recorder and the supervisor."
@@ -105,15 +108,15 @@ def play(
         except NoSession as error:
             raise click.ClickException(str(error)) from None
         if not any(keys.parse(key) for key in about.keys):
-            raise click.ClickException(f"{session} holds nothing that is a fleet's: no FLEET/CAR/... key")
+            raise click.ClickException(f"{session} has no messages of a fleet (no key FLEET/CAR/...)")
         expressions = _key_expressions(cars, cars_only=cars_only)
         there = cars or tuple(about.cars)
-        words = f"fleet {name} is a replay of {found.name}: nothing in it takes commands"
+        words = f"fleet {name} is a replay of {found.name}: it accepts no commands"
         schedule = Schedule(rate, gap_ns)
         with Bus.open(connect, start_hub=True) as bus:
             if bus.identity:
                 raise click.ClickException(
-                    f"The rules of {bus.endpoint} let nobody speak as a car. Play it on a bus of its own: "
+                    f"The rules of {bus.endpoint} let nobody publish for a car. Play the session on another bus: "
                     "`fleet play --connect tcp/127.0.0.1:7449`."
                 )
             player = Player(bus, name, words, cars_only)
@@ -126,7 +129,7 @@ def play(
                 f"{', '.join(map(printable, there)) or 'no car'}; Ctrl-C ends"
             )
             player.remember(found.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
-            # The earliest time is not the first message's if the clock went back.
+            # The first message does not have the earliest time if the clock went back.
             from_ns = part.start_ns if offset is None else first_ns
             progress = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()
@@ -135,7 +138,7 @@ def play(
                 player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
                 if not player.published and not stop.is_set():
                     why = "".join(f"; {line}" for line in player.left_out.words())
-                    raise click.ClickException(f"{session} holds nothing there that is published again{why}")
+                    raise click.ClickException(f"{session} has no messages there that can be published again{why}")
                 if not loop or stop.is_set():
                     break
                 schedule.again(LOOP_PAUSE_NS)
@@ -144,13 +147,13 @@ def play(
     took_s = time.monotonic() - origin_s
     click.echo(f"{player.published} messages in {took_s:.1f} s")
     notes = {
-        f"came over 0.25 s late: {rate:g} times as fast is too fast here": player.late,
+        f"messages came over 0.25 s late: {rate:g} times as fast is too fast for this computer": player.late,
         "pauses were shortened": schedule.shortened,
     }
     for note, count in notes.items():
         if count:
             click.echo(f"{count} {note}", err=True)
-    # Messages on keys that no selection takes never reached the player.
+    # Messages on keys that no selection matches never reached the player.
     everything = Selection(tuple(_key_expressions((), cars_only=False)))
     for key, count in about.keys.items():
         if not everything.has_key(key):

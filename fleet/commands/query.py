@@ -1,4 +1,4 @@
-"""`fleet query`: SQL over the tables of all sessions."""
+"""`fleet query`: answers SQL questions about all sessions."""
 
 import json
 import math
@@ -34,15 +34,17 @@ Exit codes: 0 done, 1 no session could be read, or no disk has room for the tabl
 def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool, as_json: bool) -> None:
     """Answer an SQL question about all sessions in DIR (default: sessions). With - for SQL, read it from stdin.
 
-    SQL is that of DuckDB. Each topic is a table, such as sensor_range or event_command, with the columns of `fleet
-    sessions export` and the column session. Tables named ..._context add the mode, motion, driver and plan at that
-    time. Times are UTC. The sender of a command is a process (tom@host-4711): person_of(sender) is the person.
-    Sessions that are not whole are listed, and their intact part counts.
+    SQL is the dialect of DuckDB. Each topic is a table, such as sensor_range or event_command, with the columns of
+    `fleet sessions export` and the column session. Tables named ..._context add the mode, motion, driver and plan at
+    that time. Times are UTC. The sender of a command is a process (tom@host-4711): person_of(sender) is the person.
+    Sessions that are not whole are listed, and only their intact part is used.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
 
-    if tables and directory is None and sql is not None and Path(sql).is_dir():  # no question: the one argument is DIR
+    if (
+        tables and directory is None and sql is not None and Path(sql).is_dir()
+    ):  # with --tables, the one argument is DIR
         directory, sql = Path(sql), None
     if (sql is None) is not tables or (as_csv and as_json):
         raise click.UsageError("give one question, or --tables; and --csv or --json, not both")
@@ -81,7 +83,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
 
 
 def _rows(answer: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows, a batch at a time: a million rows are small in Arrow, and large as Python's objects."""
+    """Yield the rows, converted batch by batch: a million rows are small in Arrow, but large as Python objects."""
     for batch in answer.to_batches(max_chunksize=ROWS_AT_ONCE):
         yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
@@ -110,13 +112,16 @@ def _text(cell: Any, limit: int) -> str:
 
 
 def _cell(value: Any) -> Any:
-    """Return a value as one cell. Lists and structs are JSON."""
+    """Return a value for one cell. Lists and structs become JSON."""
     plain = _plain(value)
     return json.dumps(plain) if isinstance(plain, dict | list) else plain
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it, else as text. Times are UTC. NaN and infinite numbers are None."""
+    """Return a value as a JSON value, or as text if JSON has none. Times are UTC.
+
+    NaN and infinite numbers become None.
+    """
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return None
     if isinstance(value, dict):

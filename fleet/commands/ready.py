@@ -26,7 +26,7 @@ _STATES: Final = ("state/link", "state/safety")
 
 
 def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: float, *, as_json: bool) -> None:
-    """Wait until the cars are ready (none: all cars and services). Exit with code 1 after the timeout."""
+    """Wait until the cars are ready. If `cars` is empty: all cars and services. Exit with code 1 after the timeout."""
     deadline = time.monotonic() + timeout_s
     bus: Bus | None = None
     try:
@@ -62,7 +62,7 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
 
 
 def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
-    """Return the cars, and those cars and services that are not ready with the reason."""
+    """Return the names of the cars, and by name the reason for each car and service that is not ready."""
     for status in ask_status(bus, fleet):
         cars = [process.name for process in status.processes if not process.name.startswith("@")]
         missing = dict(status.missing)

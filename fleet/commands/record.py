@@ -80,8 +80,8 @@ examples:
   fleet record run --sessions /media/disk --segment-time 5m
   fleet record run --site north
 
-The quota removes whole files, the oldest of all sessions first. It removes last the files around stops, marks, and
-what `pin:` in the fleet file lists. It never removes files of marked sessions."""
+The quota removes whole files, the oldest of all sessions first. Files around stops and marks, and around
+conditions under `pin:` in the fleet file, are removed last. Files of marked sessions are never removed."""
 )
 @click.option(
     "--sessions",
@@ -98,25 +98,25 @@ what `pin:` in the fleet file lists. It never removes files of marked sessions."
 @click.option(
     "--segment-time",
     type=Duration(_WEEK_S),
-    help="Start a new file after this time (default: 10m; with --quota 1m, because it takes whole files).",
+    help="Start a new file after this time (default: 10m; with --quota: 1m, because the quota removes whole files).",
 )
 @click.option(
     "--sync",
     type=Choice("time to sync", ("never", "segment", "second")),
     default="segment",
     show_default=True,
-    help="How often data is forced to disk. This matters only if the computer itself crashes.",
+    help="How often data is forced to disk. This matters only if the whole computer crashes.",
 )
 @click.option(
     "--session-size",
     type=SizeType(10**6),
-    help="Maximum size of a session, after which the next session begins. With --quota at most half of the quota "
-    "(default: a tenth).",
+    help="Maximum size of a session, after which the next session begins. With --quota: at most half of the quota "
+    "(default: a tenth of it).",
 )
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="Maximum size of all sessions in --sessions. Beyond it, the oldest minutes that nothing pins are removed.",
+    help="Maximum size of all sessions in --sessions. Beyond it, the oldest minutes without a pin are removed first.",
 )
 @click.option(
     "--keep-free",
@@ -126,14 +126,16 @@ what `pin:` in the fleet file lists. It never removes files of marked sessions."
     help="Minimum free disk space. With less, recording pauses until there is room again.",
 )
 @click.option(
-    "--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml, and pin what its pin: says."
+    "--fleet-file",
+    type=_FILE,
+    help="Copy this file into the session as fleet.yaml, and pin the conditions under `pin:` in it.",
 )
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @click.option(
     "--site",
     default="",
     metavar="SITE",
-    help="Record at this other site, beside the recorder of the fleet, which answers while it can be reached.",
+    help="Record at this site, beside the fleet's main recorder. While that one can be reached, it answers commands.",
 )
 @connect_option()
 @fleet_option()
@@ -202,10 +204,10 @@ def run(
         raise click.ClickException(str(error)) from None
     except OSError as error:
         raise click.ClickException(
-            f"No session can be made in {place}: {error.strerror}. Name another place with --sessions."
+            f"No session can be created in {place}: {error.strerror}. Name another place with --sessions."
         ) from None
     lost = {"drops": dict(outcome.drops), "missed": dict(outcome.missed)}
-    session = outcome.session  # it may be another by now
+    session = outcome.session  # a new session may have begun meanwhile
     _say(
         as_json,
         {
@@ -234,9 +236,9 @@ def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FB
 
 
 def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[], People | None]]":
-    """Return what a fleet file pins, and a function that reads its people as they are when it is called.
+    """Return the pin rules of a fleet file, and a function that reads its people again at each call.
 
-    Recording goes on without the pins of a file with mistakes.
+    If the file has mistakes, recording continues without pins.
     """
     from fleet.fleetfile.fleet_file import people_table, read_fleet, read_people
 
@@ -250,7 +252,7 @@ def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[]
     try:
         return read_fleet(fleet_file, unbound=True, moved=True).pins, people
     except ValueError as error:  # a BadFile
-        _warn(f"nothing of pin: in {fleet_file} is pinned: {error}")
+        _warn(f"no condition under pin: in {fleet_file} is pinned: {error}")
         return (), people
 
 
@@ -297,7 +299,7 @@ def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
         f"{where}{found.state}: {found.session}, {found.messages} messages, {found.bytes / 1e6:.1f} MB in "
         f"{found.segments} file{'s' * (found.segments != 1)}, {found.free_bytes / 1e9:.1f} GB free"
     )
-    for counts, words in ((found.drops, "dropped for want of room"), (found.missed, "missed on the bus")):
+    for counts, words in ((found.drops, "dropped for lack of room"), (found.missed, "missed on the bus")):
         if counts:
             worst = max(counts, key=lambda key: counts[key])
             echo_safely(f"{sum(counts.values())} {words}, most of {worst}: {counts[worst]}")
@@ -328,14 +330,14 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Show what is recorded now and where to, at all sites, how much was lost, and whether there is room."""
+    """Show what is recorded now and where, at all sites, how much was lost, and whether there is room."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
         first = _ask(bus, fleet, RecorderVerb.STATUS)
         _show_status(first, as_json=as_json)
         for site, found in site_recordings(bus, fleet):
-            if found.session != first.session:  # else it answers for the fleet, while it is alone
+            if found.session != first.session:  # otherwise this recorder has answered for the fleet above
                 _show_status(found, as_json=as_json, site=site)
 
 
@@ -348,8 +350,8 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
     from fleet.recording.session_dir import MAX_MARK_CHARACTERS
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
-        raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
+        raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and more than blanks")
     found = _query(RecorderVerb.MARK, connect, fleet, text=text, by=by or default_sender(chosen_person()))
     if why := why_unrecorded(found):
-        raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` tells whether it is.")
+        raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` shows when it is.")
     click.echo(f"marked in {found.session}")

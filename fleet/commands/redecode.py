@@ -1,4 +1,4 @@
-"""`fleet sessions redecode` and `fleet sessions vector`: decodes recorded frames again, and cuts test vectors."""
+"""`fleet sessions redecode` and `fleet sessions vector`: decode recorded frames again, and cut test vectors."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -120,7 +120,7 @@ class _RedecodeReport:
             whose = f" of {', '.join(self._cars)}" if self._cars else ""
             damage = f" ({self._session.damage_words})" if self._session is not None and self._session.damage else ""
             raise click.ClickException(
-                f"{self._path} holds no raw frames{whose} (keys FLEET/CAR/frame/rx): nothing to decode{damage}"
+                f"{self._path} has no raw frames{whose} (keys FLEET/CAR/frame/rx): nothing to decode{damage}"
             )
 
     def report(self, differences: int, *, as_json: bool) -> None:
@@ -181,7 +181,7 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     required=True,
     metavar="CAR",
     callback=lambda _ctx, _param, value: keys.check_name(value),
-    help="Take the frames of this car.",
+    help="Use the frames of this car.",
 )
 @from_option
 @to_option
@@ -193,11 +193,11 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     metavar="FILE.jsonl",
     help="Write the vector to this file, which must not exist.",
 )
-@click.option("--source", metavar="WORDS", help="Tell where the frames are from (default: the session and the car).")
+@click.option("--source", metavar="WORDS", help="Say where the frames are from (default: the session and the car).")
 def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
     """Write a part of a session as a test vector: raw frames with their times, and the decoded readings.
 
-    `fleet sessions redecode FILE.jsonl` compares it with the decoder of this version.
+    `fleet sessions redecode FILE.jsonl` compares the vector with this version's decoder.
     """
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session as overview
@@ -219,7 +219,7 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
     items = [*vector_file.select_range((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
     frames = sum(isinstance(item, Rx) for item in items)
     if not frames:
-        raise click.ClickException(f"{session} holds no raw frames of {car} there: a vector would be empty")
+        raise click.ClickException(f"{session} has no raw frames of {car} there: a vector would be empty")
     try:
         with out.open("x", encoding="utf-8") as file:
             file.writelines(

@@ -60,7 +60,7 @@ def replay(
             intact = True
             try:
                 _export(found, out, part, cars)
-            except NoSession:  # it names the damage
+            except NoSession:  # the error names the damage itself
                 intact = False
                 raise
             finally:
@@ -76,7 +76,7 @@ def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
     """Reject a target that is a recording, a device, or no .rrd file."""
     if save.suffix != ".rrd":
         raise click.UsageError(
-            f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
+            f"--save {save}: Rerun opens only files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
         )
     if save.exists() and not save.is_file():
         raise click.UsageError(f"--save {save}: this is not a file: name a file that ends in .rrd")
@@ -113,7 +113,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
         raise click.ClickException(str(error)) from None
     except OSError as error:
         raise click.ClickException(
-            f"{out} cannot be written: {error.strerror}. It needs the size of the recording twice; "
+            f"{out} cannot be written: {error.strerror}. The export needs twice the size of the recording; "
             "name another place (--save), or set TMPDIR to a directory with room."
         ) from None
     click.echo(f"{out}: {replayed.shown.total()} messages on {len(replayed.shown)} keys")
@@ -123,7 +123,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
 
 @contextmanager
 def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
-    """Show a progress bar. Yield the function that takes the number of newly read messages."""
+    """Show a progress bar. Yield the function to call with the number of newly read messages."""
     from fleet.replay.rerun.rrd_export import count_of
 
     with progress_bar("replay", count_of(session) if sys.stderr.isatty() else 0) as advance:

@@ -1,6 +1,6 @@
-"""Writes a session for other programs, and says what of it is where: `fleet sessions export`.
+"""Writes a session for other programs, and prints what was written and what was left out: `fleet sessions export`.
 
-Each function raises Exists, NoSession, FormatMissing, OSError, and leaves nothing behind then.
+Each function raises Exists, NoSession, FormatMissing or OSError. It then leaves no files behind.
 """
 
 from pathlib import Path
@@ -38,7 +38,7 @@ def export_ros2(session: Session, out: Path) -> None:
     from fleet.recording.tools.ros2 import write_bag  # raises FormatMissing without rosbags
 
     with atomic_directory(out) as new:
-        new.rmdir()  # the writer makes it
+        new.rmdir()  # the writer creates the directory itself
         bag = write_bag(watched("export ros2", total(session))(session.rows()), new)
         if not bag.messages:
             why = session.damage_words or "it is empty, or nothing in it is protobuf"

@@ -21,7 +21,7 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
     about = of_session(session)
     if missing := sorted(set(cars) - set(about.cars)):
         raise click.UsageError(
-            f"--car: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
+            f"--car: {', '.join(missing)} is not in {session.path}; its cars: {', '.join(about.cars) or 'none'}"
         )
     bounds: list[int | None] = []
     now_s = time.time()
@@ -35,5 +35,5 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
     if bounds[0] is not None and bounds[1] is not None and bounds[0] >= bounds[1]:
         raise click.UsageError(f"--from {start} is not before --to {end}: {there}")
     if not selection.overlaps(about.start_ns, about.end_ns):
-        raise click.UsageError(f"The time range is empty: {there} ({time_spec.words(about.length_s)}).")
+        raise click.UsageError(f"The time range is outside the session: {there} ({time_spec.words(about.length_s)}).")
     return selection

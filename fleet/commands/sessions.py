@@ -61,7 +61,7 @@ required_out_option = _new_session(required=True, help="Write the new session to
 
 @contextmanager
 def _session_errors(out: Path | None = None) -> Iterator[None]:
-    """Turn errors of a user into one line."""
+    """Turn expected errors into one line."""
     from fleet.recording.reading.session import NoSession
     from fleet.recording.tools.table_formats import FormatMissing
     from fleet.recording.tools.transform import Exists
@@ -95,7 +95,7 @@ def _open(path: Path) -> "Session":
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, stops, marks and cars.
 
-    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and their damage.
+    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and what is damaged.
     """
     _show(_summaries(directory), as_json=as_json)
     if not as_json:
@@ -108,7 +108,7 @@ def _say_removed(place: Path) -> None:
         times = [str(each.get(name, "")) for each in removed for name in ("from", "to")]
         many = "1 session is" if len(removed) == 1 else f"{len(removed)} sessions are"
         span = f"{of_iso(min(times))} to {of_iso(max(times))}"
-        echo_safely(f"{many} gone for the quota, of {span}: {place / REMOVED_FILE} lists them", err=True)
+        echo_safely(f"{many} gone: removed by the quota, {span}. {place / REMOVED_FILE} lists them", err=True)
 
 
 @sessions.command(
@@ -122,7 +122,7 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date."""
     now_s = time.time()
     try:
-        time_spec.is_within(time_text, 0, 0, now_s)  # refuses a wrong time even where there is no session
+        time_spec.is_within(time_text, 0, 0, now_s)  # rejects an invalid time even if there is no session
         ran = [one for one in _summaries(directory) if time_spec.is_within(time_text, one.start_ns, one.end_ns, now_s)]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
@@ -141,7 +141,7 @@ def _summaries(directory: Path | None) -> list["SessionSummary"]:
     except OSError as error:
         is_missing = isinstance(error, FileNotFoundError)
         why = f"There is no directory {place}." if is_missing else f"{place} cannot be listed: {error.strerror}."
-        raise click.ClickException(f"{why} `fleet sessions` without a name lists those here.") from None
+        raise click.ClickException(f"{why} `fleet sessions` without DIR lists the sessions here.") from None
     if not found:
         click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
     return found
@@ -217,7 +217,10 @@ def _say_contents(about: "SessionSummary") -> None:
     began = of_iso(about.started) or "an unknown time"
     click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
     if about.clock_back_s:
-        click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
+        click.echo(
+            f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is the time that passed "
+            "on that clock"
+        )
     click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}; stops: {about.stops}")
     for mark in about.marks:
         by = name_of(mark.get("by") or "") or "somebody"
@@ -228,7 +231,7 @@ def _say_contents(about: "SessionSummary") -> None:
         echo_safely(f"  pinned: {times}: {pin.get('cause')}: {pin.get('words')}{f' ({cars})' if cars else ''}")
     for each in about.gone:
         times = f"{of_iso(each['from'])} to {of_iso(each['to'])}"
-        echo_safely(f"  gone for the quota: {times}, {each['file']}{', pinned' * bool(each.get('pinned'))}")
+        echo_safely(f"  removed by the quota: {times}, {each['file']}{', pinned' * bool(each.get('pinned'))}")
     shown = {key: printable(key) for key in about.keys}
     width = max(map(len, shown.values()), default=0)
     for key, count in about.keys.items():
@@ -283,7 +286,7 @@ example:
 @click.argument("several", nargs=-1, required=True, type=SessionPath(), metavar="SESSION SESSION...")
 @required_out_option
 def merge(several: tuple[Path, ...], out: Path) -> None:
-    """Merge what several recorders of one fleet recorded at the same time, for example at two sites.
+    """Merge sessions that several recorders of one fleet recorded at the same time, for example at two sites.
 
     A message that several recorders received is written once. The recorders' clocks decide the order of the messages.
     """
@@ -358,17 +361,21 @@ def export(
     """Write a session to a new directory: as tidy tables, as a ROS 2 bag, or as a file for Foxglove.
 
     There is one table for each type of message. Its columns are key, car, log_time, publish_time, sequence, then the
-    fields. Times are UTC, in Parquet in microseconds. The names of columns contain the units. In Parquet, the metadata
-    of the fields has them, too. Messages that are not protobuf are in the table `other`. A bag contains only standard
-    messages (docs/how-to/look-at-a-recording.md).
+    fields. Times are UTC, in Parquet in microseconds. The names of columns contain the units. In Parquet, the units are
+    also in the metadata of the fields. Messages that are not protobuf are in the table `other`. A bag contains only
+    standard messages (docs/how-to/look-at-a-recording.md).
     """
     from fleet.commands.session_export import export_foxglove, export_ros2, export_tables
 
     places = [each for each in (csv, parquet, ros2, foxglove) if each is not None]
     if not places or len(set(places)) < len(places):
-        raise click.UsageError("say where to, and as what: --csv, --parquet, --ros2, --foxglove, each with its own DIR")
+        raise click.UsageError(
+            "say in which format, and where to: --csv, --parquet, --ros2 or --foxglove, each with its own DIR"
+        )
     if nanoseconds and parquet is None:
-        raise click.UsageError("--nanoseconds is about Parquet, and CSV has them always: give --parquet DIR, too")
+        raise click.UsageError(
+            "--nanoseconds applies only to Parquet (CSV always has nanoseconds): also give --parquet DIR"
+        )
     if csv is not None:
         with _session_errors(csv):
             export_tables(_open(session), csv, "csv")

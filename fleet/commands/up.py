@@ -48,18 +48,18 @@ examples:
 
 Without FILE and --sim, the file is ./fleet.yaml. The start ends with one line: all cars are ready, or which cars are
 missing and why. With --sim and --json, lines on stdin go to the simulator (`gateway sim --help`). If a car cannot be
-stopped at the end, new gateways try again until the next Ctrl-C.
+stopped at the end, new gateways try again to stop it until the next Ctrl-C.
 
 With --detach the command returns when all cars are ready. It also returns if no further car becomes ready for 30 s
-(10 s if only links cannot be opened). In both cases the fleet goes on running: `fleet logs supervisor` shows its log,
-`fleet down` ends it.
+(10 s if only links cannot be opened). In both cases the fleet keeps running: `fleet logs supervisor` shows its
+log, `fleet down` ends it.
 
-Exit codes: 0 every car was stopped (--detach: all are ready), 1 a car was not, nothing started, or not everything was
-recorded, 2 wrong use."""
+Exit codes: 0 every car was stopped (with --detach: all are ready), 1 a car was not, or nothing started, or not
+everything was recorded, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--sim", "simulated", type=Number(int, 1, MAX_SIMULATED_CARS),
-              help="Simulate N cars: first the cars in the file, whatever their link.")  # fmt: skip
+              help="Simulate N cars: first the cars in the file, regardless of their links.")  # fmt: skip
 @click.option(
     "--plan",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -86,7 +86,7 @@ recorded, 2 wrong use."""
 @connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
 @fleet_option(default=None)
 @click.option("--insecure-lan", is_flag=True, help="Open the bus to a network. Everyone there can drive the cars.")
-@click.option("--secure", is_flag=True, help="Give everybody a certificate. No other user of this computer gets in.")
+@click.option("--secure", is_flag=True, help="Use certificates, so that no other user of this computer can connect.")
 @click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
 @click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")
 def up(
@@ -127,7 +127,7 @@ def up(
         for warning in spec.warnings:
             click.echo(f"fleet: {warning}", err=True)
         if not spec.cars:
-            raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
+            raise click.UsageError(f"{file} has no car with a link: `fleet bind` finds links, --sim {3} simulates cars")
         if spec.console:
             from fleet.commands.console import listen_or_fail  # needs an extra
 
@@ -137,7 +137,7 @@ def up(
             check_listening(endpoint, insecure_lan=insecure_lan)
         if spec.record and (why := Reserve().why_unwritable(spec.recordings)):
             raise click.ClickException(
-                f"No session can be made in {spec.recordings}: {why}. "
+                f"No session can be created in {spec.recordings}: {why}. "
                 "Name another place with --sessions, or drive without a recording: --no-record."
             )
         try:
@@ -145,7 +145,9 @@ def up(
         except AnotherSupervisor as error:
             raise click.ClickException(str(error)) from None
         except OSError as error:
-            raise click.ClickException(f"there is no place for the logs: {error}; set FLEET_STATE_DIR") from None
+            raise click.ClickException(
+                f"the logs cannot be written: {error}; set FLEET_STATE_DIR to another directory"
+            ) from None
     raise SystemExit(0 if stopped else 1)
 
 
@@ -163,26 +165,26 @@ def read(file: Path | None, options: UpOptions) -> FleetSpec:
 
 
 def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
-    """Return the spec with the endpoint of a hub with certificates, if there is one here, or if there shall be one."""
+    """Return the spec with the endpoint of a hub with certificates, if one is here, or if `secure` asks for one."""
     endpoint = resolve_endpoint(spec.endpoint)
     if not secure and not is_secure(endpoint):
         return spec
     from fleet.hub import local_hub  # needs an extra
 
     if secure and not is_secure(endpoint):
-        if not spec.endpoint and os.environ.get(ENDPOINT_VARIABLE):  # the next command would look there
+        if not spec.endpoint and os.environ.get(ENDPOINT_VARIABLE):  # the next command would use that bus
             raise click.UsageError(f"{ENDPOINT_VARIABLE} names a bus without certificates, {endpoint}: unset it")
         endpoint = f"tls/{endpoint.partition('/')[2]}"
     if secure or local_hub.is_hub_here(endpoint):
         try:
             local_hub.ensure_hub_here(endpoint, spec.cars)
         except OSError as error:
-            raise click.ClickException(f"no certificates can be made: {error}") from None
+            raise click.ClickException(f"certificates cannot be created: {error}") from None
     return replace(spec, endpoint=endpoint)
 
 
 def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
-    """Return the spec with this plan. Raises ValueError with everything in the plan that can never work."""
+    """Return the spec with this plan. Raises ValueError, which names everything in the plan that can never work."""
     plan = parse_plan(text, str(spec.plan))
     cars = listed_cars(
         parse_fleet(coordinator_fleet_file(spec), Path("fleet.yaml"), unbound=True)
@@ -219,29 +221,29 @@ def _run_detached(arguments: Iterable[str], *, as_json: bool) -> int:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            start_new_session=os.name == "posix",  # the end of the terminal must not end it
+            start_new_session=os.name == "posix",  # closing the terminal must not end the child
             creationflags=getattr(subprocess, "DETACHED_PROCESS", 0)
             | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
     try:
         code = _follow_start(child, as_json=as_json)
     except KeyboardInterrupt:
-        child.terminate()  # it stops every car first
+        child.terminate()  # the child stops every car first
         _follow_start(child, as_json=as_json)
         raise SystemExit(startup.INTERRUPTED) from None
-    child.returncode = child.poll() or 0  # it outlives this process
+    child.returncode = child.poll() or 0  # the child outlives this process, so prevent a warning
     return code
 
 
 def _follow_start(child: "subprocess.Popen[str]", *, as_json: bool) -> int:
-    """Print what a detached process has to say until its start has ended. Return the exit code."""
+    """Print the messages of a detached process until its start has ended. Return the exit code."""
     assert child.stdout is not None
     with child.stdout as output:
         for line in output:
             try:
                 event = json.loads(line)
                 what, words = event["what"], event["words"]
-            except (ValueError, KeyError, TypeError):  # an error of its arguments
+            except (ValueError, KeyError, TypeError):  # not an event: an error about its arguments
                 click.echo(line, nl=False, err=True)
                 continue
             ended = what in (READY, MISSING)

@@ -46,9 +46,9 @@ LAYOUT_DELAY_S: Final = 1.5
 )
 @bus_options
 def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
-    """Show the fleet live in Rerun, until you close its window or press Ctrl-C. The cars go on."""
+    """Show the fleet live in Rerun, until you close its window or press Ctrl-C. This does not affect the cars."""
     if web and save is not None:
-        raise click.UsageError("Give --web or --save, not both.")
+        raise click.UsageError("--web and --save exclude each other: give one of them.")
     if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):
         raise click.UsageError(f"--memory {memory} is not allowed: write 500MB, 1GiB or 25%")
     keys.check_name(fleet, "fleet name")

@@ -27,7 +27,7 @@ from schemas.local_time import date_and_clock
 from schemas.suggestion import did_you_mean
 
 MAX_TIMELINE_LINES: Final = 60
-"""Maximum lines of a timeline; --json has all."""
+"""Maximum number of printed lines of a timeline. --json prints all."""
 
 
 def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:

@@ -392,7 +392,7 @@ def test_unknown_links_blink_and_person_names_them(
                 assert not truth["motor_right"]
             bind.type(answer)
         if "blue" in answers:
-            bind.until("blue has the link /dev/nothing-of-this-name. Give it this one?")
+            bind.until("blue has the link /dev/nothing-of-this-name. Replace it with this one?")
             bind.type("y")
     bind.until("still without a link: red")
     assert bind.wait() == 1
