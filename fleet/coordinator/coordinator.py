@@ -1,6 +1,6 @@
 """The coordinator: a client of the bus with a policy. Samples come in, commands and publications go out.
 
-policy/ makes all decisions, even the decision to leave a car on hold alone. The gateway enforces that as well.
+policy/ makes all decisions, even the decision to leave a car on hold alone. The gateway also enforces the hold.
 """
 
 import time
@@ -36,9 +36,9 @@ from schemas.words import Level, Phase
 
 STEP_INTERVAL_S: Final = 0.1
 SINGLETON_RECHECK_S: Final = 1.0
-"""Delay of the second search for other coordinators: two may have started at the same moment."""
+"""Delay of the second search for other coordinators, because two may have started at the same moment."""
 _MAX_STATE_QUERIES: Final = 3
-"""Maximum queries for the cars' states at the start: a stalled gateway may miss the first."""
+"""Maximum number of queries for the cars' states at the start. A stalled gateway may miss the first one."""
 _PLAN_SET: Final = "plan_set"
 _UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it."
 
@@ -48,8 +48,8 @@ class Coordinator:
     """Commands cars by a plan. `client` is of kind coordinator, its sender begins with SENDER.
 
     The coordinator calls `on_decision` for each changed decision, and `on_failure` for each failed command and each
-    warning about a plan from the bus. `listed` has the cars in the fleet file (empty without one). The caller has
-    checked `plan` by lint.find_faults().
+    warning about a plan from the bus. `listed` has the cars in the fleet file, and is empty without a file. The caller
+    must have checked `plan` with lint.find_faults().
     """
 
     client: Fleet
@@ -67,7 +67,7 @@ class Coordinator:
     _restored: bool = False
     """True once the persisted state is restored."""
     _early: list[zenoh.Query] = field(default_factory=list)
-    """Commands that came before that."""
+    """Commands that came before the persisted state was restored."""
     _inbox: Inbox = field(init=False)
     _publications: Publications = field(init=False)
     _commands: OpenCommands = field(init=False)
@@ -106,7 +106,8 @@ class Coordinator:
                 for query in self._early:
                     self._answer(query, observer)
                 while not has_ended():
-                    # Read the hubs before the inbox, which then has the lost tokens of a hub that is gone.
+                    # Read the hubs before the inbox: if a hub is gone, the inbox then already contains the tokens that
+                    # it lost.
                     linked_hubs = bus.hubs
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()
@@ -118,7 +119,7 @@ class Coordinator:
                         hubs, self._memory = linked_hubs, on_hub_back(self._memory, now)
                     try:
                         self._step(observer, pool, now)
-                    except OSError:  # its own output is closed: its parent has ended
+                    except OSError:  # our own output is closed, because the parent process has ended
                         raise
                     except Exception as error:  # noqa: BLE001 - the input came over the bus
                         self._publications.log_internal_error("deciding", error)
@@ -127,13 +128,13 @@ class Coordinator:
                         yield_to_another(self.client)
                     self._publications.republish(now)
                 if not self.run_name and self._memory.stopped_by:
-                    # Who ends a coordinator by hand and starts another one wants its plan to run.
+                    # A person who ends a coordinator by hand and starts another one wants the plan to run.
                     self._save(replace(self._memory, stopped_by="", to_rest=frozenset()))
             finally:
                 self.client.close()  # ends pending commands
 
     def _check_sleep(self, observer: FleetObserver, now: float) -> None:
-        """After a sleep of the computer, decide by new readings only. The sleep costs no car its role."""
+        """After a sleep of the computer, decide only by new readings. No car loses its role by the sleep."""
         if (slept_s := self.sleep.take()) > 0:
             observer.on_sleep(0.0 if MONOTONIC_COUNTS_SLEEP else slept_s)
             self._memory = on_hub_back(self._memory, now)
@@ -147,7 +148,8 @@ class Coordinator:
         observer.forget(now, {*self.plan.named, *self._memory.held_roles, *self._commands.busy})
         result = step(self.plan, observer.snapshot(self._commands.busy), self._memory, now)
         before, self._memory = self._memory, result.memory
-        # Persist before anything is published or commanded: a coordinator killed now is followed by one that knows.
+        # Persist before anything is published or commanded. If this coordinator is killed now, the next one knows the
+        # state.
         self._save(self._memory)
         gone = before.decisions.keys() - result.memory.decisions.keys()
         self._publications.forget(gone)
@@ -172,7 +174,7 @@ class Coordinator:
         check_sender(observer.people if self.people is None else self.people, by)
 
     def _on_request(self, query: zenoh.Query, request: PlanRequest, observer: FleetObserver) -> None:
-        """Carry out a request for the plan in force. It is persisted and recorded before it is confirmed."""
+        """Carry out a request for the plan in force. Its result is persisted and published before it is confirmed."""
         try:
             by = sender_of(query, "fleet.v1.PlanCommand")
             self._check_sender(observer, by)
@@ -235,10 +237,12 @@ class Coordinator:
     def _drain_inbox(self, observer: FleetObserver, pool: ThreadPoolExecutor, wait_s: float = STEP_INTERVAL_S) -> None:
         """Handle all items in the inbox. Wait at most `wait_s` for the first."""
         for item in self._inbox.items(wait_s):
-            self._handle_gateways(observer, pool)  # first: a gateway declares its token before it publishes states
+            self._handle_gateways(
+                observer, pool
+            )  # handle tokens first: a gateway declares its token before it publishes states
             try:
                 self._handle(item, observer)
-            except OSError:  # its own output is closed: its parent has ended
+            except OSError:  # our own output is closed, because the parent process has ended
                 raise
             except Exception as error:  # noqa: BLE001 - no input from the bus may end a coordinator
                 self._publications.log_internal_error("handling what came over the bus", error)
@@ -269,7 +273,7 @@ class Coordinator:
                 self._reply(query, observer)
             except OSError:
                 raise
-            except Exception as error:  # noqa: BLE001 - each query gets a reply, and the coordinator goes on
+            except Exception as error:  # noqa: BLE001 - each query gets a reply, and the coordinator keeps running
                 words = self._publications.log_internal_error(f"answering {query.key_expr}", error)
                 query.reply_err(words, encoding="text/plain")
 

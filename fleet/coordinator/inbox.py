@@ -1,7 +1,7 @@
 """Input of the coordinator from the bus: samples and queries in order, and gateways that arrive or leave.
 
-Zenoh's threads fill the inbox, the coordinator's own thread empties it. It is bounded: what is too much is dropped and
-counted.
+Zenoh's threads fill the inbox, and the coordinator's own thread empties it. Its size is limited: further items are
+dropped and counted.
 """
 
 import queue
@@ -22,10 +22,10 @@ from schemas.topics import Qos
 _STATE_QUERY_TIMEOUT_S: Final = 1.0
 _INBOX_SIZE: Final = 4096
 _MAX_WAITING_QUERIES: Final = 64
-"""Maximum queries in the inbox."""
+"""Maximum number of queries in the inbox."""
 _MAX_STATE_QUERIES_AT_ONCE: Final = 4
 _MAX_CARS_QUERIED_SINGLY: Final = 8
-"""Maximum cars with a query of their own. If more arrive together, one query asks all cars."""
+"""Maximum number of cars that are queried one by one. If more arrive together, one query asks all cars."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +40,21 @@ Item = Sample | QueriedSample | zenoh.Query
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Messages and changes of one turn of a program that only listens."""
+    """Messages and changes that a program that only listens has taken from its inbox at one time."""
 
     now: float
-    """When they were taken from the inbox, s, monotonic."""
+    """The time at which they were taken from the inbox, s, monotonic."""
     gateways: Mapping[str, bool]
     """The cars whose gateways arrived (True) or left."""
     samples: Sequence[tuple[Sample, float | None]]
-    """Messages, each with its wall clock, s, if a query returned it (it may be old), or None if just published."""
+    """Messages. A message from a query may be old: it has the wall clock now, s. One that was just published has
+    None."""
 
 
 class Inbox:
     """The inbox of a coordinator, or of a program that only listens.
 
-    `topics_wanted` returns the topics of which the cars are asked.
+    `topics_wanted` returns the topics for which the cars are queried.
     """
 
     def __init__(self, client: Fleet, topics_wanted: Callable[[], set[str]]) -> None:
@@ -75,7 +76,8 @@ class Inbox:
     def listening(cls, client: Fleet, topics: Iterable[str], more: Iterable[str] = ()) -> Self:
         """Return the inbox of a program that only listens, filled from now on.
 
-        topics: of all cars; a car that arrives is asked for them. more: topics that are only heard.
+        topics: topics of all cars to listen to. A car whose gateway arrives is also queried for them. more: topics that
+        are not queried.
         """
         asked = {*topics}
         inbox = cls(client, lambda: asked)
@@ -84,21 +86,21 @@ class Inbox:
         inbox.watch_gateways()
         return inbox
 
-    # ------------------------------------------------------------------ filling it
+    # ------------------------------------------------------------------ filling the inbox
 
     def subscribe(self, expression: str) -> None:
-        """Take the samples of these keys, too."""
+        """Also receive the samples of these keys."""
         if expression not in self._subscribed:
             self._subscribed.add(expression)
             self._client.bus.subscribe(expression, self._enqueue)
 
     def watch_gateways(self) -> None:
-        """Take the changes of the gateways' tokens."""
+        """Receive the changes of the gateways' tokens."""
         token = keys.car_token(self._client.name, "*")
         self._client.bus.watch_tokens(token, lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
 
     def on_query(self, query: zenoh.Query) -> bool:
-        """Put a query into the inbox; False if too many wait. Runs on a Zenoh thread."""
+        """Put a query into the inbox. Return False if too many wait. Runs on a Zenoh thread."""
         if not self._query_slots.acquire(blocking=False):
             return False
         if self._enqueue(query):
@@ -115,7 +117,7 @@ class Inbox:
                     self._enqueue(QueriedSample(answer))
 
     def _enqueue(self, item: Item) -> bool:
-        """Put an item into the inbox; False if it is full. Runs on a Zenoh thread."""
+        """Put an item into the inbox. Return False if the inbox is full. Runs on a Zenoh thread."""
         try:
             self._items.put_nowait(item)
         except queue.Full:
@@ -123,10 +125,10 @@ class Inbox:
             return False
         return True
 
-    # ------------------------------------------------------------------ emptying it
+    # ------------------------------------------------------------------ emptying the inbox
 
     def items(self, wait_s: float) -> Iterator[Item]:
-        """Yield the items in the inbox, as many as it holds. Wait at most `wait_s` for the first."""
+        """Yield the items in the inbox, at most as many as it can hold. Wait at most `wait_s` for the first."""
         for _ in range(_INBOX_SIZE):  # later items are for the next step
             try:
                 item = self._items.get(timeout=wait_s) if wait_s else self._items.get_nowait()
@@ -138,7 +140,10 @@ class Inbox:
             yield item
 
     def hear(self, wait_s: float, pool: ThreadPoolExecutor) -> Heard:
-        """Return what has come, and ask the cars that have arrived. Wait at most `wait_s` for the first message."""
+        """Return new messages and changes, and query the cars that arrived.
+
+        Wait at most `wait_s` for the first message.
+        """
         items = list(self.items(wait_s))
         now, wall_s, changes = time.monotonic(), time.time(), self.gateways()
         self.query_arrived(changes, pool, began=True)

@@ -19,7 +19,7 @@ REQUIRED_TOPICS: Final = ("state/link", "state/mode", "state/motion", "state/saf
 FORGET_AFTER_S: Final = 60.0
 """Time after which a car without a gateway is forgotten, unless the fleet file or the plan names it."""
 MAX_ABSENT_CARS: Final = 256
-"""Maximum remembered cars without a gateway. The oldest are forgotten first."""
+"""Maximum number of remembered cars without a gateway. The car that left first is forgotten first."""
 MAX_UNCONFIRMED_CARS: Final = 256
 """Maximum unlisted names on the bus that count as cars before they publish their states."""
 
@@ -33,7 +33,7 @@ class FleetObserver:
     states: dict[str, CarState] = field(default_factory=dict)
     """State of each car by name, as heard on the bus."""
     _absent_since: dict[str, float] = field(default_factory=dict)
-    """Unlisted cars without a gateway on the bus; the first to leave stands first."""
+    """Time since which unlisted cars have had no gateway on the bus, in the order in which they left."""
     _confirmed: set[str] = field(default_factory=set)
     """Cars that have published all REQUIRED_TOPICS once, present or not."""
 
@@ -56,8 +56,9 @@ class FleetObserver:
         return People.merged(state.authority.people for state in self.states.values())
 
     def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
-        """Return a snapshot; `busy`: the cars with a pending command."""
-        # An unlisted name counts as a car once it has published its states. Before, only few count while present.
+        """Return a snapshot. `busy` are the cars with a pending command."""
+        # An unlisted name counts as a car once it has published its states. Before that, only a limited number of them
+        # count, and only while they are present.
         cars = {car: known for car, known in self.cars.items() if known.listed or car in self._confirmed}
         unconfirmed = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
         cars.update(list(islice(unconfirmed, MAX_UNCONFIRMED_CARS)))
@@ -81,7 +82,8 @@ class FleetObserver:
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         if (state := self.states.get(car)) is not None:
-            # A gateway that comes back counts as new: a recording that is played in a loop has its gateways again.
+            # A gateway that comes back counts as new. If a recording is played in a loop, the same gateways come back
+            # each time.
             readings = {topic: each for topic, each in state.newest_by_topic.items() if topic.startswith("sensor/")}
             self.states[car] = CarState(car, alive, readings)
 
@@ -99,17 +101,20 @@ class FleetObserver:
             each.pop(car, None)
 
     def on_sleep(self, slept_s: float) -> None:
-        """Let all readings age by a sleep of the computer, which the clock of their times does not count."""
+        """Make all readings older by a sleep of the computer: the clock of their times stood still meanwhile."""
         for state in self.states.values():
             state.on_sleep(slept_s)
 
     def on_outcome(self, car: str, refusal: Refusal | None) -> None:
-        """Note the refusal of a command, or (None) that one succeeded."""
+        """Note that a command was refused, or with None that a command succeeded."""
         if car in self.cars:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Take a message in. `wall_s` is the wall clock if a query returned it (it may be old), else None."""
+        """Add a message. If a query returned it, it may be old: then `wall_s` is the wall clock.
+
+        Otherwise it is None.
+        """
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:
@@ -159,7 +164,7 @@ def _all_known(state: CarState) -> bool:
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:
-    """Return the cars in a fleet file as the policy knows them before their gateways are up."""
+    """Return the cars in a fleet file as the policy knows them before their gateways are on the bus."""
     return {
         name: CarSnapshot(
             platform="" if car.platform.startswith(AUTO) else car.platform,

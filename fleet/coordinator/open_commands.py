@@ -1,4 +1,4 @@
-"""The commands that the coordinator has sent and that have no outcome yet: modes and colors, and what failed before."""
+"""The coordinator's mode and color commands that have no outcome yet, and the last failures."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,7 +10,7 @@ from fleet.policy.decide import Ask
 
 
 class OpenCommands:
-    """The open commands of one coordinator. Tells each new failure once."""
+    """The open commands of one coordinator. Reports each new failure once."""
 
     def __init__(self, client: Fleet, on_failure: Callable[[str], None]) -> None:
         self._client = client
@@ -21,14 +21,14 @@ class OpenCommands:
 
     @property
     def busy(self) -> Collection[str]:
-        """The cars that have a command for a mode without an outcome."""
+        """The cars whose mode command has no outcome yet."""
         return self._modes.keys()
 
     def send(self, asks: Iterable[Ask], pool: ThreadPoolExecutor) -> None:
-        """Send commands. A car that has not answered for its color yet gets no other color of a blink."""
+        """Send commands. Skip a color of a blink if the car's last color command has no outcome yet."""
         for ask in asks:
             if ask.blink and any(ask.car == other.car for other, _ in self._leds):
-                continue  # its link or the car is slower than the LED should blink
+                continue  # the link or the car is too slow for this blinking
             request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
             future = pool.submit(self._client.ask, request, [ask.car])
             if ask.mode is not None:

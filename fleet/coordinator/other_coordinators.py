@@ -1,4 +1,4 @@
-"""Finds the other coordinators of a fleet: there is only one."""
+"""Finds other coordinators of a fleet, because a fleet may have only one."""
 
 from typing import Final
 
@@ -10,7 +10,7 @@ SENDER: Final = "coordinator-"
 
 
 class AnotherCoordinator(Exception):
-    """The fleet has a coordinator already; the text names it."""
+    """The fleet already has a coordinator. The text names it."""
 
 
 def declare_alone(client: Fleet) -> None:
@@ -22,7 +22,7 @@ def declare_alone(client: Fleet) -> None:
 
 
 def yield_to_another(client: Fleet) -> None:
-    """Raise AnotherCoordinator if one with a lower name started at the same moment."""
+    """Raise AnotherCoordinator if one whose name sorts before ours started at the same moment."""
     if others := [name for name in _others(client) if name < client.sender]:
         raise _another(client, others)
 
@@ -36,4 +36,4 @@ def _others(client: Fleet) -> list[str]:
 def _another(client: Fleet, others: list[str]) -> AnotherCoordinator:
     who = ", ".join(others) or "without a name"
     fleet = keys.describe_fleet(client.name).capitalize()
-    return AnotherCoordinator(f"{fleet} has a coordinator already ({who}). Stop that one first.")
+    return AnotherCoordinator(f"{fleet} already has a coordinator ({who}). Stop that one first.")

@@ -12,7 +12,7 @@ from schemas.identity import NotTheSender, sender_for
 from schemas.words import Phase, Reason
 
 PLAN_VERB: Final = "plan"
-"""`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
+"""`<fleet>/@coordinator/@cmd/plan` accepts another plan: a fleet.v1.Plan, or the plain text of the plan."""
 
 
 def reply_result(query: zenoh.Query, result: pb.Result) -> None:
@@ -53,7 +53,7 @@ def sender_of(query: zenoh.Query, message_type: str) -> str:
 
 
 def _proven(query: zenoh.Query, sender: str) -> str:
-    """Return the sender, or the owner of the certificate if none is named. Raises RequestRefused for another's name."""
+    """Return the sender, or the certificate's owner if no sender is named. Raises RequestRefused for another name."""
     key = str(query.key_expr)
     try:
         return sender_for(keys.identity_of(key), sender, key.rpartition("/")[2])

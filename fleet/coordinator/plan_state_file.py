@@ -1,7 +1,7 @@
 """Persists roles, phase and rules in force for the next coordinator, in one small JSON file per fleet.
 
-The file is a convenience: the cars' modes count for more (policy/state.py). So errors of reading and writing are
-ignored.
+The file is not essential, because the cars' modes count for more (policy/state.py). So errors of reading and writing
+are ignored.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from schemas.atomic_file import DAMAGE, write_state
 from schemas.state_dir import directory_of
 
 MAX_CLOCK_NOISE_S: Final = 1.0
-"""Maximum change of the start of a phase that is not a step of the wall clock."""
+"""A phase's start on the wall clock may change by this much before the change counts as a step of that clock."""
 
 
 class CoordinatorStateFile:
@@ -30,9 +30,10 @@ class CoordinatorStateFile:
             self.path = directory_of(endpoint) / f"{fleet}.@coordinator.json"
 
     def load(self) -> PersistedPolicy:
-        """Return the persisted state; an empty one if the file cannot be read or belongs to another bus.
+        """Return the persisted state, or an empty one if the file cannot be read or belongs to another bus.
 
-        Phase and rules count within one `fleet up` run. In a new run, the plan starts again with the same roles.
+        Phase and rules are restored only within one `fleet up` run. In a new run, the plan starts again with the same
+        roles.
         """
         if self.path is None:
             return PersistedPolicy()
@@ -70,7 +71,8 @@ class CoordinatorStateFile:
 
 
 def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:
-    """Return True if nothing differs but the last digits of the start of the phase, which follow the clock."""
-    # If the wall clock is set, the start is written again: else a restarted coordinator would take the step for time.
+    """Return True if the states are equal, except for small changes of the start of the phase."""
+    # After a step of the wall clock the start is written again. Otherwise a restarted coordinator would count the step
+    # as time that passed.
     is_step = abs(one.phase_since_s - other.phase_since_s) > MAX_CLOCK_NOISE_S
     return not is_step and replace(one, phase_since_s=0.0) == replace(other, phase_since_s=0.0)

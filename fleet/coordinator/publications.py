@@ -1,4 +1,4 @@
-"""Output of the coordinator to the bus: plan, roles, decisions and a log. The last messages answer queries."""
+"""Output of the coordinator to the bus: plan, roles, decisions and a log. Queries get the last messages."""
 
 import contextlib
 import time
@@ -21,9 +21,9 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Level
 
 REPUBLISH_INTERVAL_S: Final = 10.0
-"""Interval of repeated plans, assignments and decisions, for recordings that began after the first."""
+"""Interval at which plan, assignment and decisions are published again, for recordings that began later."""
 INTERNAL_ERROR: Final = "internal_error"
-"""Code of the event about an unexpected exception. The coordinator goes on."""
+"""Code of the event about an unexpected exception. The coordinator keeps running."""
 _MAX_ERROR_LENGTH: Final = 500
 """Maximum characters of such an exception's text, which may quote payloads from the bus."""
 
@@ -35,7 +35,7 @@ class Publications:
         self._client = client
         self._on_failure = on_failure
         self._last: dict[tuple[str, str], tuple[Publisher, Any]] = {}
-        """The last message by topic and subject: the replies to queries."""
+        """The last message by topic and subject, for replies to queries."""
         self._publishers: dict[str, Publisher] = {}
         self._republish_at = time.monotonic() + REPUBLISH_INTERVAL_S
         self._internal_errors: dict[str, float] = {}
@@ -73,9 +73,9 @@ class Publications:
         self._publisher("log").put(messages.log_message(now_ns, level, name, words), now_ns)
 
     def log_internal_error(self, during: str, error: Exception) -> str:
-        """Log an unexpected exception as an event and on stderr; return the words.
+        """Log an unexpected exception as an event and on stderr. Return its text.
 
-        The same words are logged once per REPUBLISH_INTERVAL_S: a fault in each step would fill the disk.
+        The same text is logged only once per REPUBLISH_INTERVAL_S, because a fault in each step would fill the disk.
         """
         frames = traceback.extract_tb(error.__traceback__)
         where = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
@@ -100,7 +100,7 @@ class Publications:
 
 
 def decision_message(decision: Decision, since_s: float) -> pb.Decision:
-    """Return the message of a decision that holds since this time, s of the wall clock."""
+    """Return the message of a decision that has held since `since_s`, s of the wall clock."""
     return pb.Decision(
         since=Timestamp(seconds=int(since_s), nanos=int(since_s % 1 * 1e9)),
         subject=decision.subject,

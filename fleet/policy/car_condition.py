@@ -1,7 +1,7 @@
 """Conditions over the readings of one car, for `find` and the pins of recordings. Pure.
 
-The names are those of plans, and the meaning is that of `Holding`. `CarCondition` is fed live by the recorder, and from
-files by `find`.
+The conditions use the names of plans, and `Holding` decides for how long they hold. The recorder feeds `CarCondition`
+with live messages, `find` feeds it from files.
 """
 
 from collections.abc import Collection
@@ -32,7 +32,7 @@ def parse_condition(text: str) -> Expression:
 
 
 class CarCondition:
-    """A condition over the messages of one car. They come in the order in which they were published, by topic."""
+    """A condition over the messages of one car. The messages of each topic must come in the order of publishing."""
 
     def __init__(self, expression: Expression) -> None:
         self._expression = expression
@@ -40,18 +40,18 @@ class CarCondition:
         self._newest: dict[str, tuple[int, Observation]] = {}
         """Time and message by topic."""
         self.topics: Collection[str] = frozenset(map(topic_of, expression.names))
-        """The topics whose messages it takes."""
+        """The topics that the condition uses."""
 
     @property
     def span(self) -> HeldSpan | None:
-        """The time for which it has held, if that has not ended."""
+        """The time span for which the condition has held, if that has not ended."""
         return self._holding.span
 
     def add(self, topic: str, message: Any, at_ns: int) -> HeldStep | None:
-        """Take in a message of a topic that it takes. None means that the message is older than the newest one.
+        """Add a message of one of `topics`. Return None if the message is older than the newest one of its topic.
 
-        at_ns: its own time. If it is older by more than CLOCK_STEP_S, somebody has set the clock back, and all begins
-        again.
+        at_ns: the message's own time. If it is older by more than CLOCK_STEP_S, somebody has set the clock back.
+        Everything then begins again.
         """
         newest_ns, before = self._newest.get(topic, (at_ns, None))
         ended = None
@@ -68,5 +68,5 @@ class CarCondition:
         return step._replace(ended=step.ended or ended)
 
     def end(self) -> HeldSpan | None:
-        """End the time for which it has held, and return it."""
+        """End the time span for which the condition has held, and return that span."""
         return self._holding.end()

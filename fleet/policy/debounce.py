@@ -12,16 +12,16 @@ UNKNOWN_TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Debounced:
-    """A condition that is true, or (not `on`) has not been true for long enough yet."""
+    """A condition that counts as true (`on`), or that has not been true for long enough yet."""
 
     on: bool
     since: float
-    """Since when the condition has been true without a break."""
+    """The time since which the condition has been true without a break."""
     otherwise_since: float | None = None
 
 
 def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself
-    """Follow a condition: on after `for_s`, None after HYSTERESIS_S of false or UNKNOWN_TIMEOUT_S of unknown."""
+    """Follow a condition. It is on after `for_s`. None after HYSTERESIS_S of false, or UNKNOWN_TIMEOUT_S of unknown."""
     if before is None or not before.on:
         if not value:
             return None
@@ -44,7 +44,7 @@ class Settled:
 
 
 def settle(before: Settled | None, value: bool | None, now: float) -> Settled | None:  # noqa: FBT001 - the value itself
-    """Follow a boolean. The first value counts at once; unknown leaves the value as it was."""
+    """Follow a boolean. The first value counts at once. An unknown value changes nothing."""
     if value is None or before is None:
         return before if value is None else Settled(value)
     if value is before.value:

@@ -1,27 +1,27 @@
 """One step of the coordinator: what each car should do now, why, and the commands for it. Pure and deterministic.
 
 A plan says which roles there are and when rules give them to cars. Turning that into commands looks like a lookup, and
-would be one if cars were always there, readings always fresh, and nobody else drove. They are not, so most of what is
-here is about *not* acting.
+would be one if cars were always connected, readings always fresh, and nobody else drove. But that is not so, and most
+of this module is about *not* acting.
 
-First: whose car is it? The coordinator has the lowest rank. A car that a person holds, drives, has paused or borrowed,
-or that cannot be reached, is left alone, whatever the plan says; it is a *barrier*, in the words of this module, and
-each barrier has a sentence for the person who asks why nothing happens. Its role is kept for it for a while, because
-links come back within seconds, and a fleet that reshuffles at every hiccup of a radio is worse than one role that is
-vacant for a moment.
+First: whose car is it? The coordinator has the lowest rank. A car is left alone, whatever the plan says, if a person
+holds, drives, has paused or borrowed it, or if it cannot be reached. This module calls such a reason a *barrier*. Each
+barrier has a sentence for the person who asks why nothing happens. A car that is out of reach keeps its role for a
+while, because links come back within seconds. A fleet that reshuffles at every hiccup of a radio is worse than one role
+that is vacant for a moment.
 
-Second: what is true? Rules are asked in every step, but their conditions must hold for a time before they count, and
-stop holding for a time before they end (`debounce`, `rules`). A comparison with a value that was not measured is
-unknown, which is not true: nothing is done on the strength of what nobody has seen.
+Second: what is true? Rules are evaluated in every step. But their conditions must be true for a time before they count,
+and must not be true for a time before they end (`debounce`, `rules`). A comparison with a value that was not measured
+is unknown, and unknown does not count as true: nothing is done because of something that nobody has seen.
 
 Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
-most, then the cars that have their role already, then few changes of mode. A car that has failed to take its mode twice
-may be replaced.
+most, then cars that keep their role, then few changes of mode. A car may be replaced if it has twice failed to change
+to its mode.
 
-Only then are there commands, and only those that change something. A mode that the car has is not asked for again; one
-that it does not take is retried ever more slowly. Everything that lasts from one step to the next is in `memory`, and
-time is an argument: the same plan, snapshot and memory give the same step, in a test, in a dry run, and in a replay of
-yesterday's recording that asks what another plan would have done.
+Only then come commands, and only commands that change something. A car that is in its mode is not commanded again. If
+it does not change to the mode, the command is retried at growing intervals. Everything that lasts from one step to the
+next is in `memory`, and time is an argument. So the same plan, snapshot and memory give the same step in a test, in a
+dry run, and in a replay of yesterday's recording that asks what another plan would have done.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -65,7 +65,7 @@ from schemas.keys import name_of
 from schemas.words import UNKNOWN, LinkState, Mode, Motors, Verdict
 
 FIRST_STATE_TIMEOUT_S: Final = 1.5
-"""Timeout for the first states of the cars on the bus; the first roles wait for them."""
+"""Timeout for the first states of the cars on the bus. The first roles wait for these states."""
 ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
 """Number of failed mode commands after which another car may take over the role."""
 
@@ -78,12 +78,12 @@ class Ask:
     mode: Mode | None = None
     led: Rgb | None = None
     blink: bool = False
-    """True if the next command comes soon, so this one may be dropped while the car is busy with the last."""
+    """True if the next command comes soon, so that this one may be dropped while the car is still busy."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionStep:
-    """The result of one snapshot; `memory` is for the next step."""
+    """The decisions about one snapshot. `memory` is for the next step."""
 
     memory: PolicyState
     decisions: tuple[Decision, ...] = ()
@@ -115,7 +115,9 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     free = tuple(car for car in subjects if car not in barriers)
     cars = CarSets(subjects, frozenset(free), frozenset({*free, *lately}), roles_before)
     phase = memory.phase
-    if not phase.name:  # the first phase begins before the rules are evaluated: some count only in it
+    if (
+        not phase.name
+    ):  # the first phase begins before the rules are evaluated, because some rules count only in this phase
         phase = follow_phase(plan, snapshot, cars, phase, {}, now, ready=False)
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
     phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, barrier_of, memory))
@@ -150,7 +152,9 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     decisions = [explain_phase(plan, phase, snapshot)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S  # the latter by on_hub_back
+            kept_s = (
+                HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
+            )  # on_hub_back has set the later time
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain_rule(car, overrides[car], allocation.roles.get(car)))
@@ -190,12 +194,13 @@ def _step_stopped(
     memory: PolicyState,
     now: float,
 ) -> DecisionStep:
-    """Bring the cars of a stopped plan to rest, without a hold, and leave all others alone."""
+    """Bring the cars of a stopped plan to rest, without a hold, and leave all other cars alone."""
     attempts, asks, decisions = dict[str, ModeAttempts](), list[Ask](), list[Decision]()
     for car, barrier in barrier_of.items():
         tried = memory.mode_attempts.get(car, ModeAttempts(Mode.MANUAL))
         known = snapshot.cars.get(car, UNKNOWN_CAR)
-        # A mode command may have been on its way when the plan was stopped: only a later one shows that it is over.
+        # A mode command may have been on its way when the plan was stopped. Only the outcome of a later command shows
+        # that the earlier one is over.
         rests = (
             tried.count
             and known.mode == Mode.MANUAL
@@ -233,7 +238,7 @@ def _step_stopped(
 
 
 def _cars_of(plan: Plan, snapshot: FleetSnapshot) -> tuple[str, ...]:
-    """Return the cars to decide about: those that the plan names, or all cars if the plan is open to any."""
+    """Return the cars to decide about: the cars that the plan names, and all others if the plan is open to any car."""
     return tuple(sorted({*plan.named, *snapshot.cars})) if plan.open else tuple(sorted(plan.named))
 
 
@@ -248,9 +253,9 @@ def _is_recovering(known: CarSnapshot) -> bool:
 def _is_ready(
     snapshot: FleetSnapshot, barrier_of: Mapping[str, tuple[Barrier, bool] | None], memory: PolicyState
 ) -> bool:
-    """Return True if every car that can be commanded is known and in the mode that was decided last.
+    """Return True if the state of every car is known, and every car is in the mode that was decided for it last.
 
-    Cars that a person has taken, lost, doubted and absent cars count as ready, unless no car is present yet.
+    Cars that are lost, doubted, absent or taken by a person count as ready, unless no car is present yet.
     """
     for car, barrier in barrier_of.items():
         known = snapshot.cars.get(car, UNKNOWN_CAR)
@@ -265,7 +270,7 @@ def _is_ready(
                 return False
             continue
         decision = memory.decisions.get(car)
-        if decision is None or decision.kind is DecisionKind.ALONE:  # this car can be commanded since this step
+        if decision is None or decision.kind is DecisionKind.ALONE:  # this car can be commanded only since this step
             return False
         if decision.mode is not None and (
             known.mode != decision.mode or known.verdict == Verdict.CONTRADICTED or known.busy
@@ -275,10 +280,10 @@ def _is_ready(
 
 
 def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
-    """Return why the car is left alone and whether a person caused it (then it loses its role at once), or None."""
+    """Return why the car is left alone, or None, and whether a person caused that. If so, it loses its role at once."""
     if not known.present:
         return Barrier(f"{car} is not on the bus", "its gateway comes up"), False
-    if not known.mode:  # nor is it known whether there is a hold
+    if not known.mode:  # nor is it known whether the car is on hold
         return Barrier(f"{car} has published no state yet", "its gateway publishes its first states"), False
     if known.estopped_by is not None:
         return Barrier(
@@ -300,7 +305,7 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
         return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends"), False
     if known.link == LinkState.LOST:
         return Barrier(f"the link of {car} is lost", "its link is back"), False
-    if known.doubted:  # people may command it, and see what it does
+    if known.doubted:  # people may command the car, because they see what it does
         ends = (
             f"it shows a stop (`fleet stop {car}`), or a person who has looked at it resumes it (`fleet resume {car}`)"
         )
@@ -322,7 +327,7 @@ def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tu
 
 
 def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, tuple[str, str]]:
-    """Return by car the only role that rules in force let it have, and the rule. The first rule counts."""
+    """Return by car the only role that a rule in force lets it have, and that rule. The first rule counts."""
     result: dict[str, tuple[str, str]] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:
@@ -341,7 +346,7 @@ def _overrides(
 ) -> dict[str, Override]:
     """Return the modes that rules in force give cars, whatever their roles say. The first rule counts.
 
-    A rule for several cars skips those that do not know its mode: they would refuse it forever.
+    A rule for several cars skips cars that do not know its mode, because they would refuse it again and again.
     """
     result: dict[str, Override] = {}
     decided: set[str] = set()
@@ -403,7 +408,7 @@ def _decide_places(
     result = []
     for name in candidates.plan.roles:
         role, places = candidates.plan.roles[name], allocation.places.get(name, 0)
-        # A role for all cars has no place while every car is left alone, and wants one nevertheless.
+        # A role for all cars has no place while every car is left alone, but it still wants at least one car.
         wants_all = role.count is None and not role.by_rules and name in candidates.in_force
         if not places and not wants_all:
             result.append(explain_inactive(name, candidates, phase))
@@ -435,7 +440,7 @@ def _command_modes(
     for decision in decisions:
         car, mode = decision.car, decision.mode
         if car is None or mode is None:
-            continue  # the car is left alone: its attempts are over
+            continue  # the car is left alone, so its attempts end
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         attempts = before.get(car, ModeAttempts(mode))
         if attempts.mode != mode:
@@ -447,7 +452,7 @@ def _command_modes(
             )
             continue
         if decision.kind is DecisionKind.IDLE and known.mode == UNKNOWN:
-            result[car] = attempts  # its gateway brings it to rest
+            result[car] = attempts  # its gateway is bringing it to rest
         elif known.busy or now < attempts.again_at:
             result[car] = replace(attempts, fine_since=None)
         else:
@@ -464,7 +469,7 @@ def _command_leds(
     allocation: RoleAllocation,
     memory: PolicyState,
 ) -> tuple[frozenset[LedRequest], list[Ask]]:
-    """Set each color of a rule once, as soon as the car is in mode manual: cars obey no color in other modes."""
+    """Set each color of a rule once, as soon as the car is in mode manual. Cars ignore colors in other modes."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
     result, asks = set[LedRequest](), []
     for index, state in rules.items():
@@ -493,7 +498,7 @@ def _command_blinks(
     allocation: RoleAllocation,
     before: Mapping[str, BlinkState],
 ) -> tuple[dict[str, BlinkState], list[Ask]]:
-    """Switch the LEDs that blink, each when its time is over, and switch off those that blink no more."""
+    """Switch each blinking LED when its time is over, and switch off LEDs that no longer blink."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
     now, result, asks = candidates.now, dict[str, BlinkState](), list[Ask]()
     for _, _, state, effect in _effects_in_force(plan, rules):

@@ -1,4 +1,4 @@
-"""A decision as a value: subject, result, reason, and what would change it. explain.py writes the words. Pure."""
+"""A decision as a value: subject, result, reason, and what would change it. explain.py writes the texts. Pure."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -10,7 +10,7 @@ LEFT_ALONE: Final = "left alone"
 
 
 class DecisionKind(StrEnum):
-    """Subject of a decision."""
+    """Kind of a decision: its subject, and for a car what decides."""
 
     ROLE = "role"
     RULE = "rule"
@@ -32,10 +32,10 @@ class Decision:
     decided: str
     """The result in a word or two: the mode, `left alone`, `1 of 2`, the phase."""
     cause: str
-    """Identifies the reason: it stays the same as long as the same thing decides."""
+    """Identifies the reason. It stays the same as long as the same role, rule or barrier decides."""
     why: str
     readings: tuple[str, ...] = ()
-    """The readings that it is based on, with values and ages."""
+    """The readings on which the decision is based, with values and ages."""
     would_change: str = ""
     car: str | None = None
     role: str | None = None
@@ -45,7 +45,7 @@ class Decision:
     """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """Return `before` if both say the same, so that its first readings stay; else this decision."""
+        """Return `before` if both say the same, so that its readings stay. Otherwise return this decision."""
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

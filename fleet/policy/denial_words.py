@@ -1,6 +1,6 @@
 """Describes a denial of a right in a few words, for a page or an answer. Pure.
 
-The gateway's own words are longer: they say what to type.
+The gateway's own texts are longer, because they say what to type.
 """
 
 from schemas.keys import person_of
@@ -9,7 +9,10 @@ from schemas.words import Rank
 
 
 def describe(denial: Denial, sender: Sender, people: People, car: str) -> str:
-    """Return a denial to a person, in words. `car` is not used for those of the whole fleet."""
+    """Return a text about a denial, for the denied person.
+
+    `car` is not used for rights that are about the whole fleet.
+    """
     mark, person = denial.mark, sender.person
     by = person_of(mark.by) if mark is not None else ""
     who = f"{by}: {mark.why}" if isinstance(mark, Estop | FleetPause) and mark.why else by

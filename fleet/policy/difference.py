@@ -1,4 +1,4 @@
-"""What another plan changes: its roles, rules, phases and fixed cars beside those of the plan in force. Pure."""
+"""Compares the roles, rules, phases and fixed cars of another plan with those of the plan in force. Pure."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _ALL: Final = "all"
 
 @dataclass(frozen=True, slots=True)
 class PlanChange:
-    """One part that differs, such as `role guide`: its fields before and after, empty if that plan lacks the part."""
+    """One part that differs, such as `role guide`, with its fields in both plans. Empty if a plan lacks the part."""
 
     part: str
     before: tuple[tuple[str, str], ...] = ()
@@ -20,7 +20,7 @@ class PlanChange:
 
     @property
     def fields(self) -> tuple[tuple[str, str, str], ...]:
-        """The fields that differ: name, before, after. Empty texts: not there."""
+        """The fields that differ: name, before, after. A text is empty if the plan lacks the field."""
         then, now = dict(self.before), dict(self.after)
         names = dict.fromkeys((*then, *now))
         return tuple((name, then.get(name, ""), now.get(name, "")) for name in names if then.get(name) != now.get(name))
@@ -40,7 +40,7 @@ _Fields = tuple[tuple[str, str], ...]
 
 
 def _parts(plan: Plan) -> dict[str, _Fields]:
-    """Return the fields of each part in words, by its name. Only fields that say something."""
+    """Return the fields of each part in words, by the part's name. Leave out fields that are not set."""
     parts: dict[str, dict[str, str]] = {f"role {name}": _role(role) for name, role in plan.roles.items()}
     parts |= {f"car {car}": {"role": role} for car, role in plan.fixed.items()}
     for number, rule in enumerate(plan.rules, 1):

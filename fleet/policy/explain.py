@@ -51,7 +51,7 @@ def explain_phase(plan: Plan, state: PhaseState, snapshot: FleetSnapshot) -> Dec
 
 
 def _unmeasured_part(condition: PlanCondition, snapshot: FleetSnapshot) -> str:
-    """Name what no present car measures of a condition, or an empty text if one of them can."""
+    """Name the readings of a condition that no present car measures. Empty if one car measures them all."""
     cars = [known for car, known in snapshot.cars.items() if known.present and condition.car in (None, car)]
     return describe_unmeasured(condition.expression, [(known, known.mode) for known in cars])
 
@@ -113,20 +113,23 @@ def explain_rule(car: str, override: Override, role: str | None) -> Decision:
 
 
 def is_new(decision: Decision, before: Mapping[str, Decision]) -> bool:
-    """Return True if the cause is not the one before."""
+    """Return True if the cause has changed."""
     last = before.get(decision.subject)
     return last is None or last.cause != decision.cause
 
 
 def is_reworded(decision: Decision, before: Mapping[str, Decision]) -> bool:
-    """Return True if the cause is the one before, but the words are new."""
+    """Return True if the cause is the same as before, but the words have changed."""
     return not is_new(decision, before) and decision is not before[decision.subject]
 
 
 def explain_role(
     car: str, held_role: HeldRole, candidates: Candidates, allocation: RoleAllocation, phase: str, last: Decision | None
 ) -> Decision:
-    """Explain a mode that a role gives the car. `last` is its last decision in this phase, reused if unchanged."""
+    """Explain a mode that a role gives the car.
+
+    `last` is the car's last decision in this phase: reuse it if unchanged.
+    """
     plan, name = candidates.plan, held_role.role
     role = plan.roles[name]
     pinned = candidates.pinned.get(car)
@@ -217,7 +220,7 @@ def explain_contradiction(decision: Decision, evidence: str) -> Decision:
 
 
 def _count(role: Role, allocation: RoleAllocation) -> str:
-    """Return how many cars have the role, of how many that it wants."""
+    """Return how many cars have the role, and how many it wants: `1 of 2`."""
     return f"{len(allocation.holders(role.name))} of {'all' if role.count is None else allocation.places[role.name]}"
 
 
@@ -226,14 +229,14 @@ class _Others:
     """The cars that do not have a role."""
 
     kinds: tuple[str, ...]
-    """Why each of them does not have it."""
+    """Why each of these cars does not have the role."""
     words: str
     """The same with the cars' names, truncated if there are many."""
     changes: str
-    """The change that would let each of them have it, with the cars' names, truncated likewise."""
+    """The change that would let each of them have the role, with the cars' names, truncated likewise."""
     used: tuple[str, ...]
     has_able: bool
-    """True if one of them could have it."""
+    """True if one of them could have the role."""
 
 
 def _list_others(
@@ -305,7 +308,7 @@ def explain_inactive(name: str, candidates: Candidates, phase: str) -> Decision:
 
 
 def explain_origin(car: str, name: str, candidates: Candidates, before: str | None, lost: str) -> HeldRole:
-    """Explain how this car got this role. `before` is the car that lost it, `lost`: the reason."""
+    """Explain how this car got this role. `before` is the car that lost the role, `lost` is the reason."""
     role = candidates.plan.roles[name]
     used = candidates.snapshot.used(role.needs, car, candidates.now) if role.needs is not None else ()
     if before is not None:

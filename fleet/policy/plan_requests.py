@@ -1,4 +1,4 @@
-"""Requests of people for the plan in force: restart it, go on to the next phase, stop it. Pure; times in s."""
+"""Requests of people for the plan in force: restart, next phase, stop. Pure; times in s."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -28,11 +28,11 @@ EVENTS: Final = {
     PlanRequest.NEXT: ("plan_next", "went on to the next phase"),
     PlanRequest.STOP: ("plan_stopped", "stopped the plan"),
 }
-"""Code and words of the event for each request, whose sender stands before the words."""
+"""Code and words of the event for each request. The event begins with the sender, followed by the words."""
 
 
 class RequestRefused(Exception):
-    """The request cannot be carried out. The text says why and, in brackets, gives the reason's code."""
+    """The request cannot be carried out. The text says why, and ends with the reason's code in brackets."""
 
     def __init__(self, words: str, reason: Reason = Reason.UNSUPPORTED) -> None:
         super().__init__(f"{words} [{reason}]")
@@ -40,9 +40,9 @@ class RequestRefused(Exception):
 
 
 def check_sender(people: People, by: str) -> None:
-    """Raise RequestRefused if the sender `by` may not set, restart and stop the plan.
+    """Raise RequestRefused if the sender `by` may not set, restart or stop the plan.
 
-    The supervisor may: it sets the plan of the fleet file.
+    The supervisor may do so, because it sets the plan of the fleet file.
     """
     words = "" if by == keys.SUPERVISOR else fleet_refusal(people, keys.person_of(by))
     if words:
@@ -50,7 +50,7 @@ def check_sender(people: People, by: str) -> None:
 
 
 def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, now: float) -> tuple[PolicyState, str]:
-    """Return the state after the request of the sender `by`, and what it did in words. Raises RequestRefused."""
+    """Return the state after the request of the sender `by`, and a text about it. Raises RequestRefused."""
     match request:
         case PlanRequest.RESTART:
             begins = f" with phase {plan.first}" if plan.first else ""
@@ -81,7 +81,7 @@ def _next_phase(plan: Plan, memory: PolicyState) -> str:
 
 
 def _stop(memory: PolicyState, by: str) -> tuple[PolicyState, str]:
-    """Let go of all cars. Those that the plan commands are brought to rest first, without a hold."""
+    """Release all cars. The cars that the plan commands are first brought to rest, without a hold."""
     if memory.stopped_by:
         return memory, f"the plan is stopped already (by {keys.name_of(memory.stopped_by)}): {GOES_ON}"
     commanded = {each.car for each in memory.decisions.values() if each.car is not None and each.mode is not None}

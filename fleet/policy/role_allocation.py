@@ -1,7 +1,8 @@
 """Gives open roles to cars. Pure; times in s.
 
-Filled places count most; of one priority, counted places come before those of a role for all cars. Next count
-current holders, then few mode changes, then the order in the plan.
+Most important are filled places, first those of high priority. Within one priority, the places of a role with a number
+come before the places of a role for all cars. Then cars should keep their roles, few modes should change, and the order
+in the plan decides the rest.
 """
 
 from collections.abc import Mapping
@@ -19,13 +20,13 @@ from schemas.words import LinkState, Reason, Verdict
 REFUSED_MODE_RETRY_S: Final = 10.0
 """Delay before the next request of a mode that a car refused."""
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
-"""Reasons that lie with the car. Holds and leases are known from its states."""
+"""Reasons that lie with the car itself. Holds and leases are known from its states."""
 _STAND_IN: Final = "/"
 """Suffix of a role's name for a place in it that stands in for another role."""
 _ROLE_LOSS_COST: Final = 1_000_000_000
 _MODE_CHANGE_COST: Final = 1_000_000
 _LINK_DOUBT_COST: Final = 10_000
-"""Each of these costs is worth more than all lower ones together."""
+"""Each of these costs is higher than all lower ones together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +36,18 @@ class Barrier:
     why: str
     change: str
     looks_at: Expression | None = None
-    """The expression that it follows from."""
+    """The expression from which the barrier follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The cars to be given roles, with all that decides who may have which."""
+    """The cars that may get roles, and everything that decides which car may have which role."""
 
     plan: Plan
     snapshot: FleetSnapshot
     free: tuple[str, ...]
     reserved: Mapping[str, str]
-    """Cars that cannot be commanded for a moment, each with the role that it keeps."""
+    """Cars that cannot be commanded for a moment, each with the role that is reserved for it."""
     roles_before: Mapping[str, str]
     """The role of each car before this step."""
     unresponsive: frozenset[str]
@@ -59,7 +60,7 @@ class Candidates:
     now: float
 
     def seen(self, car: str, barrier: Barrier | None) -> tuple[str, ...]:
-        """Return the readings that a barrier follows from."""
+        """Return the readings from which a barrier follows."""
         if barrier is None or barrier.looks_at is None:
             return ()
         return self.snapshot.used(barrier.looks_at, car, self.now)
@@ -85,7 +86,8 @@ class Candidates:
             return None
         if settled is not None:
             return Barrier(f"it needs {role.needs_text}", f"{role.needs_text} becomes true", role.needs)
-        # Most modes measure little. A car that is in the role's mode already is not taken out of it to find out.
+        # In most modes, a car measures little. A car that is already in the role's mode keeps it, although its needs
+        # are not known.
         if self.roles_before.get(car) == role.name or (car not in self.roles_before and known.mode == role.mode):
             return None
         why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} is measured"
@@ -93,7 +95,7 @@ class Candidates:
 
 
 def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
-    """Return what keeps a car from a role whatever its readings, None if nothing does."""
+    """Return the barrier between a car and a role that does not depend on readings. None if there is none."""
     if known.roles is not None and role.name not in known.roles:
         return Barrier("the fleet file does not let it take this role", "the fleet file lets it")
     profile = known.profile
@@ -145,7 +147,7 @@ class RoleAllocation:
 def follow_needs(
     plan: Plan, snapshot: FleetSnapshot, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
 ) -> dict[tuple[str, str], Settled]:
-    """Evaluate the needs of each role for each car. A value that is not measured now counts as it was."""
+    """Evaluate the needs of each role for each car. For a value that is not measured now, the last one counts."""
     result = {}
     values: dict[tuple[str, str], bool | None] = {}
     for role in plan.roles.values():
@@ -164,7 +166,7 @@ def follow_needs(
 
 
 def allocate(candidates: Candidates) -> RoleAllocation:
-    """Give the roles in force to cars. A role that lacks cars opens as many places in its fallback."""
+    """Give the roles in force to cars. For each car that a role lacks, its fallback gets an additional place."""
     plan, cars = candidates.plan, (*candidates.free, *candidates.reserved)
     counts = {
         name: _count_places(candidates, plan.roles[name], len(cars))
@@ -180,7 +182,7 @@ def allocate(candidates: Candidates) -> RoleAllocation:
         more = dict(counts)
         for name in _fallback_order(plan):
             role = plan.roles[name]
-            # A role for any number of cars lacks one only when it has none.
+            # A role for any number of cars lacks a car only if it has none.
             lacks = max(0, (1 if role.count is None else more.get(name, 0)) - list(roles.values()).count(name))
             if role.if_none is not None and name in more and lacks:
                 more[role.if_none] = more.get(role.if_none, 0) + lacks
@@ -201,7 +203,7 @@ def _count_places(candidates: Candidates, role: Role, cars: int) -> int:
 
 
 def _fallback_order(plan: Plan) -> list[str]:
-    """Sort the roles so that each comes before its fallback."""
+    """Return the roles, sorted so that each comes before its fallback."""
     depth = dict.fromkeys(plan.roles, 0)
     for name in plan.roles:
         at, steps = name, 0
@@ -233,14 +235,15 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
     slots = _stand_in_ranks(plan)
     every = sorted({*(_rank(role) for role in plan.roles.values()), *slots.values()})
     ranks = {rank: order for order, rank in enumerate(every)}
-    # One place of a higher rank is worth more than all places of lower ranks, and any place more than all else.
+    # One place of a higher rank is worth more than all places of lower ranks, and any place is worth more than
+    # everything else.
     worth = {rank: (len(cars) + 1) ** (order + 1) * _ROLE_LOSS_COST * 10 for rank, order in ranks.items()}
     result: dict[str, dict[str, int]] = {}
     for car in cars:
         row: dict[str, int] = {}
         known = candidates.snapshot.cars.get(car, UNKNOWN_CAR)
         for order, role in enumerate(plan.roles.values()):
-            # Include roles that are closed now: they open if another role lacks a car. assign() looks at the places.
+            # Include roles without a place now: they get one if another role lacks a car. assign() looks at the places.
             reserved_role = candidates.reserved.get(car)
             if reserved_role is not None:
                 pinned = candidates.pinned.get(car)
@@ -252,7 +255,7 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             if car in candidates.unresponsive and known.verdict == Verdict.CONTRADICTED and role.count is not None:
                 cost += _ROLE_LOSS_COST
             elif candidates.roles_before.get(car) == role.name:
-                # A role for all counts half, so that its holder may take over a counted place.
+                # For a role for all cars, the loss counts half, so that its holder may move to a role with a number.
                 cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
             if known.mode != role.mode or known.verdict == Verdict.CONTRADICTED:
                 cost += _MODE_CHANGE_COST

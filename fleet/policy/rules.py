@@ -20,10 +20,10 @@ from fleet.policy.plan.plan import (
 from fleet.policy.snapshot import FleetSnapshot
 
 PHASE_SETTLE_TIMEOUT_S: Final = 15.0
-"""Maximum wait for a phase's cars before its timeout starts. Recovery and opening take 4.9 + 3.5 s
+"""Maximum time to wait for a phase's cars before its timeout starts. Recovery and opening take 4.9 + 3.5 s
 (docs/reference/protocol.md#stops)."""
 _ALL_CARS: Final = ""
-"""Stands for a car's name if the condition is about all cars."""
+"""Used in place of a car's name if the condition is about all cars."""
 _NO_CARS: Final[Mapping[str, Debounced]] = MappingProxyType({})
 
 
@@ -44,23 +44,23 @@ class RuleState:
 
 @dataclass(frozen=True, slots=True)
 class PhaseState:
-    """The current phase; with an empty name: the plan has none."""
+    """The current phase. The name is empty if the plan has no phases."""
 
     name: str = ""
     since: float = 0.0
     until: Mapping[str, Debounced] = field(default_factory=dict)
     why: str = ""
-    """The reason for which it began."""
+    """The reason why the phase began."""
     used: tuple[str, ...] = ()
     settled: bool = False
-    """True once its cars were in their modes, or PHASE_SETTLE_TIMEOUT_S has passed."""
+    """True once the phase's cars were in their modes, or PHASE_SETTLE_TIMEOUT_S has passed."""
     waited_s: float = 0.0
     """Time until the cars settled. The phase's timeout starts then."""
 
 
 @dataclass(frozen=True, slots=True)
 class CarSets:
-    """The cars that a rule may be about."""
+    """Sets of cars to which a rule may apply."""
 
     subjects: tuple[str, ...]
     free: Collection[str]
@@ -124,7 +124,10 @@ def _follow(
 
 
 def _watched(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debounced]) -> list[str]:
-    """Return the cars that the condition is about. A car that made it true stays, whatever role that gave it."""
+    """Return the cars that the condition is about.
+
+    A car that made it true stays, even if the rule gave it a new role.
+    """
     if condition.car is not None:
         return [condition.car]
     role = condition.role
@@ -138,7 +141,7 @@ def _watched(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debou
 
 
 def _all_of(each: list[bool | None]) -> bool | None:
-    """Return whether all values are true (Kleene's logic), or None without values."""
+    """Return whether all values are true (Kleene's logic). None if there are no values."""
     if not each:
         return None
     return False if False in each else None if None in each else True
@@ -152,7 +155,7 @@ def _readings_used(
 
 
 def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: Mapping[str, str]) -> Iterator[str]:
-    """Yield the cars that an effect of a rule in force applies to; `roles`: the role of each car."""
+    """Yield the cars to which an effect of a rule in force applies. `roles` has the role of each car."""
     match effect.who:
         case "":
             return
@@ -179,9 +182,9 @@ def follow_phase(
     *,
     ready: bool,
 ) -> PhaseState:
-    """Return the phase now. Each phase lasts HYSTERESIS_S at least, so that two phases do not alternate quickly.
+    """Return the phase now. Each phase lasts at least HYSTERESIS_S, so that two phases do not alternate quickly.
 
-    `ready` is True if every car is known and in its mode. The phase's timeout does not start before.
+    `ready` is True if every car is known and in its mode. The phase's timeout starts only then.
     """
     phase = plan.phases.get(before.name)
     if phase is None:
@@ -190,7 +193,7 @@ def follow_phase(
     for index, state in rules.items():
         rule = plan.rules[index]
         for effect in rule.effects:
-            # A rule that was in force before this phase began starts no other phase.
+            # A rule that was already in force when this phase began does not start another phase.
             if effect.phase not in (None, phase.name) and state.on and state.since >= before.since:
                 if lasted_s < HYSTERESIS_S:
                     continue

@@ -27,7 +27,7 @@ def _fields_of(message_class: Any) -> Mapping[str, type]:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """What a name of an expression stands for: a field of a topic, or a function of it."""
+    """The meaning of a name in an expression: a field of a topic, or a function of that field."""
 
     topic: str
     member: str
@@ -42,7 +42,7 @@ class _Field:
         return self._measured(seen)
 
     def _measured(self, seen: Observation) -> Any:
-        # The schema may be that of a recording: another version's, or somebody else's.
+        # The message may come from a recording, with the schema of another version or of another project.
         return compared_in(seen.message)(self.member) if self.is_in(seen.message) else None
 
     def is_in(self, message: Any) -> bool:
@@ -52,7 +52,7 @@ class _Field:
 
 
 class _Fields(dict[str, _Field]):
-    """The fields by name. A function of one is added when a plan names it."""
+    """The fields by name. A function of a field is added when a plan names it."""
 
     def __missing__(self, name: str) -> _Field:
         function, field_name = split_call(name)
@@ -85,12 +85,12 @@ _STALE_S: Final = {
 
 
 def topic_of(name: str) -> str:
-    """Return the topic of a name of NAMES, or of a function of one."""
+    """Return the topic of one of NAMES, or of a function of one."""
     return _FIELDS[name].topic
 
 
 def value_of(name: str, seen: Observation) -> Any:
-    """Return the value of a name, or of a function of one, in a message of its topic. None if it was not measured."""
+    """Return the value that a name, or a function of it, has in a message of its topic. None if it was not measured."""
     return _FIELDS[name].value(seen)
 
 
@@ -121,7 +121,7 @@ class CarSnapshot:
     evidence: str = ""
     motors: str = ""
     doubted: bool = False
-    """True if it has shown its stops before, and did not show the last one. A car that cannot show them is not."""
+    """True if the car has shown its stops before, but not the last one. Never True for a car that cannot show stops."""
     link: str = ""
     """The state of its link, as its gateway reports. Empty if there is no report yet."""
     platform: str = ""
@@ -135,7 +135,7 @@ class CarSnapshot:
     driven_by: str | None = None
     """The holder of a motion or a lease; never a coordinator."""
     roles: frozenset[str] | None = None
-    """The roles that the fleet file lets it take, or None if it may take any role."""
+    """The roles that the fleet file lets it have, or None if it may have any role."""
     listed: bool = False
     """True if the fleet file lists it."""
     refused: Refusal | None = None
@@ -144,7 +144,7 @@ class CarSnapshot:
 
     @property
     def taken_by(self) -> str | None:
-        """Return who keeps the coordinator from the car until a person or a lead gives it back, or None."""
+        """The person because of whom the coordinator may not command the car until a person releases it, or None."""
         return self.estopped_by or self.paused_by or self.lent_to or self.held_by
 
     @property
@@ -180,8 +180,8 @@ class FleetSnapshot:
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:
         """Return whether the expression is true for this car, or None if that is not known.
 
-        Stale values count as not measured, unless `old`. `old` is for values that change slowly: in a mode that does
-        not measure them, their last value counts.
+        Stale values count as not measured, unless `old` is set. It is for values that change slowly: in a mode in which
+        the car does not measure them, the last value counts.
         """
         seen = self.readings.get(car)
         if seen is None:
@@ -198,7 +198,7 @@ class FleetSnapshot:
         return expression.value(lookup)
 
     def used(self, expression: Expression, car: str, now: float) -> tuple[str, ...]:
-        """Return the readings that an expression uses, each with its value and age, for a person."""
+        """Return texts for a person: the readings that an expression uses, each with its value and age."""
         lines = []
         for name in dict.fromkeys(expression.names):
             what = _FIELDS[name]

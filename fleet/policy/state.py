@@ -1,4 +1,4 @@
-"""The state of the coordinator between decisions, and which part of it outlives a change of plan or a restart. Pure."""
+"""The state of the coordinator between decisions, and the part that outlives a change of plan or a restart. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,7 +16,8 @@ from schemas.words import Mode
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
 HUB_RETURN_GRACE_S: Final = 5.0
-"""Maximum wait for gateways after the hub returns; their cars keep their roles. Gateways reconnect every 0.5 s."""
+"""Maximum time to wait for gateways after the hub is back. Their cars keep their roles for this time. Gateways try to
+reconnect every 0.5 s."""
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
 IN_PHASE: Final = "it was so before the coordinator was started again"
@@ -59,19 +60,19 @@ class PersistedPolicy:
     stopped_by: str = ""
     """Sender who stopped the plan. Empty if the plan runs."""
     to_rest: tuple[str, ...] = ()
-    """Cars to be brought to rest since then."""
+    """Cars that must still be brought to rest since the plan was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class LedRequest:
-    """A car that was commanded to show the color of a rule since the rule came into force."""
+    """Notes that a car was commanded to show the color of a rule since the rule came into force."""
 
     rule: int
     effect: int
     """Position of the rule in the plan, and of the effect in the rule."""
     trigger: str | None
     car: str | None
-    """The cars, or None for every car that the coordinator had before its restart."""
+    """The car, or None for every car that the coordinator had before its restart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ class PolicyState:
     decisions: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
     stopped_by: str = ""
-    """Sender who stopped the plan. Empty if the plan runs. Else only cars in `to_rest` get commands."""
+    """Sender who stopped the plan. Empty if the plan runs. After a stop, only cars in `to_rest` get commands."""
     to_rest: frozenset[str] = frozenset()
     """Cars that the stopped plan has commanded, until they are at rest or a person has taken them."""
 
@@ -114,12 +115,12 @@ class PolicyState:
 
 
 def on_hub_back(memory: PolicyState, now: float) -> PolicyState:
-    """Return the state for the time after a hub's return: an outage of the hub costs no car its role."""
+    """Return the state for the time after a hub is back. No car loses its role by an outage of the hub."""
     return replace(memory, gone_since=dict.fromkeys(memory.held_roles, now + HUB_RETURN_GRACE_S - HYSTERESIS_S))
 
 
 def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
-    """Return the state under another plan: roles, rules and the phase remain if both plans have them."""
+    """Return the state under another plan. Roles, rules and the phase remain if both plans have them."""
     places = {rule: index for index, rule in enumerate(after.rules)}
     rules = {
         places[before.rules[index]]: state for index, state in memory.rules.items() if before.rules[index] in places
@@ -143,10 +144,11 @@ def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
 
 
 def restore(plan: Plan, snapshot: FleetSnapshot, persisted: PersistedPolicy, now: float, wall_s: float) -> PolicyState:
-    """Return the state of a coordinator that starts, from the persisted state of the one before.
+    """Return the state of a coordinator that starts, from the persisted state of the previous one.
 
-    Under another plan only the roles count that both plans have. A car in the mode of another role loses its role:
-    somebody has changed it since. A plan that was stopped stays stopped, even if the plan is another one.
+    Under another plan, only roles that both plans have are restored. A car that is in the mode of another role loses
+    its role, because somebody has changed its mode since. If the plan was stopped, the new plan is stopped, too, even
+    if it is another one.
     """
     if persisted.stopped_by:
         return PolicyState(stopped_by=persisted.stopped_by, to_rest=frozenset(persisted.to_rest))

@@ -1,4 +1,4 @@
-"""A dry run: what a plan would decide first for the cars as they are now. Pure, and nothing is commanded."""
+"""A dry run: the first decisions that a plan would make for the cars as they are now. Pure: nothing is commanded."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from fleet.policy.state import HeldRole, PolicyState, carry_over
 
 @dataclass(frozen=True, slots=True)
 class PlanInForce:
-    """What the coordinator does now: its plan, the role of each car, and its phase."""
+    """The state of the coordinator now: its plan, the role of each car, and its phase."""
 
     plan: Plan
     roles: Mapping[str, str]
@@ -22,21 +22,21 @@ class PlanInForce:
 
 @dataclass(frozen=True, slots=True)
 class CarTrial:
-    """What a plan would first do with one car."""
+    """The first decision of a plan about one car, with the car's state before."""
 
     car: str
     role_before: str
-    """Empty means none."""
+    """Empty if the car has no role."""
     role: str
     mode_before: str
-    """Empty means not known."""
+    """Empty if the mode is not known."""
     decision: Decision
 
     @property
     def is_changed(self) -> bool:
         """True if the car would get another role, or a mode that it is not in."""
         mode = self.decision.mode
-        if mode is None:  # it is left alone
+        if mode is None:  # the car is left alone
             return False
         return self.role != self.role_before or mode != self.mode_before
 
@@ -51,11 +51,11 @@ class Trial:
 
 
 def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, now: float) -> Trial:
-    """Return what this plan would decide for these cars, first of all. Conditions over time have just begun.
+    """Return the first decisions of this plan for these cars. Conditions with a duration begin only now.
 
-    `in_force` is None if no plan runs. Roles and the phase go on if both plans have them, as under `fleet plan set`.
+    `in_force` is None if no plan runs. Roles and the phase remain if both plans have them, as with `fleet plan set`.
     """
-    # The states of all cars that speak are there already: nobody has to be waited for.
+    # The states of all cars that publish them are already known, so there is nothing to wait for.
     begun = now - FIRST_STATE_TIMEOUT_S
     memory = PolicyState(started_at=begun)
     if in_force is not None:
@@ -63,7 +63,7 @@ def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, 
         phase = PhaseState(in_force.phase, begun) if in_force.phase in in_force.plan.phases else PhaseState()
         memory = carry_over(PolicyState(started_at=begun, held_roles=held, phase=phase), in_force.plan, plan)
     decided = step(plan, snapshot, memory, now)
-    # The coordinator also publishes who has none of its roles.
+    # The coordinator also publishes cars without one of its roles.
     own = () if in_force is None else in_force.roles.items()
     roles_before = {car: role for car, role in own if in_force is not None and role in in_force.plan.roles}
     cars = tuple(

@@ -1,1 +1,1 @@
-"""The lint: checks a plan against the cars that are to carry it out, before anything moves. Pure."""
+"""The lint: checks a plan against the cars that will carry it out, before anything moves. Pure."""

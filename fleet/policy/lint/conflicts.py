@@ -11,12 +11,12 @@ from schemas.colors import format_color
 from schemas.words import Mode
 
 _REMEMBERED: Final = 4096
-"""Maximum pairs of conditions whose contradiction is cached: the rules of a large plan, each against each."""
+"""Maximum number of cached results for pairs of conditions: enough for each pair of rules of a large plan."""
 
 
 @lru_cache(_REMEMBERED)
 def _contradictory(both: Expression) -> bool:
-    # Conditions are joined as trees. As one text two could be longer, or deeper, than a condition may be.
+    # Conditions are joined as trees. Joined as text, two could be longer or deeper than a condition may be.
     return is_contradictory(both)
 
 
@@ -41,7 +41,7 @@ def _can_coincide(one: PlanCondition, other: PlanCondition) -> bool:
 
 
 def find_conflicts(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
-    """Yield each rule that contradicts an earlier one or itself, with the words, and whether it always does."""
+    """Yield each rule that contradicts an earlier rule or itself, with a text, and whether it always does."""
     for index, rule in enumerate(plan.rules):
         possible: list[str] = []
         for effect in rule.effects:
@@ -82,12 +82,12 @@ def _find_self_conflicts(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bo
 
 
 def _asked_for(mode: Mode) -> Expression:
-    """Return the condition that this mode is requested of a car."""
+    """Return the condition that a car was commanded into this mode."""
     return Expression(Compare(Name("mode.asked", ValueKind.WORD), Op.EQ, Literal(str(mode))))
 
 
 def _contradiction(effect: Effect, other: Effect) -> str:
-    """Return what the other effect gives in contradiction to this one, or an empty text if nothing."""
+    """Return the role, mode or color of the other effect that contradicts this one. Empty if they do not conflict."""
     wish, others = effect.mode or effect.role, other.mode or other.role
     if wish is not None and others is not None and (effect.mode, effect.role) != (other.mode, other.role):
         return str(others)
@@ -105,12 +105,12 @@ def _can_meet(plan: Plan, rule: Rule, effect: Effect, earlier: Rule, other: Effe
     one, two = _target(rule, effect), _target(earlier, other)
     if plan.is_car(one) and plan.is_car(two):
         return one == two
-    # Roles exclude each other; a car is in one only.
+    # Two different roles never meet, because a car has only one role.
     return one == two or not (one in plan.roles and two in plan.roles)
 
 
 def _target(rule: Rule, effect: Effect) -> str:
-    """Return the target of an effect, the car's name if it can be only one car."""
+    """Return the target of an effect: the car's name if it can be only one car."""
     return rule.when.car if effect.who == THIS_CAR and rule.when.car is not None else effect.who
 
 

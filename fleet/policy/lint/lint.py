@@ -1,4 +1,4 @@
-"""Finds what can never work in a plan before anything moves: roles that no car can fill, rules that never fire. Pure.
+"""Finds parts of a plan that can never work, before anything moves: roles without a car, dead rules. Pure.
 
 plan_parser.py reports faults of the text itself. The lint checks the plan against the cars in a fleet file or, without
 one, against cars of any platform.
@@ -34,7 +34,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlanFault:
-    """One fault of a plan: the part, what is wrong with it, and what to do. line, column: where the part stands."""
+    """One fault of a plan: the part, what is wrong with it, and what to do. line, column: position of the part."""
 
     severity: Severity
     part: str
@@ -58,7 +58,7 @@ class Faults:
     warnings: tuple[PlanFault, ...] = ()
 
     def refusal(self, source: str = "plan") -> str:
-        """Return all errors, one per line. If there are none, the plan may be put in force.
+        """Return all errors, one per line. If the text is empty, the plan may be put in force.
 
         `source` is the name or path of the plan.
         """
@@ -75,9 +75,9 @@ def find_faults(
 ) -> Faults:
     """Return the faults of a plan that should be put in force.
 
-    `cars` has the cars in the fleet file (observer.listed_cars), or is None if there is no such file. Then each car of
-    the plan that is not among `present`, the cars on the bus, gives a warning and no error, because it may still come.
-    If `present` is None, nobody knows which cars are on the bus.
+    `cars` has the cars in the fleet file (observer.listed_cars), or is None if there is no fleet file. `present` are
+    the cars on the bus, or None if they are not known. Without a fleet file, a car of the plan that is not present is
+    only a warning and no error, because it may still come.
     """
     findings = check(plan, cars)
     reported = {each.part for each in findings}
@@ -118,7 +118,8 @@ class _Check:
         self._named = _named(plan)
         self._known = fleet
         self._unknown = set() if fleet is None else self._named - set(fleet)
-        """Cars of the plan that the fleet file does not have: reported once, not for each part that names them."""
+        """Cars of the plan that are not in the fleet file. They are reported once, and not for each part that names
+        them."""
         self._reach = ModeReachability(plan, fleet, self._named)
 
     def findings(self) -> Iterator[PlanFault]:
@@ -216,7 +217,7 @@ class _Check:
         topics = {topic_of(name) for name in when.expression.names}
         for role in self._plan.roles.values():
             about = when.car is None and when.role in (None, role.name) and self._in_some_phase(role, rule.during)
-            # A rule about what a role needs is for the cars that lack it, and so have no role.
+            # A rule about a role's needs is meant for cars that do not meet them, and so do not have the role.
             needed = role.needs is not None and topics & {topic_of(name) for name in role.needs.names}
             kinds = [
                 kind

@@ -57,7 +57,7 @@ def _assume(node: Node, names: frozenset[str], *, value: bool) -> Node:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Tells whether a condition can be true. If both texts are empty, it can, and for any car."""
+    """Says whether a condition can be true. If both texts are empty, it can be true for any car."""
 
     never: str = ""
     """The reason why the condition is never true."""
@@ -118,7 +118,7 @@ class ModeReachability:
         return f"it needs {role.needs}, and never measures {_first_missing(role.needs, self.profiles(car), Mode)}"
 
     def explain_blindness(self, role: Role) -> str:
-        """Return the reason why no car can measure what this role needs before the car has the role.
+        """Return the reason why no car can measure the needs of this role before it has the role.
 
         The text is empty if a car can.
         """
@@ -226,7 +226,7 @@ class ModeReachability:
         idle_case = self._find_idle_case(car, phase, roles)
         if idle_case is not None:
             topics = {topic_of(name) for name in condition.expression.names}
-            # A condition about what a role needs is meant for the cars that lack it.
+            # A condition about a role's needs is meant for cars that do not meet them.
             is_about_needs = any(
                 role.needs is not None and topics.intersection(map(topic_of, role.needs.names)) for role in roles
             )

@@ -1,6 +1,6 @@
 """A plan as values: roles for cars, rules that change them, phases that follow each other. Pure.
 
-plan_parser.py reads a plan from its text, lint.py finds what can never work in it, decide.py follows it.
+plan_parser.py reads a plan from its text, lint.py finds parts of it that can never work, decide.py follows it.
 """
 
 import hashlib
@@ -17,11 +17,11 @@ THIS_CAR: Final = "this_car"
 OTHER_CARS: Final = "other_cars"
 ALL_CARS: Final = "all_cars"
 RESERVED: Final = frozenset({THIS_CAR, OTHER_CARS, ALL_CARS, "all"})
-"""Words of rules, not allowed as names of cars, roles or phases."""
+"""Words with a meaning in rules. They are not allowed as names of cars, roles or phases."""
 
 
 class Quantifier(StrEnum):
-    """The cars of which a condition must be true."""
+    """The cars for which a condition must be true."""
 
     ANY = "any_car"
     ALL = "all_cars"
@@ -33,20 +33,22 @@ _WORDS: Final = {Quantifier.ANY: "any car", Quantifier.ALL: "all cars"}
 
 @dataclass(frozen=True, slots=True)
 class PlanCondition:
-    """An expression, the cars of which it must be true, and the minimum time without a break, s."""
+    """An expression, the cars for which it must be true, and the minimum time without a break, s."""
 
     of: Quantifier
     expression: Expression
     car: str | None = None
     """The car, with Quantifier.CAR."""
     role: str | None = None
-    """Only of the cars that have this role."""
+    """With ANY and ALL: look only at cars that have this role."""
     for_s: float = 0.0
     text: str = field(init=False, compare=False)
     """The condition in words."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "text", self._text())  # computed once: it is used ten times a second for each car
+        object.__setattr__(
+            self, "text", self._text()
+        )  # computed once, because it is used ten times a second for each car
 
     def _text(self) -> str:
         who = (
@@ -60,7 +62,7 @@ class PlanCondition:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """A mode for some cars, and which cars may have it."""
+    """A mode for some cars, and the cars that may have it."""
 
     name: str
     mode: Mode
@@ -73,9 +75,9 @@ class Role:
     capabilities: frozenset[str] = frozenset()
     platforms: tuple[str, ...] | None = None
     if_none: str | None = None
-    """The role that gets a place for each place here that no car can take."""
+    """The role that gets an additional place for each place of this role that no car can fill."""
     by_rules: bool = False
-    """True if only rules give it to cars."""
+    """True if only rules give this role to cars."""
     needs_text: str = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -84,20 +86,20 @@ class Role:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """A role, mode or color that a rule gives to some cars; or the phase that it begins."""
+    """A role, mode or color that a rule gives to some cars, or the phase that a rule begins."""
 
     who: str = ""
     role: str | None = None
     mode: Mode | None = None
     led: Rgb | None = None
     blink_s: float | None = None
-    """Time for which the LED is on, and then off, or None if it does not blink."""
+    """Time for which a blinking LED is on, and then off. None if it does not blink."""
     phase: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Effects that count while `when` is true; with `until`, from then on until that is true."""
+    """Effects that count while `when` is true. With `until`: from the time at which `when` is true until `until` is."""
 
     name: str
     when: PlanCondition
@@ -121,18 +123,18 @@ class PlanPhase:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan for the coordinator. If several rules are about one car, the first that is true counts."""
+    """A plan for the coordinator. If several rules are about one car, the first rule in force counts."""
 
     roles: Mapping[str, Role]
     fixed: Mapping[str, str]
-    """By car: the only role that it may have."""
+    """By car: the only role that the car may have."""
     rules: tuple[Rule, ...]
     phases: Mapping[str, PlanPhase]
     idle: Mode | None
     """The mode of a car without a role, or None if such a car is left alone."""
     text: str
     places: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
-    """Line and column of each role, rule, phase and fixed car in the text, by its name in findings."""
+    """Line and column of each role, rule, phase and named car in the text, by the name that findings use."""
 
     @property
     def version(self) -> str:
@@ -153,14 +155,14 @@ class Plan:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The cars that it names in roles and effects."""
+        """The cars that the plan names in roles and effects."""
         targets = (effect.who for rule in self.rules for effect in rule.effects)
         cars = [*self.fixed, *(car for role in self.roles.values() for car in role.cars or ())]
         return tuple(dict.fromkeys([*cars, *(who for who in targets if who and self.is_car(who))]))
 
     @property
     def conditions(self) -> Iterable[PlanCondition]:
-        """Every condition in it."""
+        """Every condition in the plan."""
         for rule in self.rules:
             yield rule.when
             if rule.until is not None:
@@ -177,7 +179,7 @@ class Plan:
         return frozenset(name for expression in used for name in expression.names)
 
     def is_car(self, who: str) -> bool:
-        """Return True if this name in an effect is a car's."""
+        """Return True if this name in an effect is the name of a car."""
         return who not in RESERVED and who not in self.roles
 
     def may(self, car: str, role: Role) -> bool:

@@ -11,7 +11,7 @@ from schemas.words import Mode
 from schemas.yaml_document.document import Entry
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]
-"""Only plan_parser.py checks names. If pydantic refused a key, faults in its value would stay hidden."""
+"""Only plan_parser.py checks names. If pydantic rejected a key, faults in the value under it would stay hidden."""
 _Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
 
@@ -24,7 +24,7 @@ _Color = Annotated[str, AfterValidator(_check_color), Field(json_schema_extra={"
 
 
 class GivenBy(StrEnum):
-    """Source of roles: the plan or the operator."""
+    """Source of a role: the plan itself, or only its rules."""
 
     PLAN = "plan"
     RULES = "rules"
@@ -38,25 +38,25 @@ class WithoutRole(StrEnum):
 
 
 class ConditionEntry(Entry):
-    """A condition, and the cars of which it must be true: exactly one of any_car, all_cars, car."""
+    """A condition, and the cars for which it must be true: exactly one of any_car, all_cars, car."""
 
-    any_car: str | None = Field(None, description="an expression that must be true of at least one car: light.left")
-    all_cars: str | None = Field(None, description="an expression that must be true of every car")
-    car: _Name | None = Field(None, description="the car of which `is` must be true")
+    any_car: str | None = Field(None, description="an expression that must be true for at least one car: light.left")
+    all_cars: str | None = Field(None, description="an expression that must be true for every car")
+    car: _Name | None = Field(None, description="the car for which `is` must be true")
     is_: str | None = Field(None, alias="is", description="an expression over the readings of `car`")
-    with_role: _Name | None = Field(None, description="any_car, all_cars: only of the cars that have this role")
+    with_role: _Name | None = Field(None, description="with any_car or all_cars: look only at cars that have this role")
     for_s: _Seconds = Field(0.0, description="minimum time without a break, s")
 
 
 Condition = str | ConditionEntry
-"""A bare text is the expression of any_car."""
+"""A text alone is the expression of any_car."""
 
 
 class BlinkEntry(Entry):
     """A blinking LED."""
 
-    color: _Color = Field(description='the color while it is on: red, or "#ff0000" in quotes')
-    blink_s: float = Field(0.5, ge=0.5, le=60, description="time on, and then the time off, s")
+    color: _Color = Field(description='the color while the LED is on: red, or "#ff0000" in quotes')
+    blink_s: float = Field(0.5, ge=0.5, le=60, description="time for which the LED is on, and then off, s")
 
 
 class EffectEntry(Entry):
@@ -65,8 +65,8 @@ class EffectEntry(Entry):
     who: _Name | None = Field(
         None, description="this_car (the car that made the rule true), other_cars, all_cars, a car or a role"
     )
-    role: _Name | None = Field(None, description="the role that they take")
-    mode: Mode | None = Field(None, description="the mode that they are in, whatever their role says")
+    role: _Name | None = Field(None, description="the role that these cars get")
+    mode: Mode | None = Field(None, description="the mode that these cars get, whatever their roles say")
     led: _Color | BlinkEntry | None = Field(
         None, description='the color LED, set once: red, or "#ff0000"; it blinks with {color: red, blink_s: 0.5}'
     )
@@ -74,15 +74,20 @@ class EffectEntry(Entry):
 
 
 class RuleEntry(Entry):
-    """Effects (`then`) that count while `when` is true; with `until`, from then on until that is true."""
+    """Effects (`then`) that count while `when` is true.
 
-    name: str = Field("", max_length=60, description="its name in explanations")
+    With `until`: from the time at which `when` is true until `until` is.
+    """
+
+    name: str = Field("", max_length=60, description="name of the rule in explanations")
     when: Condition = Field(
-        description="the condition: a text, which must be true of any car, or `{any_car: light.left, for_s: 1}`"
+        description="the condition: a text, which must be true for any car, or `{any_car: light.left, for_s: 1}`"
     )
     until: Condition | None = Field(None, description="the condition that ends the rule; left out: `when` ends it")
-    then: EffectEntry | list[EffectEntry] = Field(description="what follows: `{who: this_car, role: rest}`, or a list")
-    during: list[_Name] | None = Field(None, description="the phases in which it counts; all, if left out")
+    then: EffectEntry | list[EffectEntry] = Field(
+        description="the effect: `{who: this_car, role: rest}`, or a list of effects"
+    )
+    during: list[_Name] | None = Field(None, description="the phases in which the rule counts; left out: all")
 
 
 class FixedEntry(Entry):
@@ -95,29 +100,36 @@ class FixedEntry(Entry):
 class RoleEntry(Entry):
     """A mode for some cars."""
 
-    mode: Mode = Field(description=f"the mode of a car that has it, one of {', '.join(Mode)}")
-    needs: str | None = Field(None, description="an expression that must be true of a car that has it")
+    mode: Mode = Field(description=f"the mode of a car with this role, one of {', '.join(Mode)}")
+    needs: str | None = Field(None, description="an expression that must be true for a car to get this role")
     count: Annotated[int, Field(ge=1, le=1000)] | Literal["all"] = Field(1, description="how many cars, or all")
-    priority: int = Field(0, ge=-100, le=100, description="the higher is filled first")
-    cars: list[_Name] | None = Field(None, min_length=1, description="the only cars that may have it, best first")
-    capabilities: list[str] = Field(default=[], description="capabilities that a car must have")
-    platforms: list[str] | None = Field(None, min_length=1, description="the platforms that may have it")
-    if_none: _Name | None = Field(
-        None, description="the role that gets a place for each place here that no car can take"
+    priority: int = Field(0, ge=-100, le=100, description="roles with a higher number are filled first")
+    cars: list[_Name] | None = Field(
+        None, min_length=1, description="the only cars that may have this role, best first"
     )
-    given_by: GivenBy = Field(GivenBy.PLAN, description="plan: the best car has it; rules: only a rule gives it")
+    capabilities: list[str] = Field(default=[], description="capabilities that a car must have")
+    platforms: list[str] | None = Field(None, min_length=1, description="the only platforms that may have this role")
+    if_none: _Name | None = Field(
+        None, description="the role that gets an additional place for each place of this role that no car can fill"
+    )
+    given_by: GivenBy = Field(GivenBy.PLAN, description="plan: the best car gets the role; rules: only a rule gives it")
 
 
 class PhaseEntry(Entry):
-    """A part of the job: it lasts until a condition is true or its time is over."""
+    """A part of the job. It lasts until a condition is true or its time is over."""
 
-    roles: list[_Name] | None = Field(None, description="the roles that count; all, if left out")
-    until: Condition | None = Field(None, description="the condition that ends it; then `next` begins")
+    roles: list[_Name] | None = Field(None, description="the roles that count in this phase; left out: all")
+    until: Condition | None = Field(None, description="the condition that ends the phase; then `next` begins")
     timeout_s: float | None = Field(
-        None, gt=0, le=86_400, description="maximum duration once its cars are in their modes, s"
+        None,
+        gt=0,
+        le=86_400,
+        description="maximum duration of the phase, counted from when its cars are in their modes, s",
     )
-    next: _Name | None = Field(None, description="the phase after it")
-    on_timeout: _Name | None = Field(None, description="the phase after it when its time is over; left out: `next`")
+    next: _Name | None = Field(None, description="the phase that follows")
+    on_timeout: _Name | None = Field(
+        None, description="the phase that follows if timeout_s has passed; left out: `next`"
+    )
 
 
 class PlanEntry(Entry):
@@ -128,7 +140,9 @@ class PlanEntry(Entry):
         default={}, description="the only role, or the only mode, of a certain car: `blue: {mode: manual}`"
     )
     rules: list[RuleEntry] = Field(
-        default=[], max_length=200, description="changes while a condition is true; the first true one counts"
+        default=[],
+        max_length=200,
+        description="changes while a condition is true; if several are about one car, the first counts",
     )
     phases: dict[_Name, PhaseEntry] = Field(default={}, description="parts of the job, the first one begins")
     without_role: WithoutRole = Field(

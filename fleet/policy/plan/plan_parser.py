@@ -40,31 +40,31 @@ from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.fault_words import Where, suggest
 
 BadPlan = BadFile
-"""Raised for a plan with faults; the text has one line for each, with file, line and column."""
+"""Raised for a plan with faults. The text has one line for each fault, with file, line and column."""
 PARTS: Final = frozenset().union(*(each.capabilities for each in drivers.built_in_profiles()))
 _MISSING: Final = {"mode": Mode.MANUAL, "when": "true", "then": []}
 """Values for missing required fields, so that the rest of a file can be checked."""
 
 
 def parse(text: str, source: str = "plan") -> Plan:
-    """Parse a plan. Raises BadPlan with all faults, if any. `source` is its name in errors, usually its path."""
+    """Parse a plan. Raises BadPlan with all faults. `source` is the plan's name in errors, usually its path."""
     return parse_entry(text, source)[1]
 
 
 def parse_entry(text: str, source: str = "plan") -> tuple[PlanEntry, Plan]:
-    """Parse a plan as `parse` does. Return what is written in it, too."""
+    """Parse a plan as `parse` does. Return its entries as written, too."""
     document = Document(text, source)
     entry = document.validate(PlanEntry) or document.validate_partial(PlanEntry, _MISSING)
     if entry is None:
         document.raise_faults()
-    assert entry is not None  # else there was a problem
+    assert entry is not None  # otherwise raise_faults has raised
     plan = _PlanParser(document, entry).plan(text)
     document.raise_faults()
     return entry, plan
 
 
 class _PlanParser:
-    """Makes a plan of the entries, and reports contradictions between them."""
+    """Makes a plan from the entries, and reports contradictions between them."""
 
     def __init__(self, document: Document, entry: PlanEntry) -> None:
         self._document = document
@@ -261,7 +261,7 @@ class _PlanParser:
             return parse_expression("false", NAMES)
 
     def _mark(self, what: str, name: str, where: Where, *, on_key: bool = False) -> None:
-        """Remember where a part stands, for the lint's findings; of a car the first place."""
+        """Remember the position of a part for the lint's findings. For a car, the first position counts."""
         self._places.setdefault(f"{what} {name}", self._document.position(where, on_key=on_key))
 
     def _check_car(self, where: Where, name: str) -> None:
@@ -283,7 +283,7 @@ class _PlanParser:
             self._report_unknown(where, name, self._entry.phases, "phase")
 
     def _is_faulty(self, place: str, name: str) -> bool:
-        """Return True if this name's entry, or the section that may contain it, is faulty."""
+        """Return True if the entry of this name is faulty, or the section that may contain it."""
         return self._document.is_faulty((place,)) or self._document.is_faulty((place, name))
 
     def _report_unknown(self, where: Where, name: str, allowed: Iterable[str], what: str) -> None:
@@ -291,6 +291,6 @@ class _PlanParser:
         self._report(where, f"there is no {what} {name}. {suggest(name, names)}")
 
     def _report(self, where: Where, words: str, *, on_key: bool = False, unless: Where | None = None) -> None:
-        """Report a fault. With `unless`, skip it if a field there is faulty, as it may only follow from that."""
+        """Report a fault. Skip it if a field at `unless` is faulty, because it may only be a consequence of that."""
         if unless is None or not self._document.faulty_within(unless):
             self._document.report(where, words, on_key=on_key)
