@@ -1,4 +1,4 @@
-"""Parses the text of a condition into its tree; each error has a column and names what is allowed. Pure.
+"""Parses the text of a condition into its tree. Each error has a column and says what is allowed. Pure.
 
 condition:  comparisons, yes/no fields, true and false, joined by `not`, `and`, `or` (binding in this order) and ()
 comparison: < <= > >= between numbers, == and != between two numbers, two words or two truths
@@ -34,11 +34,11 @@ MAX_CONDITION_LENGTH: Final = 1000
 MAX_PARENTHESES: Final = 32
 """Maximum depth of nested parentheses."""
 _MAX_NAMES_LISTED: Final = 6
-"""Maximum names that an error lists."""
+"""Maximum number of names that an error lists."""
 
 
 class BadExpression(ValueError):
-    """A condition with an error; the text says where (`column`, from 1), what is wrong and what is allowed."""
+    """A condition with an error. The text says where (`column`, from 1), what is wrong and what is allowed."""
 
     def __init__(self, text: str, column: int, words: str) -> None:
         super().__init__(f"condition {text[:80]!r}, column {column}: {words}")
@@ -52,10 +52,10 @@ def parse(
     aliases: Mapping[str, str] = MappingProxyType({}),
     functions: Collection[str] = (),
 ) -> Expression:
-    """Parse a condition over these names (of type float, int, str or bool). Raises BadExpression if it is wrong.
+    """Parse a condition over these names (of type float, int, str or bool). Raises BadExpression for an error.
 
-    `aliases`: other spellings of names, each with the name that it stands for. `functions`: those that may be applied
-    to a number.
+    `aliases`: other spellings of names, each with the name that it stands for. `functions`: the functions that may be
+    applied to a number.
     """
     if len(text) > MAX_CONDITION_LENGTH:
         raise BadExpression(
@@ -94,8 +94,8 @@ class _Token:
 class _Parser:
     """A recursive-descent parser of one text."""
 
-    # `ast.parse` would save nothing: columns of parentheses and of missing operands, names with dots and words without
-    # escapes need these tokens anyway.
+    # `ast.parse` would not help: errors need the columns of parentheses and missing operands, and names may have dots
+    # and words have no escapes.
 
     def __init__(
         self, text: str, names: Mapping[str, type], aliases: Mapping[str, str], functions: Collection[str]
@@ -148,7 +148,7 @@ class _Parser:
         return self._tokens[self._at]
 
     def _take(self, *texts: str) -> _Token | None:
-        """Take the next token if it is one of these texts and not a quoted word."""
+        """Consume the next token if it is one of these texts and not a quoted word."""
         token = self._next
         if token.kind == "word" or token.text not in texts:
             return None
@@ -229,7 +229,10 @@ class _Parser:
         return tree
 
     def _parse_call(self, function: str) -> Name:
-        """Parse the rest of `rate(range_m)`. It is a name: a number that somebody else knows."""
+        """Parse the rest of `rate(range_m)`.
+
+        The result is a Name, because the caller's lookup evaluates the function.
+        """
         token = self._next
         field = None if token.text in self._functions else self._parse_operand()
         if not isinstance(field, Name) or field.kind is not ValueKind.NUMBER:
@@ -263,7 +266,7 @@ class _Parser:
         self._fail(token, f"{token.text} is not a value. {hint}")
 
     def _close_names(self, text: str) -> list[str]:
-        """Return likely names of the kind that is compared here, first those that have the text as a part."""
+        """Return likely names of the kind that is compared here. Names with the text as a part come first."""
         expected, fitting = self._expected_kind(), self._fitting_names()
         parts = [name for name in fitting if text in name.split(".")]
         words = [*fitting, *(() if expected not in (None, ValueKind.TRUTH) else _KEYWORDS)]

@@ -57,7 +57,7 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class Literal:
-    """A value that stands in the text."""
+    """A value that is written in the text."""
 
     value: Value
 
@@ -130,7 +130,7 @@ def _in_parentheses(side: Node) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A parsed condition. Its text is normalized; parsing that text gives the same condition."""
+    """A parsed condition. Its text is normalized. Parsing that text gives the same condition."""
 
     root: Node
 
@@ -147,13 +147,13 @@ class Expression:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that it uses, each once, in their order."""
+        """The names that it uses, each once, in the order of the text."""
         return tuple(dict.fromkeys(each.name for each in names_in(self.root)))
 
     def value(self, lookup: Lookup) -> bool | None:
         """Return whether it is true, or None if that is not known because a value was not measured (None or NaN).
 
-        Raises TypeError for a value that is not of its name's type: the caller's mistake.
+        Raises TypeError for a value that is not of its name's type, which is a mistake of the caller.
         """
         return _evaluate(self.root, lookup)
 
@@ -218,7 +218,7 @@ def _value_of(node: Node, lookup: Lookup) -> Value | None:
 
 
 def join_nodes(join: type[And] | type[Or], parts: Sequence[Node]) -> Node:
-    """Join nodes into one; `a and (b and c)` becomes `a and b and c`."""
+    """Join nodes into one. `a and (b and c)` becomes `a and b and c`."""
     flat: list[Node] = []
     for part in parts:
         flat.extend(part.parts if isinstance(part, join) else (part,))

@@ -14,9 +14,9 @@ _TYPES: Final[Mapping[int, type]] = {
     FieldDescriptor.CPPTYPE_STRING: str,
     FieldDescriptor.CPPTYPE_ENUM: str,
 }
-"""By protobuf's type in C++; all others but messages are numbers."""
+"""Types of fields by protobuf's C++ type. All other types except messages are numbers."""
 LAST: Final = ("car", "seq", "boot_id")
-"""Fields of every message; lists of names end with them."""
+"""Fields of every message. They are the last ones in lists of names."""
 
 OWNERS: Final = frozenset({"by", "holder", "owner", "sender"})
 """Fields with a sender: a person, or the process of one (`mia@laptop-4711`)."""
@@ -53,7 +53,7 @@ def value_in(message: Message) -> Callable[[str], object | None]:
 
 
 def compared_in(message: Message) -> Callable[[str], object | None]:
-    """Return a lookup of what conditions compare: owners are people, whatever process of theirs it was."""
+    """Return a lookup of the values that conditions compare. For an owner, this is the person without the process."""
     look = value_in(message)
 
     def value(name: str) -> object | None:

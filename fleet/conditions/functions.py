@@ -1,7 +1,7 @@
-"""The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. One row is all that one needs.
+"""The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. Each needs only one row.
 
-To conditions `rate(range.range_m)` is a name like any other, with the range of its row; the snapshot evaluates it. A
-message alone has no past, so `watch` and `wait` know no functions.
+For a condition, `rate(range.range_m)` is a name like any other, with the range of its row. The snapshot evaluates it. A
+single message has no earlier readings, so `watch` and `wait` have no functions.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ Measured: TypeAlias = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class ConditionFunction:
-    """One row: a number from a field that is a number. A field is its only argument."""
+    """One row: a function that computes a number from its only argument, a field that is a number."""
 
     name: str
     evaluate: Callable[[Measured], float | None]
@@ -23,7 +23,7 @@ class ConditionFunction:
     readings: int = 1
     """Number of the newest readings that it needs."""
     range: tuple[float, float] = (-inf, inf)
-    """Lowest and highest value, by which a condition can be found impossible."""
+    """Lowest and highest value. They show whether a condition can be true at all."""
 
 
 def rate(readings: Measured) -> float | None:

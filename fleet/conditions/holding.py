@@ -1,10 +1,10 @@
-"""Tells since when a condition holds without a gap. Pure.
+"""Measures for how long a condition has held without a gap. Pure.
 
-`fleet wait --for` feeds it live, `fleet find` from recordings.
+`fleet wait --for` feeds it with live readings, `fleet find` with recordings.
 
-What a gap is decides what "for two seconds" means. Between two readings nobody measured: the time counts as long as the
-older value is not stale. When a value gets stale, the condition is asked again without it. If the others do not decide
-it alone, it has ended with the last reading that showed it.
+The meaning of "for two seconds" depends on what counts as a gap. Between two readings nothing is measured, but this
+time counts as long as the older value is not stale. When a value becomes stale, the condition is evaluated again
+without it. If the other values alone do not make the condition true, it ended with the last reading that showed it.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from fleet.conditions.expression import Expression, Lookup
 
 CLOCK_STEP_S: Final = 60.0
-"""Minimum difference between stamps and arrivals that is a step of a clock, and no delay of a network."""
+"""A difference between stamps and arrivals of at least this size is a step of a clock, and not a network delay."""
 
 
 class HeldSpan(NamedTuple):
@@ -30,7 +30,7 @@ class HeldSpan(NamedTuple):
 
 
 class HeldStep(NamedTuple):
-    """Changes by one reading."""
+    """The changes that one reading causes."""
 
     value: bool | None
     """The condition now, or None if it is not decided."""
@@ -42,21 +42,22 @@ class HeldStep(NamedTuple):
 
 @dataclass(slots=True)
 class Holding:
-    """One condition over the readings of one car or key. They come in the order of their times.
+    """One condition over the readings of one car or key. The readings must come in the order of their times.
 
-    source_of: the source of a name, such as its topic. stale_after_ns: how long a value of a source counts; None: ever.
+    source_of: the source of a name, such as its topic. stale_after_ns: how long a value of a source counts, or None for
+    ever.
     """
 
     expression: Expression
     source_of: Callable[[str], str]
     stale_after_ns: Callable[[str], int | None]
     span: HeldSpan | None = None
-    """The span that has not ended. It ends with the newest reading that shows it."""
+    """The span that still lasts, up to the newest reading that shows it."""
     _readings: dict[str, tuple[int, Lookup]] = field(default_factory=dict)
     """Time and values of the newest reading by source."""
 
     def add(self, source: str, values: Lookup, at_ns: int) -> HeldStep:
-        """Take in a reading."""
+        """Add a reading."""
         ended = None
         for other, (seen_ns, _) in self._readings.items():
             after_ns = self.stale_after_ns(other)

@@ -13,14 +13,14 @@ from fleet.conditions.functions import FUNCTIONS, split_call
 from schemas import topics
 
 _MAX_ALTERNATIVES: Final = 512
-"""Maximum alternatives of a condition. With more it counts as possible."""
+"""Maximum number of alternatives of a condition. A condition with more counts as possible."""
 
 _DOMAINS: Final = {
     f"{topic.name.rpartition('/')[2]}.{name}": (topic.words.get(name, ()), topic.ranges.get(name))
     for topic in topics.TOPICS.values()
     for name in {*topic.words, *topic.ranges}
 }
-"""Words and range by name; a field is named after the last word of its topic."""
+"""Allowed words and range by name. The name of a field begins with the last word of its topic."""
 _Alternative: TypeAlias = tuple[Compare, ...]
 _RELATIONS: Final = {Op.LT: "<", Op.LE: "<=", Op.GT: ">", Op.GE: ">=", Op.EQ: "=", Op.NE: "<>"}
 """The relations of two values that fulfil each operator, one character for each."""
@@ -29,7 +29,7 @@ _MIRRORED: Final = {Op.LT: Op.GT, Op.GT: Op.LT, Op.LE: Op.GE, Op.GE: Op.LE, Op.E
 
 
 def is_contradictory(expression: Expression) -> bool:
-    """Return True if it can never be true, as `range_m < 0.1 and range_m > 0.2`."""
+    """Return True if the condition can never be true, such as `range_m < 0.1 and range_m > 0.2`."""
     try:
         return not any(_is_possible(alternative) for alternative in _alternatives_of(expression.root, wanted=True))
     except _TooManyAlternativesError:
@@ -37,7 +37,7 @@ def is_contradictory(expression: Expression) -> bool:
 
 
 def explain_impossible(expression: Expression, of: str = "") -> str:
-    """Return why it can never be true by the words and ranges of schemas/topics.py, or an empty text if it can.
+    """Return why the condition can never be true by the words and ranges of schemas/topics.py. Empty if it can be true.
 
     `of` is the last word of the topic, if the names are the fields of one message.
     """

@@ -1,1 +1,4 @@
-"""The fleet file: `models`, reading (`fleet_file`), edits (`editor`), new ones (`template`), `scan`, `link_check`."""
+"""The fleet file: models (`fleet_model`), reading (`fleet_file`), edits (`editor`), new files (`template`).
+
+`scan_process` finds links, `link_check` and `adapter_check` check them.
+"""

@@ -1,7 +1,7 @@
-"""Adds up what the cars in a fleet file ask of the computer's Bluetooth adapters. Opens nothing.
+"""Adds up the load that the cars in a fleet file put on the computer's Bluetooth adapters. Opens nothing.
 
-An adapter tells nobody how many connections it holds: the car that is one too many does not connect. So the numbers are
-those of most adapters.
+An adapter does not report how many connections it can hold: a car beyond its limit just does not connect. So the
+numbers here are typical ones.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,20 +24,20 @@ _FIRST: Final = "the first adapter"
 
 @dataclass(frozen=True, slots=True)
 class AdapterCheck:
-    """The sums of one adapter; with `auto`, of all adapters of the computer together."""
+    """The sums of one adapter. For `auto`: of all adapters of the computer together."""
 
     adapter: str
     cars: tuple[str, ...]
     connections: int
     notifications_per_s: int
-    """Most notifications that its cars send together."""
+    """Maximum number of notifications that its cars send together."""
     is_crowded: bool
-    """True if some adapters hold fewer, or carry less."""
+    """True if some adapters can hold fewer connections, or carry fewer notifications."""
     words: str
 
 
 def list_adapters(directory: Path | None = None) -> list[str]:
-    """Return the names of the computer's adapters in order. Empty if that is unknown."""
+    """Return the names of the computer's adapters in order. Empty if they are not known."""
     try:
         names = [each.name for each in (ADAPTERS if directory is None else directory).iterdir()]
     except OSError:
@@ -52,7 +52,7 @@ def check_adapters(links: Mapping[str, FleetLink], adapters: Sequence[str]) -> I
     for car, link in links.items():
         if isinstance(link, BleUrl):
             by_adapter.setdefault(link.adapter or first, []).append(car)
-    if AUTO_ADAPTER in by_adapter:  # a car with any adapter may meet the cars of each
+    if AUTO_ADAPTER in by_adapter:  # a car that may use any adapter may share it with the cars of each
         by_adapter[AUTO_ADAPTER] = [car for cars in by_adapter.values() for car in cars]
     for adapter, cars in by_adapter.items():
         yield _sum(adapter, cars, max(1, len(adapters)) if adapter == AUTO_ADAPTER else 1)

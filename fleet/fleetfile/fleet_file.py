@@ -1,7 +1,7 @@
 """Reads a fleet file: the cars, their platforms, capabilities and limits. All faults are reported at once.
 
 The fields of a car override those of its type, which override the defaults. A list replaces the list below it;
-`limits` are merged field by field. This module opens no link: link_check.py checks whether the cars are there.
+`limits` are merged field by field. This module opens no link: link_check.py checks whether the cars can be reached.
 """
 
 from collections.abc import Iterator, Mapping
@@ -60,8 +60,8 @@ class FleetCar:
     """One car with its type and the defaults resolved.
 
     link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
-    parts. A car of platform `auto` has those of all platforms until its gateway detects the platform. roles: the roles
-    that it may take. None means any.
+    parts. A car of platform `auto` has the capabilities of all platforms until its gateway detects the platform. roles:
+    the roles that it may have. None means any.
     """
 
     name: str
@@ -87,7 +87,7 @@ class FleetPerson:
 
 @dataclass(frozen=True, slots=True)
 class PinRule:
-    """A condition of any car whose time is pinned in recordings, from `before_s` to `after_s`, s."""
+    """A condition. The time around it, from `before_s` before to `after_s` after it, is pinned in recordings."""
 
     condition: Expression
     before_s: float
@@ -98,9 +98,9 @@ class PinRule:
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: how much the recorder keeps.
-    console_port: the port of the web page; 0: the default. groups: cars by group. people: the only ones who may drive;
-    None: everyone may. unlinked: cars without a link, if they are allowed. pins: what is pinned in recordings.
+    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: maximum size of the recordings. console_port: the
+    port of the web page, 0 for the default. groups: cars by group. people: the only people who may drive, or None if
+    everyone may. unlinked: cars without a link, if they are allowed. pins: the times that are pinned in recordings.
     """
 
     name: str
@@ -129,7 +129,7 @@ class FleetFile:
 def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
     """Read a fleet file. Raises BadFile if it has mistakes. `unbound` allows cars without a link.
 
-    With `moved`, the file is a session's copy, so its plan and its world need not be beside it.
+    With `moved`, the file is the copy in a session, so its plan and its world need not exist.
     """
     path = Path(path)
     return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
@@ -145,7 +145,7 @@ def read_colors(path: Path) -> Mapping[str, Rgb]:
 
 
 def people_table(people: Mapping[str, FleetPerson] | None) -> People:
-    """Return the people in a fleet file as the rules know them. Whose cars they drive is for the gateways."""
+    """Return the people in a fleet file as the rules know them. Gateways check which cars a person may drive."""
     if people is None:
         return NO_PEOPLE
     leads = {name for name, person in people.items() if person.rank is PersonRank.LEAD}
@@ -168,7 +168,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
     for where, words in _find_contradictions(tree, path, unbound=unbound, moved=moved):
         document.report(where, words)
     document.raise_faults()
-    assert file is not None  # else the document had ended
+    assert file is not None  # otherwise raise_faults has raised
     merged = {name: _merge_layers(tree, car) for name, car in tree["cars"].items()}
     places = {name: _resolve_path(path, tree.get(name)) for name in PATHS}
     record = file.record if isinstance(file.record, RecordEntry) else None
@@ -193,7 +193,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 
 def profile_capabilities(platform: str) -> frozenset[str]:
-    """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
+    """Return the parts and modes of a platform's cars. For `auto`: of the cars of all platforms."""
     profiles = drivers.profiles_of(platform)
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 
@@ -240,7 +240,7 @@ def default_color(name: str, index: int) -> str:
 
 
 def _merge_layers(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge a car's fields: the defaults, then those of its type, then its own."""
+    """Merge a car's fields: the defaults, then the fields of its type, then its own fields."""
     merged: dict[str, Any] = {}
     limits: dict[str, Any] = {}
     kind = car.get("type")
@@ -255,8 +255,8 @@ def _resolve_path(path: Path, given: str | None) -> Path | None:
     return None if given is None else (path.absolute().parent / Path(given).expanduser()).resolve()
 
 
-# Contradictions between fields. They are searched in the raw data, so that they are reported along with the faults of
-# single fields.
+# Contradictions between fields. They are searched for in the raw data, so that they are reported together with the
+# faults of single fields.
 
 
 def _find_contradictions(

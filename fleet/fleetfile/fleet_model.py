@@ -24,11 +24,11 @@ from schemas.yaml_document.document import Entry
 from schemas.yaml_document.fault_words import quote_value
 
 MIN_PIN_S: Final = 1.0
-"""Minimum time before and after a pinned moment: the recorder writes what is pinned once a second."""
+"""Minimum time before and after a pinned moment. The recorder writes its pins only once a second."""
 MAX_PIN_S: Final = 3600.0
 """Maximum time before and after a pinned moment: the longest lesson."""
 MAX_PIN_RULES: Final = 50
-"""Maximum conditions of pins. The recorder asks all of them of each reading that they name."""
+"""Maximum number of conditions for pins. The recorder evaluates each for every reading that it names."""
 
 
 class PersonRank(StrEnum):
@@ -76,7 +76,7 @@ def validate_endpoint(text: str) -> str:
         raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
     try:
         return bus.resolve_endpoint(text)
-    except bus.BadEndpoint as error:  # pydantic lets no other error than ValueError be one of the file
+    except bus.BadEndpoint as error:  # pydantic reports only a ValueError as a fault of the file
         raise ValueError(str(error).removeprefix("endpoint ")) from None
 
 
@@ -96,7 +96,7 @@ def validate_size(text: str) -> str:
 def validate_path(text: str) -> str:
     """Return a path. Raises ValueError if it is not printable."""
     if not text or not text.isprintable():
-        raise ValueError(f"{quote_value(text)} is not allowed: a path, from the place of this file")
+        raise ValueError(f"{quote_value(text)} is not allowed: write a path, relative to this file")
     return text
 
 
@@ -137,7 +137,7 @@ class LimitsEntry(Entry):
     longest_drive_s: float = Field(
         default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of a drive, seconds"
     )
-    speed_max: float = Field(default=1.0, gt=0, le=1, description="1 is the car's fastest, 0.5 half of it")
+    speed_max: float = Field(default=1.0, gt=0, le=1, description="1 is the car's top speed, 0.5 half of it")
     battery_low_v: _Volts = Field(default=LOW_V, description="below this the battery is low, volts at rest")
     battery_critical_v: _Volts = Field(default=CRITICAL_V, description="below this it is critical, volts at rest")
     on_battery_low: BatteryAction = Field(default=BatteryAction.WARN, description="reaction to a low battery")
@@ -151,18 +151,20 @@ class CommonEntry(Entry):
 
     # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
     platform: _Platform = Field(
-        default=AUTO, description="its program, with options (arduino+arm); auto: its gateway finds out"
+        default=AUTO, description="the car's program, with options (arduino+arm); auto: its gateway detects it"
     )
     color: _Color = Field(
         default_factory=str,
-        description='in tables and pictures: red, or "#e01b24" in quotes; left out: the color that is the car\'s name',
+        description='color in tables and pictures: red, or "#e01b24" in quotes; left out: the color in the car\'s name',
     )
     without: list[Capability] = Field(
         default_factory=list,
         description="modes and parts that the plan does not use, because they are broken or absent",
     )
-    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="its limits")
-    roles: list[_Name] = Field(default_factory=list, description="roles of the plan that it may take; left out: any")
+    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of the car")
+    roles: list[_Name] = Field(
+        default_factory=list, description="roles of the plan that the car may have; left out: any"
+    )
 
 
 class CarEntry(CommonEntry):
@@ -184,31 +186,32 @@ class PersonEntry(Entry):
 
 
 class RecordEntry(Entry):
-    """Where `fleet up` records, and how much it keeps."""
+    """Where `fleet up` records, and how much of that is kept."""
 
-    to: _Path = Field(default_factory=str, description="the directory of sessions, from the place of this file")
+    to: _Path = Field(default_factory=str, description="the directory of sessions, relative to this file")
     quota: _Size = Field(
-        default_factory=str, description="maximum size of all sessions there: 20GB; the oldest ones are removed"
+        default_factory=str,
+        description="maximum size of all sessions there, such as 20GB; beyond it, the oldest are removed",
     )
 
     @property
     def limits(self) -> Quota:
-        """Return what the recorder keeps."""
+        """Return the limits of the recordings."""
         return Quota(total=parse_size(self.quota) or 0)
 
 
 class PinEntry(Entry):
-    """A condition whose time the quota of the recordings takes last."""
+    """A condition. Recordings of the time around it are the last that the quota removes."""
 
-    when: str = Field(description="the condition, true of any car, as in plans: `mode.verdict == 'contradicted'`")
-    before: _PinTime = Field(default="30s", description="what is pinned before it: 1s to 1h")
-    after: _PinTime = Field(default="30s", description="what is pinned after it: 1s to 1h")
+    when: str = Field(description="the condition, true for any car, as in plans: `mode.verdict == 'contradicted'`")
+    before: _PinTime = Field(default="30s", description="pinned time before the condition is true: 1s to 1h")
+    after: _PinTime = Field(default="30s", description="pinned time after the condition was true: 1s to 1h")
 
 
 class ConsoleEntry(Entry):
     """The web page of `fleet up`."""
 
-    port: int = Field(default=0, ge=0, le=65535, description="its port; 0 or left out: 7480")
+    port: int = Field(default=0, ge=0, le=65535, description="port of the page; 0 or left out: 7480")
 
 
 class FileEntry(Entry):
@@ -218,20 +221,20 @@ class FileEntry(Entry):
     endpoint: Annotated[str, AfterValidator(validate_endpoint)] = Field(
         default_factory=str, description="the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or loopback"
     )
-    plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")
+    plan: _Path = Field(default_factory=str, description="the file with the plan: what the cars do together")
     record: bool | RecordEntry = Field(
-        default=True, description="false: `fleet up` does not record; or where to, and how much"
+        default=True, description="false: `fleet up` does not record; or where it records, and how much is kept"
     )
     pin: list[PinEntry] = Field(
         default_factory=list,
         max_length=MAX_PIN_RULES,
-        description="times that the quota takes last, `[{when: range_m < 0.1}]`, beside stops and marks",
+        description="times that the quota removes last, `[{when: range_m < 0.1}]`, besides stops and marks",
     )
     console: bool | ConsoleEntry = Field(
         default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`"
     )
-    world: _Path = Field(default_factory=str, description="the world of simulated cars, a file")
-    defaults: CommonEntry = Field(default_factory=CommonEntry, description="for every car")
+    world: _Path = Field(default_factory=str, description="the file with the world of the simulated cars")
+    defaults: CommonEntry = Field(default_factory=CommonEntry, description="values for every car")
     types: dict[_Name, CommonEntry] = Field(
         default_factory=dict, description="kinds of cars, which override the defaults"
     )

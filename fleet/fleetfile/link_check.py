@@ -1,8 +1,8 @@
 """Checks the links in a fleet file without opening any that could move, reset or end a car.
 
-Opening a serial port resets an Arduino. Closing a connection to a Raspberry Pi car ends its program while the motors go
-on (docs/reference/protocol.md#hazards-of-raspberry-pi-programs), so only its host is checked. A car with a gateway is
-checked by the gateway's state.
+Opening a serial port resets an Arduino. Closing a connection to a Raspberry Pi car ends the car's program while the
+motors keep running (docs/reference/protocol.md#hazards-of-raspberry-pi-programs), so only its host is checked. For a
+car with a gateway, the state of the gateway counts.
 """
 
 import errno
@@ -64,7 +64,7 @@ def _is_same(url: str, link: str) -> bool:
 
 
 class _Look:
-    """Looks at what the link of a car of this platform names."""
+    """Looks at the device or host that the link of a car of this platform names."""
 
     def __init__(self, platform: str) -> None:
         self._has_bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
@@ -80,7 +80,7 @@ class _Look:
 
 
 def check_device(path: str) -> tuple[bool, str]:
-    """Return whether a serial port exists, is permitted and is free, with the words. Nothing is opened."""
+    """Return whether a serial port exists, may be opened and is free, with a text. Nothing is opened."""
     if os.name != "posix":
         is_listed = path.upper() in (str(port.device).upper() for port in _list_ports())
         return is_listed, "the port is there; not opened" if is_listed else "there is no such port: plug the car in"

@@ -1,4 +1,4 @@
-"""Runs `gateway scan` as a process: finds the links that may be a car's."""
+"""Runs `gateway scan` as a process, to find links that may be cars."""
 
 import json
 import subprocess
@@ -15,18 +15,17 @@ from schemas.words import LinkVerdict, Platform
 
 LIKELY_VERDICTS: Final = (LinkVerdict.CAR, "ble", "given")
 POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, LinkVerdict.SILENT, LinkVerdict.BUSY)
-"""Verdicts on links that may be a car's: a scan receives nothing from a car that is off, silent or served already.
-
+"""Verdicts on links that may be cars. A scan receives nothing from a car that is off, silent, or already has a gateway.
 `ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
 
 
 class ScanFailed(Exception):
-    """`gateway scan` failed; the text says why."""
+    """`gateway scan` failed. The text says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundLink:
-    """A link that may be a car's. `verdict` is one of POSSIBLE_VERDICTS. `platform` is detected, or `auto`."""
+    """A link that may be a car. `verdict` is one of POSSIBLE_VERDICTS. `platform` is detected, or `auto`."""
 
     url: str
     verdict: str
@@ -37,7 +36,7 @@ class FoundLink:
 def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
     """Scan these links, or all ports and Bluetooth devices, for cars. Raises ScanFailed if the scan cannot run.
 
-    Typed TCP and Bluetooth links are not scanned: closing a TCP connection may end the car's program.
+    Typed TCP and Bluetooth links are not scanned, because closing a TCP connection may end the car's program.
     """
     given = [link for link in links if not isinstance(parse_fleet_link(link), SerialUrl | UsbUrl)]
     taken = [FoundLink(link, "given", "not listened to") for link in dict.fromkeys(given)]

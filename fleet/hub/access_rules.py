@@ -1,20 +1,20 @@
 """The rules of a hub: which identity may use which keys, in the form of Zenoh's access control. Pure.
 
 Everything is denied that no rule allows. Everyone with a certificate may read everything and stop every car. Beyond
-that, an identity speaks only as itself:
+that, an identity sends only in its own name:
 
 - The gateway of a car publishes and answers under the keys of its car.
 - A service publishes and answers under its own keys, such as `@recorder/**`. The simulator also publishes the true
   state of its cars.
-- A locator publishes where the cars are (`sensor/pose`), and nothing else of them.
-- It asks for its next certificate under a key with its identity.
+- A locator publishes where the cars are (`sensor/pose`), and nothing else.
+- Every identity asks for its next certificate under a key with its own name.
 - A command has the identity of its sender in its key: `fleet/red/@cmd/@by/person.mia/drive`. Only `person.mia` may send
-  under it. What Mia may do is decided by the gateway, from `people:` of the fleet file, as on a hub without rules. So a
-  change of `people:` needs no other rules.
+  under this key. The gateway decides what Mia may do, by `people:` in the fleet file, as on a hub without rules. So the
+  rules stay the same when `people:` changes.
 
-A rule of Zenoh matches a message if one of its key expressions includes that of the message. So whoever answers the
-questions of others needs their wildcards in its rules, and `**` does not include parts that begin with @
-(docs/explanation/measurements.md#access-control).
+A rule of Zenoh matches a message if one of the rule's key expressions includes the message's key expression. So a
+program that answers queries with wildcards needs these wildcards in its rules. And `**` does not include parts that
+begin with @ (docs/explanation/measurements.md#access-control).
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,9 +25,9 @@ from schemas.bus.credentials import HUB
 from schemas.identity import IdentityRole, Service, parse, role_of
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-"""Messages that ask for something."""
+"""Messages with which a program asks for something."""
 _TELLS: Final = ("put", "delete", "reply", "liveliness_token", "declare_queryable")
-"""Messages that tell something, or offer to."""
+"""Messages with which a program publishes or answers, or offers to do so."""
 
 _SERVICES: Final = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR, keys.SIMULATOR, keys.OPERATOR, keys.REPLAY)
 _PUBLIC: Final = (
@@ -35,15 +35,15 @@ _PUBLIC: Final = (
     "**/@adv/**",
     *(each for name in _SERVICES for each in (f"*/{name}", f"*/{name}/**", f"*/{name}/**/@adv/**")),
 )
-"""What everyone may read."""
+"""The keys that everyone may read."""
 _COMMANDS: Final = (
     "*/*/@cmd/**",
     "*/*/@cmd/@by/**",
     *(each for name in _SERVICES for each in (f"*/{name}/@cmd/**", f"*/{name}/@cmd/@by/**")),
 )
-"""The keys of all commands. Everyone may see who answers them, and that somebody drives; sending is another matter."""
+"""The keys of all commands. Everyone may see who answers them, and that somebody drives. Sending needs another rule."""
 _OF_HUBS: Final = (*_PUBLIC, *_COMMANDS, keys.HUB_RULES, keys.renewal_key("*"))
-"""The keys that hubs of sites use among one another."""
+"""The keys that hubs of different sites may pass on to each other."""
 _OWN_SERVICE: Final = {
     Service.SUPERVISOR: keys.SUPERVISOR,
     Service.COORDINATOR: keys.COORDINATOR,
@@ -55,8 +55,8 @@ _OWN_SERVICE: Final = {
 def access_control(names: Iterable[tuple[str, str]], *, of_site: bool = False) -> dict[str, Any]:
     """Return the rules for identities, each with the common name of its certificate.
 
-    of_site: for the hub of another site, which links to the first one. A hub passes on what it has checked by the same
-    rules, so all of it is allowed to another hub.
+    of_site: make the rules for the hub of another site, which is linked to the first hub. A hub passes on only what it
+    has checked by the same rules, so another hub may do everything.
     """
     rules = [
         _rule("passes on", "ingress", _READS + _TELLS, _OF_HUBS),
@@ -88,7 +88,7 @@ def access_control(names: Iterable[tuple[str, str]], *, of_site: bool = False) -
 
 
 def _speaks(identity: str) -> list[dict[str, Any]]:
-    """Return the rules for what an identity sends."""
+    """Return the rules for commands, tokens and renewals that an identity sends."""
     known = parse(identity)
     if known is None:
         return []
@@ -103,12 +103,12 @@ def _speaks(identity: str) -> list[dict[str, Any]]:
 
 
 def _answers(identity: str) -> list[dict[str, Any]]:
-    """Return the rules for what an identity publishes and answers."""
+    """Return the rules for publications and answers of an identity."""
     known = parse(identity)
     if known is None:
         return []
     role, name = known
-    # Others ask with wildcards: what a rule does not include never arrives.
+    # Others ask with wildcards. A query that is not included in a rule does not arrive.
     is_asked = _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS))
     if known == (IdentityRole.SERVICE, Service.LOCATOR):
         return [_rule(f"{identity} tells", "ingress", _TELLS, ("*/*/sensor/pose", "*/*/sensor/pose/@adv/**")), is_asked]

@@ -11,7 +11,7 @@ _HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?(\.[
 
 
 def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this computer in its networks. The one of the default route is the first."""
+    """Return the IPv4 addresses of this computer in its networks. The address of the default route comes first."""
     listed = [str(each.ip) for adapter in ifaddr.get_adapters() for each in adapter.ips if each.is_IPv4]
     found = [each for each in listed if not ipaddress.ip_address(each).is_loopback]
     first = _default_address()

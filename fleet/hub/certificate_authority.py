@@ -1,7 +1,7 @@
 """The certificate authority of a hub: one key, and the certificates that it signs.
 
-Keys are on the curve P-256. A certificate names one identity. Only the certificates of hubs may be those of servers, so
-nobody else who has joined can be the hub for others.
+Keys are on the curve P-256. A certificate names one identity. Only certificates of hubs are valid for a server, so no
+other computer that has joined can pretend to be the hub.
 """
 
 import hashlib
@@ -48,7 +48,7 @@ def make_authority(now: datetime) -> KeyPair:
 
 
 def new_request(name: str) -> tuple[bytes, bytes]:
-    """Return a new private key, and a request for a certificate of it, PEM."""
+    """Return a new private key, and a request for its certificate, PEM."""
     key = new_key()
     request = x509.CertificateSigningRequestBuilder().subject_name(common_name(name)).sign(key, hashes.SHA256())
     return private_pem(key), request.public_bytes(serialization.Encoding.PEM)
@@ -57,8 +57,8 @@ def new_request(name: str) -> tuple[bytes, bytes]:
 def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
     """Return the certificate of an identity for the key of a request. Raises BadRequestForCertificate.
 
-    The name in the request does not count: whoever asks does not choose who it is. With `addresses`, it is that of the
-    hub of another site.
+    The name in the request does not count, because a computer must not choose its own identity. With `addresses`, it is
+    the certificate of the hub of another site.
     """
     try:
         asked = x509.load_pem_x509_csr(request)
@@ -77,7 +77,10 @@ def sign_request(authority: KeyPair, request: bytes, name: str, now: datetime, a
 
 
 def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str] = ()) -> KeyPair:
-    """Return a new key and its certificate. With `addresses`, IP addresses and host names, it is that of the hub."""
+    """Return a new key and its certificate.
+
+    With `addresses` (IP addresses, host names), it is the hub's certificate.
+    """
     key = new_key()
     names = tuple(addresses)
     usage = _SERVER if names else ExtendedKeyUsageOID.CLIENT_AUTH
@@ -85,9 +88,9 @@ def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str]
 
 
 def renew(authority: KeyPair, certificate: bytes, request: bytes, name: str, now: datetime) -> bytes:
-    """Return the next certificate for the key of this one, which is in force and due. Raises BadRequestForCertificate.
+    """Return the next certificate for the same key, if this one is in force and due. Raises BadRequestForCertificate.
 
-    The request proves that whoever asks has the key. The names of a hub of another site stay.
+    The request proves that the sender has the key. The names of a site's hub are copied from the old certificate.
     """
     ca = x509.load_pem_x509_certificate(authority.certificate)
     try:
@@ -103,12 +106,12 @@ def renew(authority: KeyPair, certificate: bytes, request: bytes, name: str, now
     if not old.not_valid_before_utc <= now < old.not_valid_after_utc:
         raise BadRequestForCertificate("the certificate is not in force")
     if not is_due(certificate, now):
-        raise BadRequestForCertificate("the certificate is renewed in the last third of its life, not before")
+        raise BadRequestForCertificate("a certificate is renewed only in the last third of its life")
     return sign_request(authority, request, name, now, sorted(_names(old)))
 
 
 def is_due(certificate: bytes, now: datetime, addresses: Iterable[str] = ()) -> bool:
-    """Return True if a certificate must be renewed: it ends soon, lacks an address, or is not a certificate."""
+    """Return True if a certificate must be renewed: it expires soon, lacks an address, or is not valid."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
     except ValueError:
@@ -132,12 +135,12 @@ def names_of(certificate: bytes) -> list[str]:
 
 
 def expires(certificate: bytes) -> datetime:
-    """Return when a certificate ends. Raises ValueError if it is not one."""
+    """Return when a certificate expires. Raises ValueError if it is not a certificate."""
     return x509.load_pem_x509_certificate(certificate).not_valid_after_utc
 
 
 def belong(certificate: bytes, key: bytes) -> bool:
-    """Return True if a private key is that of a certificate. False if one of them is not valid."""
+    """Return True if a private key belongs to a certificate. False if one of them is not valid."""
     try:
         found: Any = serialization.load_pem_private_key(key, None)
         public = x509.load_pem_x509_certificate(certificate).public_key()
@@ -147,10 +150,10 @@ def belong(certificate: bytes, key: bytes) -> bool:
 
 
 def only_certificate(text: bytes) -> bytes:
-    """Return the one certificate in a text, and nothing else of it, PEM. Raises ValueError if there is not just one."""
+    """Return the only certificate in a text, PEM, without the rest. Raises ValueError if there is not exactly one."""
     found = x509.load_pem_x509_certificates(text)
     if len(found) != 1:
-        raise ValueError(f"{len(found)} certificates where there is one")
+        raise ValueError(f"{len(found)} certificates, expected one")
     return pem(found[0])
 
 

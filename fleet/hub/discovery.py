@@ -1,8 +1,8 @@
 """Finds the hub that waits for somebody to join, by multicast DNS (zeroconf), so that its address need not be typed.
 
-The hub is announced for as long as its invitation waits. Anybody in the network may announce anything, and who joins
-believes none of it: the code tells the right hub from another (join_code.py). So whoever lies here can at most send
-somebody to a hub that the code refuses, and there is a limit to how many are tried.
+The hub is announced for as long as its invitation waits. Anybody in the network may announce anything, so the joining
+computer trusts no announcement: it recognizes the right hub by the code (join_code.py). A false announcement can only
+lead it to a hub that does not fit the code, and the number of hubs that are tried is limited.
 """
 
 import socket
@@ -18,16 +18,16 @@ from fleet.hub.join_code import JoinCode
 
 JOIN_SERVICE: Final = "_car-fleet-hub._tcp.local."
 SEARCH_S: Final = 3.0
-"""Maximum time to look for a hub: the questions go out after 0, 1 and 3 s."""
+"""Maximum time to look for a hub. The queries are sent after 0, 1 and 3 s."""
 MAX_FOUND_HUBS: Final = 16
-"""Maximum hubs that are tried."""
+"""Maximum number of hubs that are tried."""
 _RESOLVE_MS: Final = 1000
 _SEARCH_POLL_S: Final = 0.05
 
 
 @contextmanager
 def announced(port: int, code: JoinCode, addresses: Sequence[str]) -> Iterator[bool]:
-    """Announce an invitation at this port while the block runs. Yield False where the network has no multicast."""
+    """Announce an invitation at this port while the block runs. Yield False if the network has no multicast."""
     info = ServiceInfo(
         JOIN_SERVICE,
         f"{_instance(code)}.{JOIN_SERVICE}",
@@ -47,7 +47,7 @@ def announced(port: int, code: JoinCode, addresses: Sequence[str]) -> Iterator[b
 
 
 def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterator[str]:
-    """Yield host:port of hubs that wait for somebody, as they are found. `addresses` are this computer's."""
+    """Yield host:port of hubs that wait for somebody, as they are found. `addresses` are those of this computer."""
     try:
         browser = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
     except OSError:

@@ -1,7 +1,7 @@
 """The files of a hub on its own computer: its authority, its identities, its rules. See schemas/bus/credentials.py.
 
-`identities.json` lists who has a certificate. Whoever is revoked and joins again gets another common name, so that the
-earlier certificate stays worthless.
+`identities.json` lists who has a certificate. If an identity is revoked and joins again, it gets another common name,
+so that its earlier certificate stays invalid.
 """
 
 import json
@@ -28,7 +28,7 @@ CA_KEY_FILE: Final = "ca.key"
 IDENTITIES_FILE: Final = "identities.json"
 LOCK_FILE: Final = "lock"
 LOCK_TIMEOUT_S: Final = 10.0
-"""Maximum wait for another program's change, which takes some milliseconds."""
+"""Maximum time to wait for a change by another program. A change takes some milliseconds."""
 LOCK_POLL_S: Final = 0.02
 
 
@@ -41,16 +41,16 @@ class KnownIdentity:
     """One identity that has a certificate."""
 
     until: str
-    """When its certificate ends, ISO 8601, UTC."""
+    """When its certificate expires, ISO 8601, UTC."""
     generation: int = 1
-    """Number of its common name."""
+    """Number of common names that the identity has had. It is part of the common name, except for 1."""
     revoked: bool = False
     local: bool = False
     """True if its key is on this computer."""
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Self:
-        """Return a stored one. Raises TypeError, ValueError if a field has another type."""
+        """Return a stored identity. Raises TypeError or ValueError if a field has a wrong type."""
         if type(stored.get("until")) is not str or type(stored.get("generation", 1)) is not int:
             raise ValueError(f"it has {stored}")
         return cls(**stored)
@@ -94,12 +94,12 @@ class HubStore:
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Keep other programs from changing the files, and see what they have changed. Raises OSError, BrokenHub."""
+        """Lock the files against changes by other programs, and read them again. Raises OSError, BrokenHub."""
         path, deadline = self.directory / LOCK_FILE, time.monotonic() + LOCK_TIMEOUT_S
         lock = FileLock(path)
         while not lock.try_take():
             if time.monotonic() > deadline:
-                raise BrokenHub(f"another program changes the hub, and holds {path}: try again")
+                raise BrokenHub(f"another program is changing the hub's files and holds {path}: try again")
             time.sleep(LOCK_POLL_S)
         try:
             self._read_known()
@@ -127,11 +127,11 @@ class HubStore:
         take: Iterable[str] = (),
         now: datetime | None = None,
     ) -> None:
-        """Make what is missing or due: authority, hub, and the identities of this computer. Then write the rules.
+        """Make missing or due certificates: of the authority, the hub, and the identities here. Then write the rules.
 
-        `addresses` are IP addresses and names under which others reach the hub. `listens` are its endpoints, if new.
-        `take` has more identities. If another computer has their certificate, it becomes worthless.
-        Raises OSError, BrokenHub.
+        `addresses` are IP addresses and names under which others reach the hub. `listens` are the hub's endpoints, if
+        they change. `take` are further identities for this computer. If another computer has a certificate for one of
+        them, that certificate becomes invalid. Raises OSError, BrokenHub.
         """
         now = datetime.now(UTC) if now is None else now
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -155,10 +155,10 @@ class HubStore:
             self._save(listens)
 
     def reserve(self, identity: str, now: datetime | None = None) -> None:
-        """Write the rules for an identity of another computer, which has no certificate yet. Raises OSError.
+        """Write the rules for an identity of another computer that has no certificate yet. Raises OSError.
 
-        Its earlier certificate, if it had one, is worthless from now on, also one on this computer. Raises BrokenHub
-        for whoever uses this computer: nothing could be undone then.
+        An earlier certificate of this identity becomes invalid now, also one on this computer. Raises BrokenHub for the
+        user of this computer, because that could not be undone.
         """
         if identity == self.credentials.me:
             raise BrokenHub(f"{identity} uses the hub's own computer: invite somebody under another name")
@@ -168,7 +168,7 @@ class HubStore:
             self._save()
 
     def sign(self, request: bytes, identity: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
-        """Return the certificate of a reserved identity, PEM. addresses: of the computer, if it is to be a hub.
+        """Return the certificate of a reserved identity, PEM. addresses: those of its computer, if that becomes a hub.
 
         Raises BadRequestForCertificate (even if the identity was revoked or invited again meanwhile) and OSError.
         """
@@ -185,7 +185,7 @@ class HubStore:
         return certificate
 
     def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
-        """Return the next certificate of an identity, PEM, for the key that it has. See `certificate_authority.renew`.
+        """Return the next certificate of an identity, PEM, for the same key. See `certificate_authority.renew`.
 
         Raises BadRequestForCertificate (even if the identity is revoked) and OSError.
         """
@@ -213,12 +213,15 @@ class HubStore:
         return True
 
     def revoke(self, identity: str) -> bool:
-        """Deny everything to an identity, also once more. Return False if it is not known. Raises OSError."""
+        """Deny everything to an identity. It may be revoked already. Return False if it is not known.
+
+        Raises OSError.
+        """
         with self._changing():
             entry = self.known.get(identity)
             if entry is None:
                 return False
-            entry.revoked = True  # once more, if the last time failed half way
+            entry.revoked = True  # do it again even if it is revoked, because the last time may have failed half way
             self._forget_local(identity)
             self._save()
         return True
@@ -231,7 +234,7 @@ class HubStore:
         assert parse(identity) is not None, identity
         entry = self.known.get(identity)
         if entry is not None and not entry.local and not entry.revoked and not take:
-            return  # another computer has it
+            return  # another computer has the certificate
         if entry is None or entry.revoked or not entry.local:
             entry = self._next(identity, now)
         elif not self._is_due(identity, now):
@@ -241,23 +244,23 @@ class HubStore:
         self.known[identity] = entry
 
     def _next(self, identity: str, now: datetime) -> KnownIdentity:
-        """Return the entry of a new certificate. An earlier certificate of this identity is worthless then."""
+        """Return the entry for a new certificate. It makes an earlier certificate of this identity invalid."""
         before = self.known.get(identity)
         return KnownIdentity(_until(now), 1 if before is None else before.generation + 1)
 
     def _is_due(self, name: str, now: datetime, addresses: Iterable[str] = ()) -> bool:
-        """Return True if a certificate on this computer must be made: it is missing, damaged, or must be renewed."""
+        """Return True if a certificate on this computer must be made because it is missing, damaged or due."""
         certificate = self._read(name)
         is_whole = certificate_authority.belong(certificate, self._read(name, "key"))
         return not is_whole or certificate_authority.is_due(certificate, now, addresses)
 
     def _save(self, listens: Iterable[str] = ()) -> None:
-        """Write the identities, and the rules if they changed: the hub restarts then."""
+        """Write the identities, and the rules if they changed. The hub restarts when the rules change."""
         stored: Mapping[str, object] = {name: asdict(each) for name, each in sorted(self.known.items())}
         path = self.directory / HUB_FILE
         chosen = list(listens)
         if not chosen:
-            with suppress(NoCredentials):  # there is none yet, or it is damaged: loopback then
+            with suppress(NoCredentials):  # the file is missing or damaged: use loopback
                 chosen = self.credentials.listens
         allowed = [(name, each.common_name(name)) for name, each in self.known.items() if not each.revoked]
         settings = {
@@ -266,7 +269,7 @@ class HubStore:
             OF_SITES: access_control(sorted(allowed), of_site=True),
         }
         made = json.dumps(settings, indent=1).encode()
-        # First the rules: if the disk is full, nobody is listed as revoked who is not.
+        # Write the rules first. If the disk is full, the list must not show somebody as revoked who is not.
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
         write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)
@@ -292,5 +295,5 @@ class HubStore:
 
 
 def _until(now: datetime) -> str:
-    """Return when a certificate ends that is made now."""
+    """Return when a certificate expires that is made now."""
     return (now + LIFETIME).isoformat(timespec="seconds")

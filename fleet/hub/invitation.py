@@ -1,7 +1,7 @@
 """Lets one other computer join the hub, once, within ten minutes: the server on the hub's side, and the client.
 
-The client makes its key itself; the key never leaves it. It sends a request for a certificate with the secret half of
-the code. The hub decides which identity the certificate has.
+The client makes its own key, and the key never leaves the client. The client sends a request for a certificate, with
+the secret half of the code. The hub decides which identity the certificate gets.
 """
 
 import base64
@@ -29,12 +29,13 @@ from schemas.printable import printable
 JOIN_PORT: Final = 7448
 MAX_JOIN_REQUEST_BYTES: Final = 16_384
 _MAX_DISCARDED_BYTES: Final = 4 * MAX_JOIN_REQUEST_BYTES
-"""Maximum size of a request that is read although it is too long. With more unread, the answer may be lost."""
+"""Maximum number of bytes that are read from a request that is too long. If more stay unread, the answer may be
+lost."""
 MAX_JOIN_ANSWER_BYTES: Final = 16 << 20
-"""Of an answer: a fleet file, and for the hub of a site the rules, 2.4 kB for each identity."""
+"""Maximum size of an answer. It has a fleet file and, for the hub of a site, the rules: 2.4 kB for each identity."""
 MAX_HUB_NAMES: Final = 32
 SOCKET_TIMEOUT_S: Final = 10.0
-"""Timeout of a connection: a stranger who says nothing holds up nobody for longer."""
+"""Timeout of a connection. A stranger who sends nothing cannot block others for longer."""
 
 
 class NotJoined(BusError):
@@ -42,12 +43,12 @@ class NotJoined(BusError):
 
 
 class NotThisHub(NotJoined):
-    """Nobody answers there, or another hub than the one that made the code."""
+    """No hub answers there, or a hub that did not make the code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """What a computer gets that joins."""
+    """Everything that a joining computer gets."""
 
     identity: str
     port: int
@@ -57,11 +58,11 @@ class Joined:
     key: bytes
     fleet_file: str = ""
     rules: Mapping[str, Any] = field(default_factory=dict)
-    """The rules for the hub of another site. Empty for all others."""
+    """The rules, if the computer becomes the hub of another site. Otherwise empty."""
 
 
 class Invitation:
-    """The server for one invitation. `wait` returns when somebody has joined, or nobody may any more."""
+    """The server for one invitation. `wait` returns when somebody has joined, or when nobody may join any more."""
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class Invitation:
         ca = (store.directory / CA_FILE).read_bytes()
         self.code = JoinCode.new(certificate_authority.fingerprint(ca))
         self.joined_from = ""
-        """Address of the computer that has joined. Empty before."""
+        """Address of the computer that has joined. Empty until then."""
         self._answer = {"port": hub_port, "fleet_file": fleet_file, "identity": identity}
         self._store = store
         self._identity = identity
@@ -89,21 +90,21 @@ class Invitation:
         self._server.daemon_threads = True
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(store.directory / f"{HUB}.pem", store.directory / f"{HUB}.key")
-        # The handshake is left to the thread of the connection: a stranger who sends nothing then holds up nobody.
+        # The thread of each connection does the handshake. So a stranger who sends nothing cannot block others.
         self._server.socket = context.wrap_socket(self._server.socket, server_side=True, do_handshake_on_connect=False)
         self._thread = threading.Thread(target=self._server.serve_forever, name="invitation", daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
-        """Return the port it listens on."""
+        """Return the port on which the server listens."""
         return int(self._server.server_address[1])
 
     def wait(self, timeout_s: float = JOIN_CODE_LIFETIME_S) -> str:
-        """Wait until somebody has joined. Return an empty text then, else why nobody can join any more."""
+        """Wait until somebody has joined. Return an empty text then, or the reason why nobody can join any more."""
         if not self._over.wait(timeout_s):
             return f"nobody has joined within {timeout_s / 60:g} minutes"
-        return "" if self.joined_from else f"{MAX_GUESSES} wrong codes came: this code is over"
+        return "" if self.joined_from else f"{MAX_GUESSES} wrong codes came: this code is no longer valid"
 
     def close(self) -> None:
         """Stop listening."""
@@ -112,11 +113,14 @@ class Invitation:
         self._thread.join()
 
     def _take(self, guess: str, request: bytes, addresses: list[str], source: str) -> tuple[int, dict[str, Any]]:
-        """Return the answer to a request to join: HTTP status and fields. `addresses` are the asking computer's."""
+        """Return the answer to a request to join: HTTP status and fields.
+
+        `addresses` are those of the joining computer.
+        """
         is_site = role_of(self._identity) is IdentityRole.SITE
         with self._lock:
             if self._over.is_set():
-                return 410, {"error": "this code is used or over: `fleet hub invite` makes another one"}
+                return 410, {"error": "this code was used or has expired: `fleet hub invite` makes another one"}
             if not self.code.is_secret(guess):
                 self._wrong += 1
                 if self._wrong >= MAX_GUESSES:
@@ -129,7 +133,7 @@ class Invitation:
             except BadRequestForCertificate as error:
                 return 400, {"error": str(error)}
             except OSError as error:
-                return 500, {"error": f"the hub cannot store it: {error.strerror or error}"}
+                return 500, {"error": f"the hub cannot store the certificate: {error.strerror or error}"}
             self.joined_from = source
             self._over.set()
             own = {"certificate": certificate.decode(), "ca": self._ca.decode(), "rules": rules}
@@ -151,7 +155,7 @@ class Invitation:
                     if not 0 < length <= MAX_JOIN_REQUEST_BYTES:
                         # Unread bytes would reset the connection when it closes, and the answer could be lost.
                         self.rfile.read(min(max(length, 0), _MAX_DISCARDED_BYTES))
-                        self._send(413, {"error": f"a request has 1 to {MAX_JOIN_REQUEST_BYTES} bytes"})
+                        self._send(413, {"error": f"a request must have 1 to {MAX_JOIN_REQUEST_BYTES} bytes"})
                         return
                     asked = json.loads(self.rfile.read(length))
                     guess, request = str(asked["secret"]), base64.b64decode(asked["request"], validate=True)
@@ -162,7 +166,7 @@ class Invitation:
                 self._send(*invitation._take(guess, request, addresses, str(self.client_address[0])))
 
             def log_message(self, *_: object) -> None:
-                """Log nothing: strangers would fill the terminal."""
+                """Log nothing, because strangers could fill the terminal."""
 
             def _send(self, status: int, fields: dict[str, Any]) -> None:
                 body = json.dumps(fields).encode()
@@ -183,14 +187,14 @@ def join(
     clock: Callable[[], float] = time.time,
     addresses: Iterable[str] = (),
 ) -> Joined:
-    """Join the hub on another computer, or raise NotJoined. `addresses` are this computer's, if it may be a hub."""
+    """Join the hub on another computer. Raises NotJoined. `addresses` are this computer's, in case it becomes a hub."""
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code says whether it is the right one
+    anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code shows whether it is the right hub
     found = _ask(where, anyone, "GET", None)
     ca, fits = b"", False
     try:
-        # Just one: OpenSSL would trust each of several, and the code is about the first.
+        # Allow only one certificate: OpenSSL would trust each of several, but the code checks only the first.
         ca = certificate_authority.only_certificate(str(found.get("ca")).encode())
         fits = code.fits(certificate_authority.fingerprint(ca))
     except ValueError:
@@ -207,7 +211,7 @@ def join(
     found = _ask(where, known, "POST", json.dumps(asked).encode())
     try:
         certificate = str(found["certificate"]).encode()
-        if role_of(str(found["identity"])) is None:  # it becomes the name of a file
+        if role_of(str(found["identity"])) is None:  # the identity becomes the name of a file
             raise NotJoined(f"{where} gave no identity: {printable(str(found['identity']))}")
         if certificate_authority.expires(certificate).timestamp() <= clock():
             raise NotJoined(f"the clock of this computer is wrong: the new certificate of {where} has ended already")
@@ -218,9 +222,9 @@ def join(
 
 
 def join_one_of(found: Iterable[str], code: JoinCode, addresses: Iterable[str] = ()) -> tuple[str, Joined]:
-    """Join the hub that made a code. found: addresses, host:port, of any hubs. Return its host, too. Raises NotJoined.
+    """Join the hub that made a code, and return its host, too. found: host:port of any hubs. Raises NotJoined.
 
-    Those that did not make the code learn nothing of it (see `join`).
+    Hubs that did not make the code do not learn it (see `join`).
     """
     own, tried = list(addresses), 0
     for each in found:

@@ -14,7 +14,7 @@ CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """Letters and digits that people do not confuse."""
 _BASE32: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ234567"
 _HALF: Final = 12
-"""Characters of each half, 60 bits. The hub allows five guesses. To forge an authority with this pin takes 10^18 tries.
+"""Characters of each half, 60 bits. The hub allows five guesses. Forging an authority with this pin takes 10^18 tries.
 """
 _GROUP: Final = 4
 """Characters between two hyphens."""

@@ -1,4 +1,4 @@
-"""Makes this computer the hub, lets it join another one's, and ends that."""
+"""Makes this computer a hub, lets it join the hub on another computer, and lets it leave that hub."""
 
 import getpass
 import os
@@ -21,15 +21,15 @@ from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, directory_of, joined_endpoint
 
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
-"""Where the programs of the hub's own computer find it."""
+"""Endpoint at which programs on the hub's own computer find the hub."""
 JOINED_BYTES: Final = 65_536
-"""More than a computer stores when it joins: a key, two certificates, and at a site the rules of twenty identities."""
+"""More bytes than a joining computer stores: a key, two certificates, and at a site the rules of twenty identities."""
 SOMEBODY: Final = "operator"
-"""The name of a user whose login is not a name of a person."""
+"""The name of a user whose login is not valid as a person's name."""
 
 
 def local_person() -> str:
-    """Return the name of whoever uses this computer: FLEET_AS, else the login."""
+    """Return the name of the user of this computer: FLEET_AS, or the login."""
     given = os.environ.get("FLEET_AS", "")
     try:
         name = given or getpass.getuser()
@@ -44,8 +44,8 @@ def ensure_hub_here(
 ) -> HubStore:
     """Make this computer the hub at `endpoint`, or bring its certificates up to date. Raises BusError, OSError.
 
-    cars: those whose gateways run on this computer, unless another computer has their certificates. take: identities
-    that are at home here from now on.
+    cars: cars whose gateways run on this computer, unless another computer has their certificates. take: identities
+    that this computer gets even if another computer has their certificates.
     """
     store = HubStore.of(endpoint)
     name = identity.parse(store.credentials.me)
@@ -58,7 +58,7 @@ def ensure_hub_here(
 
 
 def everywhere(endpoint: str) -> str:
-    """Return where a hub listens that other computers may join."""
+    """Return the endpoint at which a hub listens if other computers may join it."""
     return f"{endpoint.partition('/')[0]}/0.0.0.0:{endpoint.rpartition(':')[2]}"
 
 
@@ -68,7 +68,7 @@ def is_hub_here(endpoint: str) -> bool:
 
 
 def use(endpoint: str) -> None:
-    """Make `endpoint` the one of every program of this user, unless it is told another one. Raises OSError."""
+    """Make `endpoint` the default of every program of this user. Raises OSError."""
     directory = default_directory()
     directory.mkdir(parents=True, exist_ok=True)
     write_atomically(directory / JOINED_FILE, f"{endpoint}\n".encode())
@@ -102,10 +102,10 @@ def _check_writable(place: Path) -> None:
 
 
 def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:
-    """Store what a computer got that joined, and return the endpoint of its hub. Raises OSError, NotJoined.
+    """Store what this computer got when it joined, and return the endpoint of its hub. Raises OSError, NotJoined.
 
     A computer may join again, for a car or a service. Its user stays the person who joined first. `site` is the address
-    of the hub that it uses, if that is not the one it has joined at; site_port: its port, if it is another one.
+    of the hub to use, if it is not the hub that was joined. site_port: the port of that hub, if it differs.
     """
     first = f"tls/{host}:{joined.port}"
     at = LOOPBACK if joined.rules else site or host
@@ -132,7 +132,9 @@ def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) 
 
 
 def leave() -> tuple[str, Path | None]:
-    """End the use of a joined hub. Return its endpoint, empty if there is none, and what was kept: a hub's authority.
+    """End the use of a joined hub.
+
+    Return its endpoint (empty if there is none), and the directory of a hub's authority if that was kept.
 
     Raises OSError.
     """

@@ -11,9 +11,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 LIFETIME: Final = timedelta(days=397)
-"""Lifetime of a certificate. Browsers refuse much longer ones."""
+"""Lifetime of a certificate. Browsers reject certificates that last much longer."""
 _BACKDATED: Final = timedelta(days=1)
-"""Clocks of phones and small computers differ, and a Raspberry Pi without a network has yesterday's."""
+"""Certificates begin earlier by this, because clocks differ. A Raspberry Pi without a network may show yesterday's
+time."""
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:

@@ -1,6 +1,6 @@
 """`fleet up`: starts all processes of a fleet, restarts crashed processes, and stops every car before it exits.
 
 Read `supervisor` first. `spec` describes the fleet to run, `processes` and `child` run its processes. `restart_policy`,
-`start_limit` and `hang` decide when to start or kill one (pure). `shutdown` shuts down the gateways in order. `service`
-answers queries on the bus, `status_table` draws the table.
+`start_limit` and `hang` decide when to start or kill a process (pure). `shutdown` shuts down the gateways in order.
+`supervisor_service` answers queries on the bus, `status_table` draws the table.
 """

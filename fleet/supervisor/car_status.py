@@ -17,9 +17,9 @@ MAX_CARS_LISTED: Final = 8
 READY_TIMEOUT_S: Final = 30.0
 """Time without another ready car after which a start ends, although somebody is missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
-"""The same time if everything runs, and only links of cars cannot be opened."""
+"""The same time, if everything runs and only the links of cars cannot be opened."""
 REACHED_S: Final = 2.0
-"""Time after which an open link has reached a car that sends nothing."""
+"""Time for which a link must be open to count as a link to a car, if the car sends nothing."""
 RATE_WINDOW_S: Final = 2.0
 """Minimum time over which the frame rate is measured."""
 
@@ -36,7 +36,7 @@ class CarStatus:
     safety_received: bool = False
     """True if any gateway has published the car's state/safety."""
     reached: bool = False
-    """True if any gateway has had an open link to the car: bytes came, or it stayed open."""
+    """True if any gateway has had an open link to the car: bytes came, or the link stayed open."""
     _counted: tuple[float, int] | None = None
     _reported: dict[str, str] = field(default_factory=dict)
 
@@ -54,7 +54,8 @@ class CarStatus:
             self.event = value.message.removeprefix(f"{self.car} ")
         if topic.startswith("event/") or not self.state.take(topic, value, now):
             return ""
-        # The supervisor knows when a process has ended (`reset`). Until then whoever publishes a state is there.
+        # The supervisor knows when a gateway has ended (`reset`). Until then, a gateway that publishes a state is
+        # present.
         self.state.present |= topic.startswith("state/")
         match topic:
             case "state/link":
@@ -91,7 +92,7 @@ class CarStatus:
             self._counted = (now, frames)
 
     def _change(self, what: str, words: str) -> str:
-        """Return the words if they are news. A growing time is not news, nor are normal values in the first message."""
+        """Return the words if they are new. A growing time is not new, nor are normal values in the first message."""
         essence = _SECONDS.sub("", words)
         before, self._reported[what] = self._reported.get(what), essence
         return "" if essence == before or (before is None and words in _AT_FIRST) else words
@@ -99,13 +100,13 @@ class CarStatus:
 
 @dataclass(slots=True)
 class StartProgress:
-    """The progress of a start: the fewest missing cars and services so far, and the time since when."""
+    """The progress of a start: the smallest number of missing cars and services so far, and the time since then."""
 
     fewest: int | None = None
     since: float = 0.0
 
     def has_ended(self, missing: int, now: float, *, unreachable: bool) -> bool:
-        """Return True if nobody is missing, or if nobody has become ready for a while.
+        """Return True if no car or service is missing, or if none has become ready for a while.
 
         `unreachable` is True if only links of cars cannot be opened.
         """

@@ -27,7 +27,7 @@ MAX_LOG_BYTES: Final = 1_000_000
 """Maximum size of one log file. Each process has at most two."""
 MAX_LINE_BYTES: Final = 65_536
 MAX_RUN_DIRECTORIES: Final = 10
-"""Maximum number of run directories, apart from those that may be in use."""
+"""Maximum number of run directories, not counting directories that may be in use."""
 RUN_IN_USE_S: Final = 3600.0
 """A run directory that was changed within this time may be in use and is not removed."""
 _LOGGED: Final = re.compile(r"\d\d:\d\d:\d\d \S+ (?P<level>[A-Z]+) (?P<words>.*)")
@@ -82,7 +82,7 @@ def new_run(fleet: str, endpoint: str, now: float) -> Path:
 
 
 def write_copy(directory: Path, name: str, text: str) -> Path:
-    """Write a file that is named by the hash of its text, unless there is one. Raises OSError."""
+    """Write a file that is named by the hash of its text, unless it exists. Raises OSError."""
     data = text.encode()
     path = directory / f"{name}-{hashlib.sha256(data).hexdigest()[:12]}.yaml"
     if not path.is_file():
@@ -118,7 +118,7 @@ class Child:
     ) -> "Child":
         """Start a process. `on_exit` is called with the exit code.
 
-        `on_line` is called with each line of stdout; returns False for a line that is not to be logged.
+        `on_line` is called with each line of stdout, and returns False for a line that should not be logged.
 
         Raises OSError.
         """

@@ -1,4 +1,4 @@
-"""Reads the CPU time of a process. `hang` decides what it means."""
+"""Reads the CPU time of a process. `hang` interprets it."""
 
 import subprocess
 from pathlib import Path
@@ -14,7 +14,7 @@ _READY: Final = frozenset("RD")
 
 def read(pid: int) -> CpuTime | None:
     """Return the CPU time of a process's main thread (Linux) or of the process (other systems). None if unknown."""
-    # A gateway's asyncio loop runs on its main thread. Zenoh's threads run on while that one is blocked.
+    # A gateway's asyncio loop runs on its main thread. Zenoh's threads keep running even if that thread is blocked.
     if not _PROC.joinpath("self", "stat").exists():
         return _of_ps(pid)
     try:

@@ -1,4 +1,4 @@
-"""Tells a hung process from a slow one, and from a stalled hub or machine. Pure.
+"""Distinguishes a hung process from a slow one, and from a stalled hub or machine. Pure.
 
 The supervisor kills a process that sends no heartbeat for its `Patience`, unless there is another explanation:
 - The supervisor itself stalled (`WatchClock`) and could not receive heartbeats.
@@ -20,7 +20,7 @@ MANY_SILENT_S: Final = 30.0
 SLOW_SILENT_S: Final = 30.0
 """Maximum silence of a slow process."""
 MOVING_SILENT_S: Final = 300.0
-"""Maximum silence of a slow gateway whose car may move: long, because only this gateway can stop the car."""
+"""Maximum silence of a slow gateway whose car may move. It is long, because only this gateway can stop the car."""
 CPU_WINDOW_S: Final = 3.0
 """How far back the samples of a process's CPU time go."""
 SAMPLE_INTERVAL_S: Final = CPU_WINDOW_S / 6
@@ -95,9 +95,9 @@ class Pulse:
 
 
 def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
-    """Return how long a process may be silent, apart from its own patience. The longer of the two times counts.
+    """Return how long a process may be silent for a reason other than a hang.
 
-    The result is 0 if nothing but a hang explains the silence: then only the process's own patience counts.
+    If its own patience is longer, that counts. The result is 0 if only a hang explains the silence.
     """
     longest = MANY_SILENT_S if many else 0.0
     if sign is Sign.SLOW:

@@ -22,14 +22,15 @@ from schemas.words import ProcessKind, RunState
 SUPERVISOR_POLL_INTERVAL_S: Final = 0.1
 """Interval at which the supervisor polls its processes."""
 STARTS_AT_ONCE: Final = 1 + (os.cpu_count() or 1)
-"""Maximum number of gateways that start at the same time. Each needs a whole CPU for 0.3 s, and waits in between."""
+"""Maximum number of gateways that start at the same time. Each needs a whole CPU for 0.3 s in total, with waits."""
 MISSED_HEARTBEAT_S: Final = 2.0
 """Silence after which a process counts as silent: it has missed one heartbeat."""
 CPU_CHECK_SILENCE_S: Final = 1.0
 """Silence after which a process's CPU time is sampled."""
 
 
-# The link to the hub is its heartbeat: its main thread shows nothing of Zenoh's routing threads.
+# A hub sends no heartbeats, because its main thread does not show whether Zenoh's routing threads hang. Our link to the
+# hub is its heartbeat.
 _HEARTBEAT_KINDS: Final = tuple(kind for kind in ProcessKind if kind is not ProcessKind.HUB)
 
 
@@ -44,7 +45,7 @@ class ManagedProcess:
     log: Log
     child: Child | None = None
     leaving: bool = False
-    """True if the process is removed when it has ended."""
+    """True if the process will be removed when it has ended."""
     code: int | None = None
     """The last exit code."""
     urgent: bool = False
@@ -60,8 +61,8 @@ class ManagedProcess:
 class ProcessSet:
     """All processes of one supervisor, by name.
 
-    on_event: called with a name and words. on_line: called with each line of a stdout. on_exit: called when a process
-    has ended, with True if the supervisor ended it.
+    on_event: called with a process's name and a text. on_line: called with each line of its stdout. on_exit: called
+    when it has ended, with True if the supervisor ended it.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class ProcessSet:
         return [process for process in self if process.kind in kinds]
 
     def add(self, name: str, kind: ProcessKind, command: tuple[str, ...], *, restart: bool = False) -> None:
-        """Add a process. If there is one of that name, restart it if its command differs or `restart` is True."""
+        """Add a process. If one of this name exists, restart it if its command differs or `restart` is True."""
         process = self._processes.get(name)
         if process is None:
             log = Log(self.directory / f"{name}.log")
@@ -119,7 +120,7 @@ class ProcessSet:
             process.child.signal(signal.SIGTERM)
 
     def on_heartbeat(self, name: str, pid: int | None = None) -> bool:
-        """Note a heartbeat, unless it is of an earlier process of that name. Return True if it is the first one."""
+        """Note a heartbeat, unless an earlier process of that name sent it. Return True if it is the first one."""
         process = self._processes.get(name)
         if process is None or process.child is None or pid not in (None, process.child.pid):
             return False
@@ -134,14 +135,15 @@ class ProcessSet:
     ) -> None:
         """Start the due processes and kill the hung ones.
 
-        `since` returns since when a process's heartbeats could be received without a break, or None if they cannot be.
-        `may_move` returns True if a gateway's car may be moving.
+        `since` returns the time since which a process's heartbeats could be received without a break, or None if they
+        cannot be received now. `may_move` returns True if a gateway's car may be moving.
         """
         now = self.now
         silent = {process.name: process.status.silent_s(now, since(process)) for process in self}
         judged = [process for process in self.of(*_HEARTBEAT_KINDS) if process.status.state is RunState.RUNNING]
         many = have_common_cause(sum(silent[process.name] > MISSED_HEARTBEAT_S for process in judged), len(judged))
-        # The process that has waited longest comes first. So a few that crash repeatedly do not delay the others.
+        # The process that has waited longest comes first. So a few processes that crash again and again do not delay
+        # the others.
         for process in sorted(self, key=lambda each: each.status.due):
             if silent[process.name] > CPU_CHECK_SILENCE_S and process.child is not None and process.pulse.is_due(now):
                 process.pulse.add(now, cpu_time.read(process.child.pid))
@@ -168,7 +170,7 @@ class ProcessSet:
         return self._admission.admit_start(now, starting, restart=restart)
 
     async def wait_or_kill(self, processes: Iterable[ManagedProcess], seconds: float) -> None:
-        """Wait until these have ended. After `seconds`, kill those that have not."""
+        """Wait until these processes have ended. After `seconds`, kill the rest."""
         alive = {process.child.task: process for process in processes if process.child and process.status.alive}
         if alive:
             await asyncio.wait(alive, timeout=seconds)

@@ -11,10 +11,10 @@ _FIXED_PROPERTIES: Final[Mapping[str, str]] = {
     "endpoint": "the endpoint",
     "world": "the world",
     "recordings": "where recordings go",
-    "quota": "how much it keeps",
-    "pins": "what it pins",
-    "record": "whether it records",
-    "console": "whether it serves the page",
+    "quota": "the quota of recordings",
+    "pins": "the pins of recordings",
+    "record": "whether the fleet is recorded",
+    "console": "whether the page is served",
     "console_port": "the port of the page",
 }
 """Properties that cannot change while the fleet is running, with their names in messages."""
@@ -32,7 +32,7 @@ class SpecChange:
     words: tuple[str, ...]
     """One line for each change."""
     needs_restart: tuple[str, ...] = ()
-    """What cannot change while the fleet runs, in words."""
+    """Properties and cars that cannot change while the fleet runs, in words."""
 
 
 def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
@@ -79,7 +79,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
 
 
 def _is_same_simulated(before: CarProcessSpec | None, now: CarProcessSpec) -> bool:
-    """Return True if only options of the gateway differ, so that the simulator can go on."""
+    """Return True if only options of the gateway differ, so that the simulator can keep running."""
     return before is not None and replace(before, arguments=now.arguments) == now
 
 

@@ -1,6 +1,6 @@
-"""Decides when a process is started, killed as hung, and restarted. Pure: time is an argument.
+"""Decides when a process is started, killed because it hangs, and restarted. Pure: time is an argument.
 
-A car that is switched off is not a failure: its gateway runs, sends heartbeats, and retries the link by itself.
+A car that is switched off is not a failure. Its gateway runs, sends heartbeats, and retries the link by itself.
 """
 
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ MAX_RESTART_DELAY_S: Final = 10.0
 RESTART_JITTER: Final = 0.2
 """Share by which a delay varies, so that processes that crashed together do not restart together."""
 STABLE_RUN_S: Final = 10.0
-"""Minimum run after which the backoff starts again from the first delay."""
+"""Minimum duration of a run after which the backoff starts again from the first delay."""
 WRONG_USE: Final = 2
 """Exit code of a process that rejects its arguments. A restart seldom helps."""
 WRONG_USE_RETRY_S: Final = 60.0
 """Interval of retries after WRONG_USE. The supervisor never gives up: the user may fix a file or a device."""
-# A gateway leaves the bus after its car has shown the stop. That takes up to two seconds.
+# A gateway leaves the bus only after its car has shown the stop. Leaving takes up to two seconds.
 GATEWAY_GRACE_S: Final = SHUTDOWN_S + 3.0
 """Timeout for a gateway's exit after SIGTERM. Then the supervisor kills it."""
 HUNG: Final = "hung"
@@ -95,8 +95,8 @@ class ProcessState:
     def turn(self, now: float, listening_since: float | None, leave_s: float = 0.0) -> RestartAction:
         """Return the next action.
 
-        `listening_since` is the start of uninterrupted reception of heartbeats, None if there is no reception now.
-        `leave_s` is the allowed silence (from `hang`). It counts if it is longer than the patience.
+        `listening_since` is the time since which heartbeats could be received without a break, or None if they cannot
+        be received now. `leave_s` is the allowed silence (from `hang`). It counts if it is longer than the patience.
         """
         if self.state in (RunState.WAITING, RunState.REFUSED) and now >= self.due:
             return RestartAction.START
@@ -148,7 +148,7 @@ class ProcessState:
         self.due = now + delay_s(self._failures, chance)
 
     def end(self, now: float, grace_s: float, *, again: bool = False) -> bool:
-        """Note that the process shall exit, and restart if `again`. Return True if there is a process to signal."""
+        """Note that the process must exit, and restart if `again`. Return True if there is a process to signal."""
         self._again = again
         if self.state is RunState.ENDING:
             return False

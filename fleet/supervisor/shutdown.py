@@ -21,13 +21,13 @@ from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, delay_s
 from schemas.words import Basis, LinkState, Motors, RunState
 
 LAST_CLAIM_TIMEOUT_S: Final = 1.0
-"""Timeout for the last state of a gateway that has ended in order: it may arrive after its end."""
+"""Timeout for the last state of a gateway that has ended normally. This state may arrive after the gateway's end."""
 NEVER_REACHED: Final = "never reached"
 """First words of the result for a car to which no gateway had a link."""
 GATEWAY_START_TIMEOUT_S: Final = 20.0
 """Timeout for the first heartbeat of a gateway that has not yet reached its car."""
 NOT_TRIED: Final = "not connected yet"
-"""The reason that a gateway gives for a lost link before its first attempt."""
+"""The reason that a gateway gives for a lost link before its first attempt to open it."""
 CAR_LINK_TIMEOUT_S: Final = 8.0
 """Timeout after the first heartbeat for the link to the car."""
 
@@ -61,7 +61,7 @@ class GatewayShutdown:
         self._tries: dict[str, int] = {}
         """Number of new gateways that were started to stop a car."""
         self._unclaimed: dict[str, float] = {}
-        """Gateways that ended in order before their last state arrived, and until when to wait for it."""
+        """Gateways that ended normally before their last state arrived, with the time until which to wait for it."""
         self.results: dict[str, str] = {}
         """Result by car, without the cars that a reload removed."""
 
@@ -108,7 +108,7 @@ class GatewayShutdown:
         self.results.pop(name, None)
 
     def may_start(self, name: str) -> bool:
-        """Return True if this gateway shall start, although it is being shut down."""
+        """Return True if this gateway may start, although it is being shut down."""
         return name in self._tries
 
     def _forget(self, name: str) -> None:
@@ -136,7 +136,7 @@ class GatewayShutdown:
             self._finish(process, words)
 
     def _finish_claimed(self, process: ManagedProcess) -> None:
-        """Finish a gateway that ended in order: its last claim says whether the car has shown its stop."""
+        """Finish a gateway that ended normally. Its last claim says whether the car has shown its stop."""
         row = self._rows.get(process.name)
         if row is not None and row.motors.what == Motors.OFF:
             self._finish(process, rest_words(row.motors, process.name))
@@ -173,7 +173,7 @@ class GatewayShutdown:
                     self._finish(process, self._unstopped(process, process.status.words))
 
     def _is_retried(self, process: ManagedProcess) -> bool:
-        """Return True if another gateway may stop the car. A car that was never reached does not move."""
+        """Return True if another gateway should try to stop the car. A car that was never reached does not move."""
         row = self._rows.get(process.name)
         reached = row is not None and row.reached and self._exists(process.name)
         return reached and not self._hurried and not process.leaving and process.code != WRONG_USE
@@ -211,12 +211,12 @@ class GatewayShutdown:
 
 
 def describe_end(results: Mapping[str, str]) -> str:
-    """Describe in one line what became of the cars. `results` has words by car, as `GatewayShutdown.results`."""
+    """Describe in one line the results for all cars. `results` are those of `GatewayShutdown.results`."""
     groups = {words: sorted(car for car, said in results.items() if said.startswith(words)) for words in _RESULTS}
     bad = [f"{words}: {', '.join(groups[words])}" for words in (NOT_STOPPED, NOT_CONFIRMED) if groups[words]]
     if bad:
         return f"{'; '.join(bad)}. They may be moving: go to them."
-    known = sum(len(cars) for cars in groups.values())  # the gateways of the others had not started
+    known = sum(len(cars) for cars in groups.values())  # the gateways of the other cars had not started
     if not known:
         return "no car had been started"
     if len(groups[STOPPED]) == known:

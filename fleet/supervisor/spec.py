@@ -1,6 +1,6 @@
 """The specification of a fleet and the command lines of its processes, from a fleet file and the options of `fleet up`.
 
-Links and simulators belong to the gateway package: they run as processes, nothing of them is imported here.
+Gateways and the simulator belong to the gateway package. They run as processes, and are not imported here.
 """
 
 import json
@@ -65,7 +65,7 @@ class CoordinatorCar:
 
     platform: str
     without: tuple[str, ...] = ()
-    """The modes and parts of its platform that it does not use."""
+    """The modes and parts of its platform that the car does not use."""
     roles: tuple[str, ...] | None = None
     """None means any role."""
 
@@ -83,9 +83,9 @@ class FleetSpec:
     record: bool = True
     recordings: Path = RECORDINGS
     quota: Quota = field(default_factory=Quota)
-    """How much the recorder keeps."""
+    """The maximum size of recordings."""
     pins: tuple[PinRule, ...] = ()
-    """What is pinned in recordings. The recorder reads it from the file."""
+    """The rules for pins in recordings. The recorder itself reads them from the file."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """The cars of each group."""
     colors: Mapping[str, str] = field(default_factory=dict)
@@ -96,7 +96,7 @@ class FleetSpec:
     listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
     """The coordinator's entries, by car."""
     people: Mapping[str, FleetPerson] | None = None
-    """The people who may drive, and change the plan, or None if everyone may."""
+    """The people who may drive and change the plan, or None if everyone may."""
     console: bool = False
     console_port: int = 0
     """Port of the web page. 0: the default of `fleet console`."""
@@ -174,7 +174,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
 
 
 def _names(known: Sequence[str], count: int) -> list[str]:
-    """Return `count` names: those of the file, then default ones."""
+    """Return `count` names: first those of the file, then default names."""
     more = (
         name
         for name in (
@@ -212,7 +212,7 @@ def _car(spec: FleetCar) -> CarProcessSpec:
 
 
 def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:
-    """Return the options of a gateway that name the people who may drive its car, and those who drive others."""
+    """Return the options of a gateway that name the people who may drive its car, and people who drive only others."""
     named = [
         f"{name}:lead" if person.rank is PersonRank.LEAD else name if person.may_drive(car) else f"{name}:other"
         for name, person in people.items()
@@ -260,7 +260,8 @@ def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: s
     """Return the command of a car's gateway."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", *parent_option())
     options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
-    # The link of a simulated car is of this run only. The next run in this folder has the same car, another folder not.
+    # The link of a simulated car changes with each run. So holds belong to the folder: the next run in this folder has
+    # the same car.
     folder = (Path.cwd() if spec.file is None else spec.file.parent).resolve()
     same = ("--holds-of", f"{SIMULATED} in {folder}") if car.link == SIMULATED else ()
     return module("gateway.cli", "run", *options, *same, *where)

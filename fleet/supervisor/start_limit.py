@@ -1,7 +1,7 @@
 """Rate limits for starts and kills, so that restarts do not overload the machine further. Pure.
 
-A gateway takes 0.3 s of CPU time to start. A hundred gateways on two cores cannot all send a heartbeat in time. Each
-restart would delay the others further.
+A gateway needs 0.3 s of CPU time to start. If a hundred gateways start on two cores, they cannot all send a heartbeat
+in time. Each restart would delay the others further.
 """
 
 from collections.abc import Iterable

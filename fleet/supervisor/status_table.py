@@ -1,4 +1,4 @@
-"""The live table of `fleet up` on a terminal, a row for each car and events above. The only import of rich."""
+"""The live table of `fleet up` on a terminal: a row for each car, events above. Only this module imports rich."""
 
 import asyncio
 import time

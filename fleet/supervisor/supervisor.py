@@ -49,23 +49,24 @@ from schemas.yaml_document.document import BadFile
 STATUS_INTERVAL_S: Final = 1.0
 HUB_START_TIMEOUT_S: Final = 10.0
 SUPERVISOR_HUB_RESTART_DELAY_S: Final = 0.3
-"""Time without a link after which the supervisor restarts the hub: sooner than gateways start one (0.5 s)."""
+"""Time without a link after which the supervisor restarts the hub. Other programs would start one after 0.5 s."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
-"""Timeout for the recorder's first heartbeat. Gateways start after it, so that the recorder misses nothing."""
+"""Timeout for the recorder's first heartbeat. Gateways start only then, so that the recorder misses nothing."""
 RECORDER_LOST_S: Final = 2.0
-"""Time without a status of a recorder, which sends one each second, after which nothing is recorded."""
+"""Time without a status of a recorder after which the fleet counts as not recorded. A recorder sends one each
+second."""
 STOP_QUERY_TIMEOUT_S: Final = 0.5
 SERVICE_EXIT_TIMEOUT_S: Final = 5.0
 CAR_STOP_RETRY_S: Final = 30.0
 """Timeout for retries to stop a car, if nobody is there to cancel them with Ctrl-C."""
 RECORDER_EXIT_TIMEOUT_S: Final = 30.0
-"""Timeout for the recorder's exit: it still writes its buffers."""
+"""Timeout for the recorder's exit, because it must still write its buffers."""
 
 
 READY: Final = "ready"
 """The event that ends a start: all cars and services are ready."""
 MISSING: Final = "missing"
-"""The event that ends a start of which somebody is missing."""
+"""The event that ends a start with missing cars or services."""
 _LOGGED_ELSEWHERE: Final = ("log", "decision", "simulator")
 """Events that are in the logs of other processes."""
 
@@ -118,9 +119,9 @@ class Supervisor:
         self._shown: object = None
         self._session = ""
         self._recorder_heard_at = inf
-        """When the last status of a recorder of this fleet came."""
+        """The time at which the last status of a recorder of this fleet came."""
         self._unrecorded = ""
-        """Why not everything is recorded, though it should be."""
+        """Why not everything is recorded, although it should be."""
         self._console = ""
         """Address of the web page."""
         self.starting = True
@@ -209,7 +210,7 @@ class Supervisor:
         return result
 
     def _follow_start(self, now: float) -> None:
-        """Report the end of the start once: all are ready, or nobody has become ready for a while."""
+        """Report the end of the start once: all cars and services are ready, or none has become ready for a while."""
         if not self.starting:
             return
         missing = self.missing()
@@ -251,14 +252,14 @@ class Supervisor:
             self._service is not None and not linked and now - self._unlinked_since >= SUPERVISOR_HUB_RESTART_DELAY_S
         )
         due = hub.status.state is RunState.WAITING and now >= hub.status.due
-        refused = hub.status.state is RunState.REFUSED  # no hub of ours on a network: the router there is back
+        refused = hub.status.state is RunState.REFUSED  # we may not start a hub on this network, and its router is back
         if (refused and linked) or (due and await asyncio.to_thread(accepts, self.endpoint)):
             hub.status.served_elsewhere(now, f"another program's hub listens at {self.endpoint}")
         elif hub.status.state is RunState.ELSEWHERE and is_lost and not await asyncio.to_thread(accepts, self.endpoint):
             hub.status.schedule(now)
 
     def _check_recorder(self, now: float) -> None:
-        """Say that nothing is recorded if the recorder does not come up, and no other one of this fleet is heard."""
+        """Report that nothing is recorded if the recorder does not start and no other one of this fleet is heard."""
         recorder = self.processes.get(RECORDER)
         if recorder is None or self._shutdown_requested.is_set() or now < self._recorder_heard_at + RECORDER_LOST_S:
             return
@@ -291,7 +292,7 @@ class Supervisor:
             self.processes.add(COORDINATOR, ProcessKind.COORDINATOR, command)
 
     def _add_car(self, car: CarProcessSpec) -> None:
-        """Start or restart a car's gateway. A simulated car must have a link first."""
+        """Start or restart a car's gateway. Do nothing for a simulated car that has no link yet."""
         self.rows.setdefault(car.name, CarStatus(car.name))
         link = self._sim_links.get(car.name) if car.link == spec.SIMULATED else car.link
         if link is not None:
@@ -301,7 +302,7 @@ class Supervisor:
             )
 
     def _coordinator(self, fleet_spec: FleetSpec) -> tuple[str, ...]:
-        """Return the coordinator's command, an empty one without a plan. Raises OSError."""
+        """Return the coordinator's command. Empty if there is no plan. Raises OSError."""
         if fleet_spec.plan is None:
             return ()
         return self._coordinator_of(fleet_spec, fleet_spec.plan_text)
@@ -333,7 +334,7 @@ class Supervisor:
                 self._say("process", COORDINATOR, words)
 
     async def _set_plan(self, service: SupervisorService, old: FleetSpec, command: tuple[str, ...]) -> str:
-        """Bring the coordinator to the spec after a reload. Return words about changes of the plan."""
+        """Make the coordinator follow the spec after a reload. Return words about changes of the plan."""
         coordinator = self.processes.get(COORDINATOR)
         if not command or coordinator is None:
             if command:
@@ -456,16 +457,16 @@ class Supervisor:
                 self._say("log", car, row.event)
 
     def _set_unrecorded(self, why: str, over: str = "") -> None:
-        """Say once that nothing is recorded any more, and that everything is again. The cars drive on.
+        """Report once that nothing is recorded any more, and once that everything is recorded again. Cars keep driving.
 
-        `over` tells why recording is over, and is empty if recording goes on.
+        `over` is the reason if recording has ended for good, and empty if it continues.
         """
         if bool(why) is not bool(self._unrecorded):
             self._say("process", RECORDER, f"NOT RECORDED: {why}" if why else over or "records again")
         self._unrecorded = why
 
     def _on_line(self, process: ManagedProcess, line: str) -> bool:
-        """Handle a line of a process's stdout. Return False if it is a heartbeat, which no log needs."""
+        """Handle a line of a process's stdout. Return False for a heartbeat, which is not logged."""
         try:
             values = json.loads(line)
         except ValueError:
@@ -604,7 +605,7 @@ class Supervisor:
             raise ReloadRefused("nothing was changed: the fleet is ending")
         old, found = self._spec, compare(self._spec, new)
         try:
-            command = self._coordinator(found.spec)  # it may fail, so before any change
+            command = self._coordinator(found.spec)  # this may fail, so do it before any change
         except OSError as error:
             why = f"the coordinator's copies cannot be written in {self.processes.directory}: {error.strerror}"
             raise ReloadRefused(f"nothing was changed: {why}") from None

@@ -30,7 +30,7 @@ from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason
 
 SECOND_CHECK_DELAY_S: Final = 0.3
-"""Time after which two supervisors that start at the same moment have both declared."""
+"""Time after which two supervisors that start at the same moment have both declared themselves on the bus."""
 SERVICE_QUERY_TIMEOUT_S: Final = 2.0
 SUBSCRIPTIONS: Final = (
     "*/state/*",
@@ -40,7 +40,7 @@ SUBSCRIPTIONS: Final = (
     f"{keys.COORDINATOR}/plan",
 )
 MAX_QUEUED_SAMPLES: Final = 8192
-"""Maximum number of queued messages: some seconds of a hundred cars."""
+"""Maximum number of queued messages. This is some seconds of a hundred cars."""
 MAX_SUPERVISOR_QUERIES: Final = 64
 SUPERVISOR_COMMANDS: Final = {"down": "fleet.v1.DownCommand", "reload": "fleet.v1.ReloadCommand"}
 """The supervisor's commands, with the message type of the payload."""
@@ -55,7 +55,7 @@ class ReloadRefused(Exception):
 
 
 class RestartNeeded(Exception):
-    """A part of a reload needs a restart of the fleet; the rest is done. The text names both."""
+    """A part of a reload needs a restart of the fleet. The rest is done. The text names both."""
 
 
 _log: Final = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class SupervisorService:
             try:
                 value = sample.message()
             except (messages.BadPayload, KeyError):
-                return  # a publisher that is not a program of this fleet
+                return  # the publisher is not a program of this fleet
             if key is not None:
                 on_message(key.car, key.topic, value)
 
@@ -147,7 +147,7 @@ class SupervisorService:
 
     def stop_all(self) -> None:
         """Stop every car with one query. Call it on a thread."""
-        # As a coordinator: the stop of a person or a script would put the cars on hold, also after the next start.
+        # Stop as a coordinator. A stop by a person or a script would put the cars on hold, even for the next start.
         command = pb.StopCommand(sender="supervisor", kind=Rank.COORDINATOR, id=uuid.uuid4().hex)
         key = keys.command_key(self.fleet, "*", Verb.STOP, self.bus.identity)
         encoding = messages.encoding_of(COMMANDS[Verb.STOP].message)
@@ -192,7 +192,10 @@ class SupervisorService:
 
 
 def _proven(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
-    """Return the sender of a command. Raises ReloadRefused if a certificate names another one, or one who may not."""
+    """Return the sender of a command.
+
+    Raises ReloadRefused if the certificate names another sender, or if it may not.
+    """
     try:
         sender = sender_for(identity, sender, verb)
     except NotTheSender as error:

@@ -16,7 +16,7 @@ from schemas.process.parent import parent_option
 from schemas.words import Motors
 
 TEMPORARY_PREFIX: Final = "temporary-"
-"""How the names of cars begin that exist for a moment only."""
+"""Prefix of the names of cars that exist only for a moment."""
 _READY_S: Final = 15.0
 """Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
 _READY_POLL_S: Final = 0.1
@@ -29,7 +29,8 @@ def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[s
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
         command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, *parent_option()]
         command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
-        # In its own session, so that Ctrl-C at the terminal reaches only us. We let the gateway stop its car.
+        # The gateway runs in its own session, so that Ctrl-C at the terminal reaches only us. Then we let it stop its
+        # car.
         gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:
             yield name if _is_ready(client, name, gateway, log.name, on_error) else None
@@ -40,7 +41,7 @@ def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[s
 def _is_ready(
     client: Fleet, name: str, gateway: "subprocess.Popen[bytes]", log: str, on_error: Callable[[str], object]
 ) -> bool:
-    """Wait until the gateway serves and its car stands. Return True if it serves, also for a silent car."""
+    """Wait until the gateway answers and its car stands still. Return True if it answers, even if the car is silent."""
     deadline, served = time.monotonic() + _READY_S, False
     while time.monotonic() < deadline:
         if gateway.poll() is not None:

@@ -136,7 +136,7 @@ def test_each_rejected_frame_counts_once() -> None:
     """The frames that came include the rejected ones. Other counts of a link are no frames."""
     (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
     assert found.cause.startswith("10 of 40 frames ")
-    assert " truncated: " in found.cause
+    assert " truncated. " in found.cause
     few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1, "text": 90}
     assert diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few))) == []
     over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})

@@ -159,7 +159,7 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
     [
         ("red --csv", 2, "--csv … fleet/red/sensor/* … sensor/range, sensor/battery"),
         ("red/sensor/rang --csv", 2, "red/sensor/rang. … mean red/sensor/range?"),
-        ("red/sensor/range --csv --json", 2, "--csv and --json: "),
+        ("red/sensor/range --csv --json", 2, "--csv and --json "),
         ("red/sensor/range --last 0", 2, "--last: 0 … 1"),
         ("red/sensor/range --last ten", 2, '--last: "ten" … whole number'),
         ("red/sensor/range --since noon", 2, "--since: 'noon' … time. … 30s or 5m (ago), 14:05 (local), "),

@@ -88,7 +88,7 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert error("get", "battery").endswith(" mean '*/sensor/battery'?")
     assert error("get", "red/sensor/rang") == "No key red/sensor/rang. Did you mean red/sensor/range?"
     assert error("watch", "*/sensor/rang") == "No key */sensor/rang. Did you mean */sensor/range?"
-    assert "no group" in error("get", "@a")
+    assert "not a group" in error("get", "@a")
     assert error("list", "@A").endswith(' mean "@a"?')
     for command in ("list", "stop", "pause"):
         assert re.fullmatch(r'No fleet "flet" .*: fleet\.', error(command, "--fleet", "flet"))
@@ -127,7 +127,7 @@ def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
     done = CliRunner().invoke(ask, input="Red Car\n")
     assert done.exit_code == 1
     assert 'fleet: "Red Car" ' in done.output
-    assert "Such as red-car.\n" in done.output
+    assert "such as red-car.\n" in done.output
     assert "stdin" in done.output
 
 
