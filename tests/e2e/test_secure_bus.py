@@ -350,7 +350,7 @@ def test_revoke_of_car_stops_it_first(stage: SecureStage, monkeypatch: pytest.Mo
     assert done.returncode == 0, done.stderr
     assert not driving(stage.sim, "red")
     assert "NOT STOPPED" not in done.stderr
-    assert "red is stopped first" in done.stderr
+    assert "red was stopped first" in done.stderr
 
 
 def test_invitation_of_car_elsewhere_stops_it_first(stage: SecureStage) -> None:
