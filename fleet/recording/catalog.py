@@ -1,11 +1,12 @@
-"""Answers SQL questions to all recorded sessions: DuckDB over the tables of each, with one view for each topic.
+"""Answers SQL questions about all recorded sessions, with DuckDB over their tables. Each topic is one view.
 
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
 as commanded and as seen, the motion, who drove, and the phase of the plan. Topics without a message have views, too.
-Who drove is a person. `sender` and other columns of the tables are as recorded; `person_of(sender)` is the person.
+`owner` and `driver` in it are persons. `sender` and other columns are as recorded. `person_of(sender)` is the person.
 
-A view is defined when a question names it: DuckDB then opens files, and a thousand sessions have twenty each.
+A view is defined only when a question names it, because DuckDB then opens its files: a thousand sessions have twenty
+files each.
 """
 
 import re
@@ -33,14 +34,14 @@ if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
 MEMORY_LIMIT: Final = "1GB"
-"""Maximum memory of a question. DuckDB writes to a temporary directory beyond it."""
+"""Maximum memory of a question. Beyond it, DuckDB writes to a temporary directory."""
 CONTEXT: Final[tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = (
     ("state/mode", (("mode", "{c}.asked"), ("mode_seen", "{c}.inferred"), ("verdict", "{c}.verdict"))),
     ("state/motion", (("motion", "{c}.motion"), ("owner", "person_of({c}.owner)"))),
     ("state/safety", (("motors", "{c}.motors"), ("driver", "person_of(json_extract_string({c}.lease, '$.holder'))"))),
     ("@coordinator/assignment", (("plan_phase", "{c}.phase"), ("plan_version", "{c}.plan_version"))),
 )
-"""What `..._context` adds: topic, and for each column its expression. `{c}` is the row of the topic."""
+"""Columns that `..._context` adds: for each topic, the names and expressions. `{c}` is the row of the topic."""
 
 
 _PERSON_OF: Final = (
@@ -48,7 +49,8 @@ _PERSON_OF: Final = (
 )
 """`schemas.keys.name_of` for questions: the person of a sender, without the host and the process."""
 MAX_QUERY_ATTEMPTS: Final = 4
-"""Each attempt looks for the sessions again: the quota deletes some, and those that grow have other tables by then."""
+"""Maximum number of attempts for one question. Each looks for the sessions again, because the quota may have deleted
+some, and sessions that grow get new tables."""
 _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
 
 
@@ -57,11 +59,11 @@ class BadQuery(ValueError):
 
 
 class QueryFailed(RuntimeError):
-    """A question that could not be answered here: of memory, disk or files. The text is that of DuckDB, on one line."""
+    """A question that failed because of memory, disk or files. The text is that of DuckDB, on one line."""
 
 
 class Catalog:
-    """All sessions of a directory. `damage` has what could not be read.
+    """All sessions of a directory. `damage` lists the parts that could not be read.
 
     Raises FormatMissing without DuckDB, and QueryFailed without a directory for temporary files.
     """
@@ -80,9 +82,9 @@ class Catalog:
         self._duckdb = duckdb
         self.directory = Path(directory) if directory is not None else sessions_place()
         self.damage: dict[str, str] = {}
-        """By name of a session, what of it could not be read."""
+        """By name of a session: the parts that could not be read, in words."""
         self.unanswered: dict[str, str] = {}
-        """By name of a session, why its tables could be written nowhere. Each question fails while there is one."""
+        """By name of a session: why its tables could not be written anywhere. If there is one, every question fails."""
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
         self._views: set[str] = set()
@@ -93,14 +95,14 @@ class Catalog:
             raise QueryFailed(
                 f"no temporary file can be written: {error.strerror or error}. Make room, or set TMPDIR."
             ) from None
-        # DuckDB would write to `.tmp` here, and here may be read-only.
+        # Otherwise DuckDB would write to `.tmp` in the current directory, which may be read-only.
         weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._config: dict[str, Any] = {"memory_limit": MEMORY_LIMIT, "temp_directory": scratch}
         self._database: Any = None
         self._find()
 
     def _find(self) -> None:
-        """Look for the sessions, and begin without views."""
+        """Find the sessions, and forget all views."""
         self.damage.clear()
         self.unanswered.clear()
         self.sessions.clear()
@@ -173,21 +175,21 @@ class Catalog:
             self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
-        if self.unanswered:  # what is missing there would be missing in the answer
+        if self.unanswered:  # the answer would lack the messages of this session
             name, why = next(iter(self.unanswered.items()))
             which = f"{name} and {more} more" if (more := len(self.unanswered) - 1) else name
             raise QueryFailed(
-                printable_lines(f"the tables of {which} can be written nowhere: {why}. Make room, or set TMPDIR.")
+                printable_lines(f"the tables of {which} cannot be written anywhere: {why}. Make room, or set TMPDIR.")
             )
         self._define(sql)
         answer: Any = self._database.sql(sql, params=list(parameters) or None)
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
     def left_out(self) -> dict[str, LeftOut]:
-        """Return by session the messages that are in no table asked so far: they could not be decoded."""
+        """Return by session the messages of the topics asked so far that are in no table: they cannot be decoded."""
         found: dict[str, LeftOut] = {}
         for cached in self.sessions:
-            with suppress(OSError):  # deleted since it was asked
+            with suppress(OSError):  # deleted since the question
                 for (key, cause), count in cached.left_out().counts.items():
                     topic = topics.of_key(key)
                     if topic is not None and topic.name in self._views:
@@ -195,13 +197,13 @@ class Catalog:
         return found
 
     def nulled(self) -> dict[str, list[str]]:
-        """Return by session the columns asked so far with values that are null because they had another type.
+        """Return by session, in words, how many values are null because they had another type.
 
-        Each in words, with the number of values.
+        Only columns of topics that were asked for so far are listed, each on its own line.
         """
         found: dict[str, list[str]] = {}
         for cast in self._casts:
-            with suppress(self._duckdb.Error):  # deleted since it was asked
+            with suppress(self._duckdb.Error):  # deleted since the question
                 for session, count in self._database.execute(cast.count()).fetchall():
                     words = f"{count} of {cast.topic} {cast.column}: not {cast.kind}"
                     found.setdefault(session, []).append(printable_lines(words))
@@ -216,8 +218,8 @@ class Catalog:
         empty = f"empty_{name}"
         self._database.register(empty, _empty(topic))
         ours = self._columns(f'"{empty}"')
-        # By columns: those of this version, then the others. A column that has another type in a file is null where it
-        # has no value of ours. One that only other versions have is text.
+        # Files are grouped by their columns: first those of this version, then the others. If a column has another type
+        # in a file, its value is converted, or null if that fails. A column that only other versions have becomes text.
         groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for cached in self.sessions:
             for file in cached.files(topic.message):
@@ -269,7 +271,8 @@ class Catalog:
 
 
 _FOLDERS: Final = r"([^/\\]+)[/\\][^/\\]+[/\\][^/\\]+$"
-# The session is the directory above that of its tables. That of a single file is hidden, beside it.
+# The session is the directory above the directory of its tables. For a single file, this is a hidden directory beside
+# it.
 _SESSION: Final = f"regexp_replace(regexp_extract(filename, '{_FOLDERS}', 1), '^\\.(.*)$', '\\1')"
 
 
@@ -284,7 +287,7 @@ class _Cast:
     files: tuple[str, ...]
 
     def count(self) -> str:
-        """Return the question how many values of each session are null in our type only."""
+        """Return the SQL question how many values of each session become null only by the conversion to our type."""
         files, column = ", ".join(map(_text, self.files)), _quoted(self.column)
         return (
             f"SELECT {_SESSION}, count(*) FROM read_parquet([{files}], filename=true) "  # noqa: S608 - quoted
@@ -294,7 +297,10 @@ class _Cast:
 
 
 def _is_of(topic: str) -> str:
-    """Return the condition that a row is of a topic: several may share a message."""
+    """Return the condition that a row is of this topic.
+
+    It is needed because several topics may share a message type.
+    """
     return f"key LIKE {_text('%/' + topic)}"
 
 
@@ -328,6 +334,6 @@ def _is_gone(error: Exception) -> bool:
 
 
 def _one_line(text: str) -> str:
-    """Return the message of DuckDB without the picture of the place."""
+    """Return the message of DuckDB on one line, without the lines that show the position."""
     lines: Iterable[str] = (line.strip() for line in text.splitlines())
     return printable_lines(" ".join(line for line in lines if line and not line.startswith(("^", "LINE"))))

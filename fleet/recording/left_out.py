@@ -1,6 +1,6 @@
 """Counts the messages that a view, a table or a replay leaves out, by key and cause. Pure.
 
-Whoever shows recorded messages adds the others here, so that recorded = shown + left out.
+A module that shows recorded messages counts the others here, so that recorded = shown + left out.
 """
 
 from collections import Counter
@@ -12,7 +12,7 @@ from typing import Any, Final
 from schemas.printable import printable
 
 MAX_LEFT_OUT_LINES: Final = 20
-"""Maximum keys to print."""
+"""Maximum number of lines to print."""
 
 
 class LeftOutCause(StrEnum):
@@ -39,7 +39,7 @@ class LeftOut:
     counts: Counter[tuple[str, LeftOutCause]] = field(default_factory=Counter)
 
     def add(self, key: str, cause: LeftOutCause, count: int = 1) -> None:
-        """Count messages; 0 adds nothing."""
+        """Count messages. 0 adds nothing."""
         if count:
             self.counts[key, cause] += count
 
@@ -65,7 +65,7 @@ class LeftOut:
 
 
 def has_unknown_enum(message: Any) -> bool:
-    """Return True if an enum of a message, or of one in it, has a number without a name. Rerun aborts on it."""
+    """Return True if an enum of a message, or of a message in it, has a number without a name. Rerun would abort."""
     for descriptor, value in message.ListFields():
         values = value if descriptor.is_repeated else (value,)
         if descriptor.message_type is not None:

@@ -24,7 +24,7 @@ class Selection:
         return self.keys is None or any(matches(expression, key) for expression in self.keys)
 
     def overlaps(self, first_ns: int, last_ns: int) -> bool:
-        """Return True if a time between these two, both included, is selected."""
+        """Return True if any time between these two (both included) is selected."""
         return (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
 
     def has_time(self, at_ns: int) -> bool:
@@ -40,7 +40,7 @@ _GROUPS: Final = frozenset(topic.partition("/")[0] for topic in TOPICS)
 
 
 def key_expressions(name: str, fleet: str) -> tuple[str, ...]:
-    """Return the key expressions of a topic (`sensor/*`), a message, or a key, which may lack the fleet's name."""
+    """Return the key expressions of a topic (`sensor/*`), a message, or a key with or without the fleet's name."""
     if name.partition("/")[0] in _GROUPS:
         return (_any_fleet(name),)
     messages = (name, f"fleet.v1.{name}")
@@ -61,7 +61,8 @@ def _any_fleet(topic: str) -> str:
 def matches(expression: str, key: str) -> bool:
     """Return True if a key equals or matches a key expression of the bus.
 
-    `*` matches one chunk, `**` any number of chunks, `$*` any part of a chunk. None matches a chunk that begins with @.
+    `*` matches one chunk, `**` any number of chunks, `$*` any part of a chunk. None of them matches a chunk that begins
+    with @.
     """
     return expression == key or ("*" in expression and _pattern(expression).fullmatch(f"{key}/") is not None)
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_TRACKED_SOURCES: Final = 16
-"""Maximum senders to remember per key: each `fleet drive` is a new one."""
+"""Maximum number of senders to remember per key. Each `fleet drive` is a new sender."""
 MAX_OPEN_GAPS: Final = 256
-"""Maximum gaps of one sender that a backfill may close. Older ones are only counted."""
+"""Maximum number of gaps of one sender that a backfill may close. Older gaps are only counted."""
 MAX_LISTED_GAPS: Final = 1000
-"""Maximum gaps of one publisher to list. Later ones are only counted."""
+"""Maximum number of gaps of one publisher to list. Later gaps are only counted."""
 MAX_EARLY_BACKFILLS: Final = 512
-"""Maximum backfilled messages to remember whose originals may still arrive: about twice a publisher's cache."""
+"""Maximum number of backfilled messages to remember whose originals may still arrive: about twice a publisher's
+cache."""
 _MODULO: Final = 1 << 32
 _BACKWARD: Final = 1 << 31
 
@@ -87,14 +88,14 @@ class SequenceTracker:
         if self._early.get((sender, number)) == published_ns:
             del self._early[sender, number]
             return False
-        if self._close(sender, number):  # a newer backfilled message came first
+        if self._close(sender, number):  # it fills a gap: a newer backfilled message came before it
             return True
-        self._forget(sender)  # the sender restarted its count: no gap of four billion messages
+        self._forget(sender)  # the sender restarted its count, so this is not a gap of four billion messages
         self._begin(sender, number)
         return True
 
     def add_dropped(self, sender: Hashable, number: int, count: int) -> None:
-        """Add a gap of messages that came and were not kept: `count` of them, the last one with this number."""
+        """Add a gap of `count` messages that came but were dropped. `number` is that of the last one."""
         if sender not in self.last:
             self._begin(sender, (number - count) % _MODULO)
             self._first[sender] = (number - count + 1) % _MODULO
@@ -122,7 +123,7 @@ class SequenceTracker:
 
     def _expect(self, sender: Hashable, number: int, published_ns: int) -> None:
         """Remember a backfilled message whose original may still arrive."""
-        # Only the newest can arrive late: publications of one publisher keep their order.
+        # Only the newest ones can still arrive, because publications of one publisher keep their order.
         self._early[sender, number] = published_ns
         if len(self._early) > MAX_EARLY_BACKFILLS:
             del self._early[next(iter(self._early))]
@@ -141,7 +142,7 @@ class SequenceTracker:
             return
         gaps = self._gaps.setdefault(sender, [])
         first, last = (below + 1) % _MODULO, (below + distance - 1) % _MODULO
-        if first > last:  # across the wrap
+        if first > last:  # the gap spans the wrap
             gaps.append(Gap(first, _MODULO - 1))
             first = 0
         gaps.append(Gap(first, last))
@@ -165,7 +166,8 @@ class PublisherSequence:
     """Tracks the recorded messages of one publisher on one key."""
 
     restarts: bool = False
-    """True if the count may restart. Then a number that neither grows nor fills a gap is a new start, else a duplicate.
+    """True if the count may restart. A number that neither grows nor fills a gap is then a restart, and otherwise a
+    duplicate.
 
     The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher.
     """
@@ -174,7 +176,7 @@ class PublisherSequence:
     count: int = 0
     duplicates: int = 0
     unlisted: int = 0
-    """Missing messages beyond MAX_LISTED_GAPS."""
+    """Number of missing messages in gaps beyond MAX_LISTED_GAPS."""
     gaps: list[Gap] = field(default_factory=list)
     _last_ns: int = 0
 

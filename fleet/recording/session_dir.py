@@ -5,7 +5,7 @@
 - the segments `0001.mcap`, `0002.mcap`, ...;
 - copies of the fleet file and the plan, if any;
 - `index.json`, a cache with the counts of each segment;
-- during recording `session.json.spare`, reserved space for the description if the disk gets full.
+- during recording `session.json.spare`, reserved space for the description in case the disk gets full.
 
 `sessions/removed.json` lists the sessions that a quota has removed.
 """
@@ -34,7 +34,7 @@ INDEX_FILE: Final = "index.json"
 SPARE_FILE: Final = "session.json.spare"
 REMOVED_FILE: Final = "removed.json"
 TABLES_PREFIX: Final = ".tables-"
-"""Beginning of the names of directories with tables for questions (table_cache.py)."""
+"""Prefix of directories with tables for SQL questions (table_cache.py)."""
 SPARE_BYTES: Final = 256 * 1024
 """Reserved space: enough for the drops by key of 100 cars. Copy-on-write file systems (btrfs) may not honor it."""
 FLEET_FILE: Final = "fleet.yaml"
@@ -72,7 +72,7 @@ class SessionInfo:
     error: str = ""
     """Last error, even if the recording continued."""
     recovered: Mapping[str, int] = field(default_factory=dict)
-    """Backfilled messages by key. They lie in the file later than their sequence numbers."""
+    """Backfilled messages by key. They come later in the file than their sequence numbers suggest."""
     continues: str = ""
     """Name of the interrupted session that this one continues. Its unwritten messages are backfilled here."""
     format: int = FORMAT_VERSION
@@ -83,15 +83,15 @@ class SessionInfo:
     stops: int | None = None
     """Number of recorded commands that stop cars. None if nobody has counted them."""
     pins: Sequence[Mapping[str, Any]] = ()
-    """Times that the quota takes last, without those of marks: as `Pin.to_dict` writes them."""
+    """Times that the quota removes last, without those of marks, as `Pin.to_dict` writes them."""
     gone: Sequence[Mapping[str, Any]] = ()
-    """Segments that the quota has taken: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
+    """Segments that the quota has removed: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Source session, tool (`recover`, `cut`) and losses. Empty if the session was recorded."""
 
     @classmethod
     def read(cls, directory: Path) -> Self | None:
-        """Read the description in a directory, or None if missing or invalid. Ignore unknown fields."""
+        """Return the description in a directory, or None if it is missing or invalid. Ignore unknown fields."""
         path = directory / SESSION_FILE
         try:
             values: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
@@ -116,25 +116,25 @@ class SessionInfo:
             with spare.open("r+b", buffering=0) as file:
                 file.truncate(write_all(file, (json.dumps(values) + "\n").encode()))
             spare.replace(directory / SESSION_FILE)
-            with contextlib.suppress(OSError):  # from the space that the old description has freed
+            with contextlib.suppress(OSError):  # use the space that the old description has freed
                 reserve(directory)
 
 
 def gone_of(info: SessionInfo) -> list[Mapping[str, Any]]:
-    """Return the segments that the quota has taken from a session. Invalid entries are left out."""
+    """Return the segments that the quota has removed from a session. Leave out invalid entries."""
     wanted = {"file": str, "from": str, "to": str}
     return [each for each in info.gone if all(isinstance(each.get(name), kind) for name, kind in wanted.items())]
 
 
 def gone_messages(info: SessionInfo) -> int | None:
-    """Return how many messages the quota has taken, or None if nobody has counted them."""
+    """Return how many messages the quota has removed, or None if they were not counted."""
     counts = [each.get("messages") for each in info.gone]
     known = [count for count in counts if isinstance(count, int)]
     return sum(known) if len(known) == len(counts) else None
 
 
 def add_gone(directory: Path, gone: Sequence[Mapping[str, Any]]) -> None:
-    """List segments that the quota takes in `session.json`. Raises OSError, even if the file cannot be read."""
+    """List in `session.json` the segments that the quota removes. Raises OSError, also if the file cannot be read."""
     path = directory / SESSION_FILE
     values = read_json(path)
     if not _is_valid(values):
@@ -167,22 +167,22 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 class NoMark(Exception):
-    """A session cannot take a mark. The message gives the reason."""
+    """A session cannot be marked. The message gives the reason."""
 
 
 def add_mark(directory: Path, at_ns: int, text: str, by: str) -> None:
     """Add a mark to `session.json` of a closed session, and exempt it from the quota. Raises NoMark, OSError.
 
-    at_ns: the moment that is marked, ns since the epoch. A mark that is there already is not added again. The recorded
-    messages stay as they are, so the mark has the key `added`: the time of its making. Only `@recorder/mark` in a file
-    has marks that were set during recording.
+    at_ns: the marked moment, ns since the epoch. A mark that is already there is not added again. The mark has the key
+    `added`, the time at which it was made, because it is not among the recorded messages: `@recorder/mark` has only
+    marks that were set during recording.
     """
     if not directory.is_dir():
-        raise NoMark(f"it is one file without {SESSION_FILE}, where marks of closed sessions are")
+        raise NoMark(f"it is one file without {SESSION_FILE}, where marks of closed sessions are stored")
     path = directory / SESSION_FILE
     if not path.exists():
         raise NoMark(
-            f"it has no {SESSION_FILE}, where marks of closed sessions are: `fleet sessions recover` makes one"
+            f"it has no {SESSION_FILE}, where marks of closed sessions are stored: `fleet sessions recover` makes one"
         )
     info = SessionInfo.read(directory)
     if info is None or info.format > FORMAT_VERSION:
@@ -193,7 +193,7 @@ def add_mark(directory: Path, at_ns: int, text: str, by: str) -> None:
     mark = {"time": iso(at_ns), "text": text, "by": by}
     if any({name: each.get(name) for name in mark} == mark for each in info.marks):
         return
-    # Fields of a newer version stay.
+    # Keep fields of a newer version.
     values = json.loads(path.read_text(encoding="utf-8"))
     values["marks"] = [*info.marks, {**mark, "added": format_utc(datetime.now(UTC))}]
     replace(path, {**values, "kept": True}, indent=2)
@@ -216,7 +216,7 @@ def release(directory: Path) -> None:
 
 
 def write_all(file: FileIO, data: bytes) -> int:
-    """Write all data, and return its size. Unbuffered: a buffer would fail again when the file is closed."""
+    """Write all data without a buffer, and return its size. A buffer would fail again when the file is closed."""
     rest = memoryview(data)
     while rest:
         rest = rest[file.write(rest) :]
@@ -239,7 +239,7 @@ _FIELD_TYPES: Final[Mapping[str, type]] = {
 
 
 def _is_valid(values: Mapping[str, Any]) -> bool:
-    """Return True if all values have their types: a wrong edit by hand must not fail the reading of a session."""
+    """Return True if all values have the right types. A wrong edit by hand must not make a session unreadable."""
     return (
         all(isinstance(values[name], kind) for name, kind in _FIELD_TYPES.items() if name in values)
         and all(isinstance(count, int) for name in _COUNTS for count in values.get(name, {}).values())

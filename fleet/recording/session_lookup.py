@@ -1,7 +1,7 @@
 """Finds the session that a name means: a path, a name in the directory of sessions, `latest`, or `latest~1`.
 
-One rule for the command line and Python. `latest` is the session whose recording began last. A session that a tool made
-from another one (cut, recover) does not count.
+The rule is the same for the command line and Python. `latest` is the session whose recording began last. Sessions that
+a tool made from others (cut, recover) do not count.
 """
 
 import os
@@ -21,11 +21,11 @@ _STAMP: Final = re.compile(r"\d{8}T\d{6}Z", re.ASCII)
 
 
 class NoLatest(LookupError):
-    """There are not so many sessions. The text says how many, and where."""
+    """There are fewer sessions than the name asks for. The text says how many there are, and where."""
 
 
 def sessions_place() -> Path:
-    """Return the directory of sessions: `sessions` here, or else where the fleet file here records to."""
+    """Return the directory of sessions: `sessions` here, or the one that the fleet file here names."""
     if not DEFAULT_SESSIONS.is_dir() and _FLEET_YAML.is_file():
         from fleet.fleetfile.fleet_file import read_fleet
 
@@ -60,7 +60,7 @@ def find_session(session: str | os.PathLike[str], place: Path | None = None) -> 
     `place` is the directory of sessions.
     """
     path = Path(session)
-    # `os.path.exists` is false for a path that is too long or may not be read. The reader then says why.
+    # `os.path.exists` is False for a path that is too long or may not be read. Opening it then gives the reason.
     if os.path.exists(path):  # noqa: PTH110
         return path
     place = place or sessions_place()

@@ -11,7 +11,7 @@ from schemas.words import Phase
 
 EVENTS: Final = TOPICS["event/command"]
 MAX_RECENT_IDS: Final = 1000
-"""Maximum number of remembered ids. The events of one command are seconds apart, and a flood has a budget."""
+"""Maximum number of remembered ids. It is enough, because the events of one command are at most seconds apart."""
 
 
 class StopCount:
@@ -22,8 +22,8 @@ class StopCount:
         self._recent: dict[str, None] = {}
 
     def add(self, event: Any) -> None:
-        """Take in a message of `EVENTS`. Messages of other types are ignored."""
-        # The schema is that of the recording: another writer's may lack a field.
+        """Count a message of `EVENTS`. Messages of other types are ignored."""
+        # The message has the schema of the recording, which may lack a field.
         verb, command, phase = (str(getattr(event, name, "")) for name in ("verb", "id", "phase"))
         if event.DESCRIPTOR.full_name != EVENTS.message or verb not in STOPPING_VERBS:
             return

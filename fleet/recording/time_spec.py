@@ -14,7 +14,7 @@ _WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "sat
 _NS: Final = 1_000_000_000
 _DAY_NS: Final = 86_400 * _NS
 _MAX_DAYS: Final = 3
-"""Maximum days that a message proposes."""
+"""Maximum number of days that a message proposes."""
 
 _NUMBER: Final = re.compile(r"-?\d+([.,]\d+)?")
 
@@ -27,9 +27,9 @@ def at_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> int:
 def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, int]:
     """Return begin and end of a time as a person types it for a session from `start_ns` to `end_ns`, ns.
 
-    A time of day and a date without a zone are local. A time of day without a day is that of the session. Raises
-    ValueError with the syntax and the range of the session, or with the days if the time of day is on several.
-    `now_s` is the wall clock.
+    A time of day and a date without a zone are local. A time of day without a day is a time within the session. Raises
+    ValueError with the syntax and the range of the session, or with the days if the session has this time of day on
+    several. `now_s` is the wall clock.
     """
     try:
         return _span_ns(text, start_ns, end_ns, now_s)
@@ -38,7 +38,7 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
 
 
 class _Unreadable(ValueError):
-    """A text that is not a time. Its words say what may have been meant, and not what may be written."""
+    """A text that is not a time. The message says what may have been meant. The caller adds the syntax."""
 
 
 def _span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, int]:
@@ -66,7 +66,7 @@ def _date_ns(text: str) -> tuple[int, int]:
     try:
         when = datetime.fromisoformat(text)
         whole = int(when.replace(microsecond=0).timestamp())
-    except (ValueError, OverflowError, OSError):  # the year 1 is before the first time of this computer
+    except (ValueError, OverflowError, OSError):  # such as the year 1, which this computer cannot represent
         typed = re.fullmatch(r"(\d+):(\d+)", text)  # such as 90:00
         near = f" Minutes and seconds are written as {typed[1]}m{typed[2]}s." if typed else ""
         raise _Unreadable(f"{text!r} is not a time.{near}") from None
@@ -83,8 +83,8 @@ def ago_s(text: str, now_s: float) -> float:
 def past_ns(text: str, now_s: float) -> int:
     """Return a time in the past as a person types it: a duration ago (`5m` or `-5m`), a local time, or a date.
 
-    The result is in ns since the epoch. A time of day without a day is the last one that has passed. Raises ValueError
-    with the syntax, also for a time that is not over. `now_s` is the wall clock.
+    The result is in ns since the epoch. A time of day without a day is its last occurrence. Raises ValueError with the
+    syntax, also for a time in the future. `now_s` is the wall clock.
     """
     if _NUMBER.fullmatch(text):  # 18.21 may be meant for 18:21
         raise ValueError(f"{text} has no unit: write {text}s for that many seconds ago, or a time such as 14:05.")
@@ -99,7 +99,7 @@ def past_ns(text: str, now_s: float) -> int:
     except _Unreadable as error:
         raise ValueError(f"{error} Write {PAST_RULE}.") from None
     if begin_ns >= now_ns:
-        raise ValueError(f"{text} is not over: it is {date_and_clock(now_s)}.")
+        raise ValueError(f"{text} is in the future: it is {date_and_clock(now_s)} now.")
     return begin_ns
 
 
@@ -144,7 +144,7 @@ def iso(ns: int) -> str:
     try:
         when = datetime.fromtimestamp(ns // 1_000_000_000, UTC)
     except (OverflowError, ValueError, OSError):
-        return f"{ns} ns"  # not a date: the clock of another writer was wrong
+        return f"{ns} ns"  # not a date, because the clock of another writer was wrong
     return f"{when:%Y-%m-%dT%H:%M:%S}.{ns // 1_000_000 % 1000:03d}Z"
 
 

@@ -1,6 +1,6 @@
 """Decodes one chunk of an MCAP file: decompresses it, checks its CRC and splits it into records.
 
-Not the mcap library: it allocates what a damaged length says, and takes eight times as long for each message.
+The mcap library is not used for this: it allocates as much as a damaged length says, and takes eight times as long.
 """
 
 import struct
@@ -21,8 +21,8 @@ from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 MAX_CHUNK_BYTES: Final = 2**30
 MAX_RATIO: Final = 64
-"""Limits of a decompressed chunk over MAX_RECORD_BYTES: a few bytes must not fill the memory. Readings compress by 3
-to 20."""
+"""Limits of a decompressed chunk that is larger than MAX_RECORD_BYTES, so that a few bytes cannot fill the memory.
+Readings compress by a factor of 3 to 20."""
 # Errors that the mcap library and the decompressors raise for corrupted bytes.
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
@@ -53,11 +53,11 @@ class ChunkPart:
     """Time span of its messages as text. Empty without an index."""
 
     def check(self) -> None:
-        """Check its CRC; raises one of BROKEN."""
+        """Check its CRC. Raises one of BROKEN."""
         get_chunk_data_stream(self._plain(), validate_crc=True)
 
     def records(self) -> list[Record]:
-        """Return its messages, channels and schemas in order; raises one of BROKEN."""
+        """Return its messages, channels and schemas in order. Raises one of BROKEN."""
         chunk = self._plain()
         stream, end = get_chunk_data_stream(chunk, validate_crc=True)
         data = chunk.data if not chunk.compression else stream.read(end)
@@ -78,7 +78,7 @@ class ChunkPart:
                     raise EndOfFile
                 if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                     body = data[begin:at]
-                    # Parse it here too: a chunk with one corrupted record yields no message.
+                    # Parse it here, too, so that a chunk with one corrupted record yields no message at all.
                     (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
                     found.append((-opcode, 0, 0, 0, body))
         return found
@@ -122,7 +122,7 @@ class ChunkPart:
                 f"says that it has {size} bytes when decompressed from {len(chunk.data)}, more than the limit of "
                 f"{most}: it was not read, and may be intact"
             )
-        # Ask for one byte more: detects a larger chunk without decompressing all of it.
+        # Ask for one byte more than the chunk says. This detects a larger chunk without decompressing all of it.
         data: bytes
         match chunk.compression:
             case "":
@@ -144,7 +144,7 @@ class ChunkPart:
 
 
 def _lz4(data: bytes, most: int) -> bytes:
-    """Return the plain bytes of all frames, at most so many."""
+    """Return the plain bytes of all frames, at most `most` bytes."""
     plain = b""
     while data and len(plain) < most:
         frame = lz4.frame.LZ4FrameDecompressor()
@@ -154,7 +154,7 @@ def _lz4(data: bytes, most: int) -> bytes:
 
 
 def read(file: IO[bytes], at: int, length: int) -> bytes:
-    """Return the bytes from an offset on; fewer at the end of the file."""
+    """Return the bytes from an offset on. There are fewer at the end of the file."""
     file.seek(at)
     return file.read(length)
 

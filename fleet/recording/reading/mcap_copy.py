@@ -12,13 +12,14 @@ from mcap.writer import LIBRARY_IDENTIFIER, Writer
 from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 
 SESSION_METADATA: Final = "session"
-"""Name of the metadata record that says of which session a file is a part."""
+"""Name of the metadata record that names the session of which a file is a part."""
 CHUNK_NS: Final = 1_000_000_000
-"""Maximum time span of a chunk. The recorder uses the same: reading a short part decompresses little else."""
+"""Maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than
+it."""
 
 
 class McapCopy:
-    """One file to write; every method may raise OSError. After an exception the file stays truncated."""
+    """One file to write. Every method may raise OSError. After an exception the file stays truncated."""
 
     def __init__(self, path: Path, about: Mapping[str, str] | None = None) -> None:
         self._file = path.open("xb")
@@ -42,7 +43,7 @@ class McapCopy:
             self._writer.finish()
             self._file.close()
         else:
-            with suppress(OSError):  # the failed disk, which raised `error`
+            with suppress(OSError):  # the disk has failed, as `error` says
                 self._file.close()
 
     def add(self, row: Row) -> None:

@@ -1,7 +1,7 @@
 """Reads the index at the end of an MCAP file: its chunks, channels and schemas. Reads no message.
 
-Not the mcap library: it parses the channel table of each chunk. For 1,000 channels and an hour of chunks these are
-millions of entries. Here a table stays bytes until `may_contain` searches it.
+The mcap library is not used for this, because it parses the channel table of each chunk. With 1,000 channels, an hour
+of chunks has millions of entries. Here, a table stays unparsed until `may_contain` searches it.
 """
 
 import struct
@@ -38,7 +38,7 @@ class ChunkPlace:
     table: bytes
 
     def may_contain(self, channels: frozenset[int]) -> bool:
-        """Return True if it may contain messages of these channels. Without a table it may contain any."""
+        """Return True if it may contain messages of these channels. A chunk without a table may contain any."""
         return not self.table or any(channel in channels for channel, _ in _CHANNEL_ENTRY.iter_unpack(self.table))
 
 
@@ -76,7 +76,7 @@ class Index:
 
     @property
     def counts_all_messages(self) -> bool:
-        """True if the counts by channel are complete, so that nothing need be read to know them."""
+        """True if the counts by channel are complete, so that no message must be read to count them."""
         statistics = self.statistics
         if statistics is None or not (self.has_all_chunks and self.has_all_channels):
             return False
@@ -102,7 +102,7 @@ class Index:
 
 
 def read(file: IO[bytes], start: int, end: int) -> Index:
-    """Parse the index between two offsets; raises errors of the mcap library and struct if it is corrupted."""
+    """Parse the index between two offsets. Raises errors of the mcap library and struct if it is corrupted."""
     index = Index()
     for at, opcode, body in _records(file, start, end):
         match opcode:

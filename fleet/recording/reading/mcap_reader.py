@@ -1,8 +1,9 @@
 """Reads the intact messages of an MCAP file, and reports where and why others are lost. Repairs nothing.
 
 The mcap library parses every record except messages. Chunks (mcap_chunk.py) and the scan of files without an index
-(mcap_scan.py) are our own: the library gives up at the first damage, and needs 1.0 instead of 0.12 us a message.
-If the file has an index (mcap_index.py), the reader opens only the selected chunks, and a damaged one hides no other.
+(mcap_scan.py) are our own: the library gives up at the first damage, and needs 1.0 us for a message instead of 0.12.
+If the file has an index (mcap_index.py), the reader opens only the selected chunks, and a damaged chunk does not hide
+others.
 """
 
 import os
@@ -33,7 +34,7 @@ _HEADER_LIMIT: Final = 2**16
 
 
 class NotMcap(Exception):
-    """The file is missing or no MCAP file. The message gives the reason."""
+    """The file is missing, or it is not an MCAP file. The message gives the reason."""
 
 
 class ChannelInfo(NamedTuple):
@@ -44,7 +45,8 @@ class ChannelInfo(NamedTuple):
 
 
 Row = tuple[ChannelInfo, int, int, int, bytes]
-"""One message: channel, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
+"""One message: channel, sequence, log time and publish time in ns, payload. A plain tuple, because there are
+millions."""
 
 
 Extra = Attachment | Metadata
@@ -52,7 +54,10 @@ Extra = Attachment | Metadata
 
 
 class McapReader:
-    """Reader of one MCAP file, or raises NotMcap. `damage` lists what `check` or `messages` have found so far."""
+    """Reader of one MCAP file. Raises NotMcap.
+
+    `damage` lists the damage that `check` or `messages` have found so far.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -97,7 +102,7 @@ class McapReader:
         return self.cut and len(self.damage) == 1
 
     def check(self) -> None:
-        """Check every CRC. Parses no message."""
+        """Check every CRC without parsing messages."""
         self._begin()
         try:
             with self.path.open("rb") as file:
@@ -147,7 +152,7 @@ class McapReader:
             self._unreadable(error)
 
     def extras(self) -> list[Extra]:
-        """Return the intact attachments and metadata records. `damage` then lists only what is lost of them."""
+        """Return the intact attachments and metadata records. `damage` then lists only damage of such records."""
         self._begin()
         try:
             with self.path.open("rb") as file:
@@ -204,7 +209,7 @@ class McapReader:
         at = size - _FOOTER_SIZE - len(MAGIC)
         tail = read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))
         if at < len(MAGIC) or not tail.endswith(MAGIC):
-            return None, None  # the scan tells a cut file from one with bytes after its end
+            return None, None  # the scan will distinguish a cut file from a file with bytes after its end
         if HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - HEAD.size):
             self.damage.append(Damage(at, "there is no footer"))
             return None, None
@@ -283,7 +288,7 @@ class _Channels:
         self._selection = selection
         self._found: dict[int, ChannelInfo | None] = {}
         self.count = 0
-        """Messages of known channels in the chunks so far, selected or not. Read it between chunks."""
+        """Number of messages of known channels in the chunks so far, selected or not. Valid only between chunks."""
 
     def rows(self, records: list[Record], at: int, strays: list[int]) -> Iterator[Row]:
         """Yield the selected messages of one chunk. For each message of an unknown channel add `at` to `strays`."""
@@ -324,7 +329,7 @@ class _Channels:
 
 
 def _parse_extra(part: ChunkPart) -> Extra:
-    """Parse an attachment or a metadata record; raises one of BROKEN."""
+    """Parse an attachment or a metadata record. Raises one of BROKEN."""
     stream = ReadDataStream(BytesIO(part.body))
     if part.opcode == Opcode.METADATA:
         metadata: Metadata = Metadata.read(stream)

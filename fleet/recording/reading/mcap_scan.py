@@ -1,7 +1,7 @@
 """Scans an MCAP file without a valid index record by record, past damage. Reads no message.
 
-A damaged length would lead anywhere. So the scan trusts a record only if a record follows it and no intact chunk lies
-inside it. Otherwise the scan reports the damage and resumes at the next intact chunk.
+A damaged length could lead anywhere. So the scan trusts a record only if another record follows it and no intact chunk
+lies inside it. Otherwise the scan reports the damage and continues at the next intact chunk.
 """
 
 import os
@@ -30,7 +30,7 @@ _MESSAGE_INDEX_HEAD: Final = struct.Struct("<HI")  # channel, length of the entr
 _CANDIDATE: Final = re.compile(rb"(?=\x06[\s\S]{3}[\x00-\x05]\x00{4})")
 _BLOCK: Final = 2**20
 _MAX_REREADS: Final = 4
-"""Maximum bytes to read for false candidates, as a multiple of the file size."""
+"""Maximum number of bytes to read for false candidates, as a multiple of the file size."""
 
 
 class RecordScanner:
@@ -44,7 +44,7 @@ class RecordScanner:
         """Result of the last search: its start, and the next intact chunk from there."""
         self.damage: list[Damage] = []
         self.cut = True
-        """True if the end of the file is missing: no footer was found so far, or the file ends in it."""
+        """True if the end of the file is missing: no footer was found so far, or the file ends within the footer."""
 
     def parts(self, *, extras: bool = False) -> Iterator[ChunkPart]:
         """Yield the records that contain messages or describe channels, in order.
@@ -105,7 +105,7 @@ class RecordScanner:
             for match in _CANDIDATE.finditer(block):
                 if self._is_chunk_head(start + match.start(), HEAD.unpack_from(block, match.start())[1]):
                     yield start + match.start()
-                # A file full of false heads would cost its size for each of them.
+                # In a file full of false heads, each one could cost a read of the whole file.
                 if self._reread > _MAX_REREADS * self._size:
                     return
             start += _BLOCK
@@ -127,20 +127,22 @@ class RecordScanner:
             return False
         if opcode == Opcode.CHUNK:
             return length > MAX_RECORD_BYTES or self._begins(end) or self._is_intact(at)
-        if opcode == Opcode.MESSAGE_INDEX:  # its own length agrees: trust it also before a damaged record
+        if (
+            opcode == Opcode.MESSAGE_INDEX
+        ):  # the length of its entries agrees, so trust it even if a damaged record follows
             body = read(self._file, at + HEAD.size, _MESSAGE_INDEX_HEAD.size)
             return (
                 len(body) == _MESSAGE_INDEX_HEAD.size
                 and length == _MESSAGE_INDEX_HEAD.size + _MESSAGE_INDEX_HEAD.unpack(body)[1]
             )
-        # No writer puts messages both into chunks and between them: this opcode is damaged.
+        # No writer puts messages both into chunks and between them, so this opcode is damaged.
         if (opcode == Opcode.MESSAGE and chunks) or not self._begins(end):
             return False
         inside = self.chunk_from(at + 1)
         return inside is None or inside >= end
 
     def _begins(self, at: int) -> bool:
-        """Return True if a record may begin there, or the file ends."""
+        """Return True if a record may begin there, or if the file ends there."""
         head = read(self._file, at, HEAD.size)
         if len(head) < HEAD.size:
             return not head or 0 < head[0] <= Opcode.DATA_END

@@ -51,13 +51,13 @@ def _build_class(name: str, data: bytes) -> type[Message] | None:
         for file in FileDescriptorSet.FromString(data).file:
             pool.Add(file)
         return GetMessageClass(pool.FindMessageTypeByName(name))
-    # For an invalid schema protobuf raises one of these, depending on the place.
+    # For an invalid schema, protobuf raises one of these, depending on where the fault is.
     except (DecodeError, KeyError, TypeError, ValueError):
         return None
 
 
 def compare_schema(message_class: type[Message]) -> str:
-    """Return the difference of a recorded schema from ours of the same name in words, or SAME_SCHEMA."""
+    """Return in words how a recorded schema differs from ours of the same name, or SAME_SCHEMA."""
     name = message_class.DESCRIPTOR.full_name
     try:
         today = _field_shapes(messages.message_class(name).DESCRIPTOR)
@@ -78,7 +78,7 @@ def compare_schema(message_class: type[Message]) -> str:
 
 def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = frozenset()) -> dict[str, tuple[int, ...]]:
     """Return number, type and label of every field by its path. Skip messages nested in themselves."""
-    # Any: the stubs know two types of descriptors, those of upb and of pure Python.
+    # Any, because the stubs have two types of descriptors: for upb and for pure Python.
     found: dict[str, tuple[int, ...]] = {}
     for field in descriptor.fields:
         path = prefix + field.name

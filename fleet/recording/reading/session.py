@@ -54,7 +54,7 @@ class NoSession(Exception):
 
 
 def _near(path: Path) -> str:
-    """Return a question with the likely session and a blank. Empty if no name is near."""
+    """Return the question whether a likely session was meant, with a blank at its end. Empty if no name is near."""
     place = sessions_place()
     there = sorted(each.name for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
     near = did_you_mean(path.name, [LATEST, *there])
@@ -76,15 +76,15 @@ class Recorded:
     recorded_ns: int
     """Time of the recorder's clock, ns since the epoch."""
     sequence: int
-    """Sequence number of the publisher for the key, modulo 2^32; 0 if it sent none."""
+    """Sequence number of the publisher for the key, modulo 2^32. 0 if the publisher sent none."""
 
 
 class Session:
     """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
-    `path` is a session's directory, an .mcap file, the name of a session in `./sessions` (or where the fleet
-    file here records to), or `latest` (`latest~1` is the
-    one before). Raises NoSession. Reading never changes a session, and finds what is damaged: see `damage_words`.
+    `path` is a session's directory, an .mcap file, the name of a session in `./sessions` (or in the directory that the
+    fleet file here names), or `latest` (`latest~1` is the one before). Raises NoSession. Reading never changes a
+    session. `damage_words` describes the damage that was found.
     """
 
     def __init__(self, path: str | PathLike[str] = LATEST) -> None:
@@ -107,11 +107,11 @@ class Session:
         self.damage: dict[Path, str] = {}
         """Damage that opening, checking or reading has found so far."""
         self.unended: set[Path] = set()
-        """Segments that are only truncated, as a file still being written is."""
+        """Segments that are only truncated, like a file that is still being written."""
         self.lost_extras = ""
-        """Damage of attachments and metadata that the latest `extras` has found, in words."""
+        """Damage of attachments and metadata that the last call of `extras` has found, in words."""
         self.left_out = LeftOut()
-        """Messages by key and cause that the latest `messages(decode=True)` could not decode so far."""
+        """Messages by key and cause that the last call of `messages(decode=True)` could not decode so far."""
         for segment in there:
             try:
                 McapReader(segment)
@@ -124,7 +124,7 @@ class Session:
         self.description = session_dir.SessionInfo.read(path) if whole else None
         if whole:
             numbered = {session_dir.segment(path, number + 1) for number in range(int(there[-1].stem))}
-            # Only index.json shows that the last segment is missing.
+            # Only index.json can show that the last segment is missing.
             closed = {path / one["file"] for one in session_dir.indexed_segments(path)}
             if missing := sorted((numbered | closed) - set(there) - self._taken()):
                 self.damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
@@ -133,14 +133,14 @@ class Session:
                 raise NoSession(
                     f"{path} has format {given}, this version reads up to {session_dir.FORMAT_VERSION}: "
                     "update zenoh-car-fleet; "
-                    f"its files can be read one by one, such as {there[0].name} in there"
+                    f"its files can be read one by one, such as {there[0].name} in it"
                 )
 
     def __repr__(self) -> str:
         return f"Session({str(self.path)!r})"
 
     def _taken(self) -> set[Path]:
-        """Return the segments that the quota has taken."""
+        """Return the segments that the quota has removed."""
         return (
             set()
             if self.description is None
@@ -148,7 +148,7 @@ class Session:
         )
 
     def part(self, segments: tuple[Path, ...]) -> "Session":
-        """Return these segments as a session of their own."""
+        """Return a session that has only these segments."""
         part = copy(self)
         part.segments, part.damage, part.unended, part.left_out = segments, {}, set(), LeftOut()
         return part
@@ -160,12 +160,12 @@ class Session:
 
     @property
     def undescribed(self) -> str:
-        """Return what is wrong with session.json of a directory, in words, or an empty text if it can be read."""
+        """Return in words what is wrong with session.json of a directory. Empty if it can be read."""
         unread = self.description is None and self.path.is_dir()
         return "is missing or unreadable: it names recorder and marks" if unread else ""
 
     def lacking(self, messages: int) -> str:
-        """Return which messages session.json counts beyond these, in words, or an empty text if none or unknown."""
+        """Return in words how many messages session.json counts beyond `messages`. Empty if none, or if not known."""
         info = self.description
         gone = session_dir.gone_messages(info) if info is not None else 0
         total = info.messages - gone if info is not None and info.closed and gone is not None else 0
@@ -177,12 +177,12 @@ class Session:
         return "; ".join(f"{path} {words}" for path, words in sorted(self.damage.items()))
 
     def check(self) -> None:
-        """Check every CRC, also those that reading skips, and add failures to `damage`."""
+        """Check every CRC, also the CRCs that reading skips, and add failures to `damage`."""
         for segment in self.segments:
             try:
                 reader = McapReader(segment)
                 reader.check()
-            except NotMcap as error:  # replaced since it was opened
+            except NotMcap as error:  # the file was replaced since it was opened
                 self.damage[segment] = str(error)
             else:
                 self._add_damage(reader)
@@ -192,7 +192,7 @@ class Session:
 
         Raises OSError, and NoSession if no message is intact.
 
-        For truncated or damaged files: other readers stop at the damage, or show corrupted messages.
+        Use it for truncated or damaged files: other readers stop at the damage, or show corrupted messages.
         """
         if out.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(out))
@@ -210,16 +210,16 @@ class Session:
         return self.part((out,))
 
     def extras(self) -> list[Extra]:
-        """Return the intact attachments and metadata records, each once. `lost_extras` then says what is lost of them.
+        """Return the intact attachments and metadata records, each once. `lost_extras` then describes the damaged ones.
 
-        Without the record that each of our own files has to say of which session it is a part.
+        The record in each of our own files that names its session is left out.
         """
         found: list[Extra] = []
         self.lost_extras = ""
         for segment in self.segments:
             try:
                 reader = McapReader(segment)
-            except NotMcap:  # removed since it was opened: reading its messages says so
+            except NotMcap:  # the file was removed since it was opened: reading its messages reports that
                 continue
             for extra in reader.extras():
                 own = isinstance(extra, Metadata) and extra.name == SESSION_METADATA and "format" in extra.metadata
@@ -258,14 +258,14 @@ class Session:
         *,
         decode: bool = False,
     ) -> Iterator[Recorded] | Iterator[Reading]:
-        """Yield every intact message in the order of the file; see `damage_words` afterwards.
+        """Yield every intact message in the order of the file. `damage_words` then describes the damage.
 
         keys: one or several topics (`sensor/range`, `sensor/*`), messages (`fleet.v1.Range`), keys or key expressions
         (`red/sensor/range`, `fleet/red/**`). start_ns (included), end_ns (excluded): times of the recorder's clock, ns
-        since the epoch. With an index only the chunks in question are read, so the last minute of a long session takes
-        no longer than a minute's messages.
-        decode: True to yield readings, as `Fleet.watch` does; what cannot be decoded is counted in `left_out`. False to
-        yield payloads as they were on the bus.
+        since the epoch. With an index, only the chunks in question are read. So reading the last minute of a long
+        session takes no longer than reading a session of one minute.
+        decode: True to yield readings, as `Fleet.watch` does. Messages that cannot be decoded are counted in
+        `left_out`. False to yield payloads as they were on the bus.
         Raises NoTable if `keys` is one name without wildcards that neither we nor this session have.
         """
         selection = self.selection(keys, start_ns, end_ns)
@@ -298,14 +298,14 @@ class Session:
         Columns: key, car, log_time (recorder's clock) and publish_time (publisher's clock) as timestamp[ns, UTC],
         sequence, then the fields. A unit is in the column's name and in the field's metadata (`unit`). A value is null
         if it was not measured. The request of a command has a column for each field (`request_motion`).
-        Messages of other types on these keys are not in it: a warning counts them, `stray_tables` has them. Times
+        Messages of other types on these keys are left out. A warning counts them, and `stray_tables` has them. Times
         beyond the year 2262 are null, with a warning.
         Raises NoTable, and FormatMissing (an ImportError) without the extra `analysis`.
         """
         return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
 
     def stray_tables(self, *, start_ns: int | None = None, end_ns: int | None = None) -> "dict[str, pa.Table]":
-        """Return the messages that are not of the type of their key, one pyarrow.Table each type.
+        """Return the messages that are not of the type of their key, one pyarrow.Table for each type.
 
         The names are `stray.fleet.v1.Range`, and `other` for messages that are not protobuf. start_ns, end_ns: as for
         `messages`. Raises FormatMissing without the extra `analysis`.
@@ -323,11 +323,13 @@ class Session:
         """Return the table of the first topic, with the latest values that the same car had published in the others.
 
         `session.joined("sensor/range", "state/mode")` adds the columns `mode.asked`, `mode.verdict`, ... to those of
-        the distances. They are null in rows for which no value is young enough. With `state/mode` there are two columns
-        more: `mode` is the mode as commanded, `mode_seen` as the readings of the car show it; null if not known.
-        A warning tells how long cars were in modes in which this reading does not exist: see `times_without`.
+        the distances. They are null in rows for which no value is young enough. With `state/mode` there are two more
+        columns: `mode` is the commanded mode, `mode_seen` is the mode that the car's readings show. Both are null if
+        not known.
+        A warning says how long cars were in modes in which this reading does not exist: see `times_without`.
         tolerance_s: maximum age of a value, s, by publish_time. The default is the time after which its topic is stale
-        (3 s for readings and states); values of topics that are never stale have no limit. Raises as `to_pandas`.
+        (3 s for readings and states). Values of topics that are never stale have no limit. Raises the errors of
+        `to_pandas`.
         """
         if tolerance_s is not None and not tolerance_s >= 0:
             raise ValueError(f"tolerance_s {tolerance_s:g} is not allowed: at least 0, or None for the topic's own")
@@ -342,13 +344,13 @@ class Session:
     def times_without(self, of: str) -> "pd.DataFrame":
         """Return when cars were in modes in which a reading does not exist: car, mode, begin and end of each time.
 
-        of: as for `to_pandas`, about one sensor (`sensor/range`, `red/sensor/range`). In obstacle avoidance, a car
-        sends no distance. A plot that marks these times shows why there are no dots. The mode is the commanded one, or
-        the one that the car shows if that contradicts it. Manual mode has all readings.
+        of: as for `to_pandas`, about one sensor (`sensor/range`, `red/sensor/range`). For example, a car sends no
+        distance in obstacle avoidance. A plot that marks these times shows why there are no dots. The mode is the
+        commanded one, or the one that the car's readings show if they contradict it. Manual mode has all readings.
         Raises NoTable for another name, and FormatMissing without the extra `analysis`.
         """
         if not sensor_of(of):
-            raise NoTable(f"{of} is not about one sensor. Such as sensor/range.")
+            raise NoTable(f"{of} does not name one sensor, such as sensor/range.")
         return data_frame(spans_table(self._spans_without(of, self.to_arrow(MODE.name))))
 
     def _spans_without(self, of: str, modes: "pa.Table") -> list[ModeSpan]:
@@ -371,7 +373,10 @@ class Session:
         return Selection(tuple(each for name in names for each in key_expressions(name, fleet)), start_ns, end_ns)
 
     def rows(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
-        """Yield messages as plain tuples with their channel and schema: a third of the time of `messages`."""
+        """Yield messages as plain tuples with their channel and schema.
+
+        This takes a third of the time of `messages`.
+        """
         for segment in self.segments:
             yield from self._read_segment(segment, selection)
 

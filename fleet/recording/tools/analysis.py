@@ -1,4 +1,4 @@
-"""Tables of a session for pyarrow and pandas, which are imported only then: conversion, and joins by car and time."""
+"""Tables of a session for pyarrow and pandas: conversion, and joins by car and time. Imports both only when needed."""
 
 import math
 import warnings
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
 TIME: Final = "publish_time"
-"""Column by which tables are sorted and joined. All messages of a car have it from the clock of its gateway."""
+"""Column by which tables are sorted and joined. For all messages of a car it is by the clock of the car's gateway."""
 _NOT_JOINED: Final = frozenset({"key", "car", "log_time", "sequence", "seq", "boot_id"})
 
 
@@ -34,7 +34,7 @@ class NoTable(ValueError):
 def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
     """Return the only table of these messages, sorted by publish_time. Raises NoTable, FormatMissing.
 
-    of, session: the names for errors. If `of` is a topic or a message of ours, the table may be empty.
+    of, session: names for error messages. If `of` is a topic or a message of ours, the table may be empty.
     """
     tables, exported = arrow_tables(rows)
     strays = {name: tables.pop(name) for name in list(tables) if name.startswith(STRAY_PREFIX)}
@@ -65,18 +65,18 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
 
 
 def warn_of_modes(sensor: str, spans: Iterable[ModeSpan]) -> None:
-    """Warn of readings that do not exist because of the modes of the cars."""
+    """Warn about readings that do not exist because of the modes of the cars."""
     if words := describe_spans(sensor, spans):
-        _warn(f"{words}. Session.times_without() has when")
+        _warn(f"{words}. Session.times_without() has the times")
 
 
 def _warn(words: str) -> None:
-    # The caller of `Session.to_arrow` or `to_pandas` sees its own line or one of ours, depending on the method.
+    # The warning names the line of the caller of `Session.to_arrow`, but a line of ours for `to_pandas`.
     warnings.warn(printable_lines(words), stacklevel=4)
 
 
 def stray_tables(rows: Iterable[Row]) -> "dict[str, pa.Table]":
-    """Return the tables of messages that are not of the type of their key, and of those that are not protobuf."""
+    """Return the tables of messages that are not of the type of their key, and of messages that are not protobuf."""
     decoder = MessageDecoder()
     tables, _ = arrow_tables(row for row in rows if decoder.class_of(row[0]) is None or is_stray(row[0]))
     return {name: table.sort_by(TIME) for name, table in tables.items()}
@@ -91,7 +91,7 @@ def _empty_table(of: str, session: str) -> "pa.Table":
 
 def no_messages(of: str, session: str) -> NoTable:
     """Return the error that a session has no messages of this name."""
-    # A path is the name of a topic, where the last part decides. As a whole, two topics of one family are alike.
+    # In the name of a topic, compare the last part: whole names of two topics of one family are too much alike.
     likely = topics.likely_name(of) if "/" in of else None
     is_other = likely is not None and not f"/{of}".endswith(f"/{likely}")
     near = f"Did you mean {likely}?" if is_other else did_you_mean(of, _known_names(), 2)
@@ -158,7 +158,7 @@ def join_as_of(left: "pa.Table", right: "pa.Table", prefix: str, tolerance_s: fl
 def add_modes(table: "pa.Table") -> "pa.Table":
     """Add to a table that was joined with `state/mode` the columns `mode` (as commanded) and `mode_seen`.
 
-    Both are null where they are not known. A column of the table itself keeps its name.
+    Both are null if they are not known. If the table already has a column of that name, nothing is added.
     """
     import_pyarrow()
     import pyarrow.compute as pc  # type: ignore[import-untyped]  # it has no stubs

@@ -1,4 +1,4 @@
-"""What happened to one car around one time of a session: commands, records, changed claims and decisions. Pure."""
+"""Lists what happened to one car around one time of a session: commands, records, claims and decisions. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,9 +11,9 @@ from schemas.local_time import clock
 
 TIMELINE_BEFORE_NS: Final = 30_000_000_000
 TIMELINE_AFTER_NS: Final = 30_000_000_000
-"""Time before and after the asked one that is told, ns."""
+"""Time before and after the requested one that the timeline covers, ns."""
 STATE_BEFORE_NS: Final = 30_000_000_000
-"""Time before those in which the states that were in force are found: gateways repeat them each second."""
+"""Time before the timeline that is searched for the states at its beginning. Gateways repeat states each second."""
 DECISION_TOPIC: Final = f"{keys.COORDINATOR}/decision"
 _CLAIMS: Final = {
     "state/link": ("link", link_claim),
@@ -46,7 +46,7 @@ class CarTimeline:
     _last: dict[str, str] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any, at_ns: int) -> None:
-        """Take in a message of the car, or a decision of the plan. `at_ns` is its time on the recorder's clock."""
+        """Add a message of the car, or a decision of the plan. `at_ns` is its time on the recorder's clock."""
         if topic in TIMELINE_TOPICS:
             self.stops.add(self.car, topic, message, at_ns)
         if topic in _CLAIMS:
@@ -85,7 +85,10 @@ class CarTimeline:
         }
 
     def _changed(self, what: str, words: str, why: str, at_ns: int) -> None:
-        """Add a line unless the same was told last. The states before the timeline are its first lines."""
+        """Add a line, unless the last line about `what` was the same.
+
+        The states before the timeline are its first lines.
+        """
         if self._last.get(what) == words:
             return
         self._last[what] = words

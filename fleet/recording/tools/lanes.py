@@ -1,10 +1,10 @@
-"""The lanes of a time line: for each car when which mode was in force, who drove, what kept it, stops and losses. Pure.
+"""The lanes of a time line: for each car its modes, drivers, holds, stops and losses over time. Pure.
 
-The console draws them live, and of a session. Times are those of one clock that the caller chooses, ns since the epoch:
-for a session that of the recorder, since the clock of a gateway may be wrong.
+The console draws them live, and for a session. Times are by one clock that the caller chooses, ns since the epoch. For
+a session this is the recorder's clock, because the clock of a gateway may be wrong.
 
-A state holds until the next one, and no longer than until it is stale: what nobody said is not drawn. A stop begins
-when it arrived and ends with its last record.
+A state lasts until the next one, but not longer than until it is stale. So nothing is drawn for times without messages.
+A stop begins when it arrived, and ends with its last event.
 """
 
 from collections import deque
@@ -25,21 +25,21 @@ MARK_TOPIC: Final = f"{keys.RECORDER}/mark"
 MODE_TOPIC: Final = TOPICS["state/mode"]
 assert MODE_TOPIC.stale_after_s is not None
 HELD_NS: Final = round(MODE_TOPIC.stale_after_s * 1e9)
-"""Time after which a state is stale. All states of a car have the same."""
+"""Time after which a state is stale. It is the same for all states of a car."""
 MAX_SPANS: Final = 4096
-"""Maximum number of spans of one lane. The oldest are forgotten: a car that changes each second fills more than an
-hour with them."""
+"""Maximum number of spans of one lane. The oldest are forgotten. Even if a car changes each second, this is enough for
+more than an hour."""
 MAX_OPEN_STOPS: Final = 64
-"""Maximum number of stops of a car without an end. Their records may be lost."""
+"""Maximum number of stops of a car without an end. There may be some, because their last events may be lost."""
 NOT_HEARD: Final = "not heard"
-"""Words of a loss: the gateway of the car says nothing."""
+"""Words of a loss during which the car's gateway published nothing."""
 _MOVING: Final = frozenset(Motion) - {Motion.STOP}
 _BAD_ENDS: Final = frozenset({Phase.FAILED, Phase.EXPIRED, Phase.REJECTED})
 _LAST_PHASES: Final = _BAD_ENDS | {Phase.COMPLETE, Phase.SUPERSEDED}
 
 
 class Lane(StrEnum):
-    """What is drawn of a car, from top to bottom."""
+    """The lanes of a car, from top to bottom."""
 
     MODE = "mode"
     DRIVER = "driver"
@@ -50,7 +50,7 @@ class Lane(StrEnum):
 
 @dataclass(slots=True)
 class LaneSpan:
-    """One thing that was so from `begin_ns` to `end_ns`. Its end grows while it lasts."""
+    """A mode, driver, hold, stop or loss from `begin_ns` to `end_ns`. The end grows while it lasts."""
 
     car: str
     lane: Lane
@@ -66,7 +66,7 @@ class LaneSpan:
 
 @dataclass(frozen=True, slots=True)
 class LaneMark:
-    """What somebody marked."""
+    """A mark that somebody set."""
 
     at_ns: int
     words: str
@@ -84,10 +84,10 @@ class Lanes:
     _open: dict[tuple[str, Lane], LaneSpan] = field(default_factory=dict)
     """The span of each lane that the next state may prolong."""
     _heard_ns: dict[str, int] = field(default_factory=dict)
-    """When each car last said how its link is."""
+    """When the last state of each car's link came."""
 
     def add(self, car: str, topic: str, message: Any, at_ns: int) -> None:
-        """Take in a message of LANE_TOPICS, or a mark. Others change nothing."""
+        """Add a message of LANE_TOPICS, or a mark. Other messages change nothing."""
         match topic:
             case "state/mode":
                 is_wrong = message.verdict == Verdict.CONTRADICTED
@@ -116,27 +116,27 @@ class Lanes:
                 del by_car[car]
 
     def since(self, at_ns: int) -> Iterator[LaneSpan]:
-        """Yield the spans that reach this time, or are later: by car, lane and time."""
+        """Yield the spans that reach this time or are later, ordered by car, lane and time."""
         for _, spans in sorted(self.spans.items()):
             yield from (span for span in spans if span.end_ns >= at_ns)
 
     def silences(self, now_ns: int) -> Iterator[LaneSpan]:
-        """Yield a loss for each car that has not been heard for too long by now, and may never be again."""
+        """Yield a loss for each car that has not been heard for too long by now. It may never be heard again."""
         for car, heard_ns in sorted(self._heard_ns.items()):
             if now_ns - heard_ns > HELD_NS:
                 yield LaneSpan(car, Lane.LOSS, heard_ns, now_ns, NOT_HEARD, bad=True)
 
     def at(self, at_ns: int) -> dict[tuple[str, Lane], LaneSpan]:
-        """Return what was so at a time, by car and lane."""
+        """Return the span at a time, by car and lane."""
         found = {}
         for place, spans in self.spans.items():
             for span in spans:
                 if span.begin_ns <= at_ns <= span.end_ns:
-                    found[place] = span  # of two that touch the later one
+                    found[place] = span  # if two spans touch, the later one counts
         return found
 
     def _hold(self, car: str, lane: Lane, words: str, at_ns: int, *, bad: bool = False) -> None:
-        """Note what a state says: empty words end what was so."""
+        """Prolong or begin the span that a state means. Empty words end the current span."""
         spans = self._spans(car, lane)
         last = spans[-1] if spans else None
         if last is not None and self._open.get((car, lane)) is last and at_ns - last.end_ns <= HELD_NS:
@@ -150,7 +150,7 @@ class Lanes:
             self._open[car, lane] = span
 
     def _silence(self, car: str, at_ns: int) -> None:
-        """Draw the time as a loss for which a car was not heard, once it is heard again."""
+        """Add a loss for the time in which a car was not heard, once it is heard again."""
         before = self._heard_ns.get(car)
         self._heard_ns[car] = at_ns
         if before is not None and at_ns - before > HELD_NS:
@@ -179,7 +179,10 @@ class Lanes:
 
 
 def _kept_by(safety: Any) -> str:
-    """Return what keeps a car from moving: an e-stop, the pause of the fleet, or a hold. Empty if nothing does."""
+    """Return in words what keeps a car from moving: an e-stop, the pause of the fleet, or a hold.
+
+    Empty if nothing does.
+    """
     if safety.estops:
         return f"e-stop by {keys.person_of(safety.estops[0].by)}{_because(safety.estops[0].why)}"
     if (pause := binding_pause(safety.pauses)) is not None:

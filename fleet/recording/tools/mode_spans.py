@@ -1,7 +1,7 @@
 """Finds when cars were in a mode in which a reading does not exist, from their `state/mode`. Pure.
 
 A car sends only what its mode needs (docs/reference/modes.md#what-a-car-reports-in-a-mode). So a table of distances has
-no row at all from obstacle avoidance, and nobody sees that something is missing.
+no rows at all from obstacle avoidance, and nobody would notice that they are missing.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,8 +15,8 @@ from schemas.words import UNKNOWN, Mode, Platform, Verdict
 MODE: Final = TOPICS["state/mode"]
 assert MODE.stale_after_s is not None
 _HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
-"""A state holds until the next one, and no longer than until it is stale."""
-# Only Arduino cars are known to report in other modes than manual. No other car reports more there.
+"""A state lasts until the next one, but not longer than until it is stale."""
+# Only Arduino cars are known to report in modes other than manual. No other car reports more than they do there.
 _PROFILE: Final = drivers.profile_of(Platform.ARDUINO)
 
 
@@ -31,7 +31,10 @@ class ModeSpan:
 
 
 def sensor_of(name: str) -> str:
-    """Return the sensor of a topic, a message or a key, such as `range`. Empty if it is not about one sensor."""
+    """Return the sensor that a topic, a message or a key names, such as `range`.
+
+    Empty if it does not name one sensor.
+    """
     for topic in TOPICS.values():
         messages = (topic.message, topic.message.rpartition(".")[2])
         if topic.family == "sensor" and (name in messages or f"/{name}".endswith(f"/{topic.name}")):
@@ -40,14 +43,15 @@ def sensor_of(name: str) -> str:
 
 
 def does_exist(sensor: str, mode: Mode) -> bool:
-    """Return True if cars send readings of this sensor in this mode. In manual mode that depends on the car: True."""
+    """Return True if cars send readings of this sensor in this mode. Manual mode counts as True for every sensor."""
     return mode is Mode.MANUAL or f"sensor/{sensor}" in FROM_OUTSIDE or sensor in _PROFILE.measurable(mode)
 
 
 def mode_spans(states: Iterable[Mapping[str, Any]]) -> Iterator[ModeSpan]:
     """Yield the spans of each car, from rows of `state/mode` sorted by publish_time.
 
-    The mode is the commanded one, and the one that the car shows where that contradicts it. Unknown modes have no span.
+    The mode is the commanded one, or the one that the car's readings show if they contradict it. Unknown modes have no
+    span.
     """
     current: dict[str, ModeSpan] = {}
     for state in states:

@@ -1,8 +1,9 @@
-"""What was known at one moment of a session: the newest message of each key, and the lanes of the whole session.
+"""Finds what was known at one moment of a session: the newest message of each key, and the session's lanes.
 
-The moment is one of the recorder's clock, as `start_ns` and `end_ns` of `Session.messages`: the clock of a gateway may
-be wrong, and two of them differ. What the recorder had not received is not known yet. Of the messages that it had,
-the newest by the time of publishing counts, as in the tables: a backfilled one comes late and is old.
+The moment is by the recorder's clock, as `start_ns` and `end_ns` of `Session.messages`, because the clocks of gateways
+may be wrong and differ. A message that the recorder had not received by then is not known yet. Of the messages that it
+had received, the newest by the time of publishing counts, as in the tables, because a backfilled message comes late and
+is old.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +25,7 @@ from schemas.topics import TOPICS
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A message as it was known. Times: ns, of the recorder's and of the publisher's clock."""
+    """A message that was known. Times: ns, by the recorder's and by the publisher's clock."""
 
     key: keys.Key
     message: Any
@@ -35,15 +36,18 @@ class Known:
 def known_at(session: Session, at_ns: int, *, before_ns: int = STATE_BEFORE_NS) -> list[Known]:
     """Return the newest message of each key up to a moment, by the time at which it was recorded.
 
-    Only of the time `before_ns` before it: gateways repeat their states each second, so what is older nobody said any
-    more. Messages that are not of their key's type are left out.
+    Only the time `before_ns` before the moment is searched. Gateways repeat their states each second, so older states
+    are no longer in force. Messages that are not of their key's type are left out.
     """
     newest = newest_rows(session.rows(Selection(None, at_ns - before_ns + 1, at_ns + 1)))
     return sorted(_decoded(newest.values()), key=lambda each: each.log_ns)
 
 
 def newest_rows(rows: Iterable[Row]) -> Mapping[str, Row]:
-    """Return the row of each key that was published last; of two at one time the later one in the file. Pure."""
+    """Return the row of each key that was published last.
+
+    If two were published at one time, the later one in the file counts. Pure.
+    """
     newest: dict[str, Row] = {}
     for row in rows:
         topic = row[0].channel.topic
@@ -74,12 +78,15 @@ def one_a_step(rows: Iterable[Row], step_ns: int) -> Iterator[Row]:
 
 
 def newest_of(session: Session, expressions: tuple[str, ...], at_ns: int) -> list[Known]:
-    """Return the newest message of some keys up to a moment, however old. For what is published on change only."""
+    """Return the newest message of some keys up to a moment, however old.
+
+    Use it for keys that are published on change.
+    """
     return list(_decoded(newest_rows(session.rows(Selection(expressions, 0, at_ns + 1))).values()))
 
 
 def lanes_of(session: Session) -> Lanes:
-    """Return the lanes and marks of a whole session. `session.damage` then has what could not be read."""
+    """Return the lanes and marks of a whole session. `session.damage` then lists the parts that could not be read."""
     expressions = (*(f"*/*/{topic}" for topic in LANE_TOPICS), f"*/{MARK_TOPIC}")
     lanes = Lanes()
     for each in read_between(session, expressions, 0, _LATEST_NS):
@@ -91,11 +98,11 @@ def lanes_of(session: Session) -> Lanes:
 
 
 _LATEST_NS: Final = 2**63 - 2
-"""The latest time that a file can have."""
+"""The latest time that a file can contain."""
 
 
 def _decoded(rows: Iterable[Row]) -> Iterator[Known]:
-    """Yield the messages with our own classes: a schema only gains fields, and an older recording lacks some."""
+    """Yield the messages with our own classes. That works because a schema only gains fields."""
     for info, _, log_ns, publish_ns, data in rows:
         key = keys.parse(info.channel.topic)
         topic = None if key is None else TOPICS.get(key.topic) or TOPICS.get(f"{key.car}/{key.topic}")

@@ -1,6 +1,6 @@
 """Writes a session as one MCAP file in which each topic has one schema, as Foxglove and PlotJuggler expect it.
 
-A message of another type than its key's has a topic of its own: `stray/KEY/TYPE`. Nothing else changes: payloads,
+A message that is not of the type of its key gets another topic: `stray/KEY/TYPE`. Nothing else changes: payloads,
 times, sequences, attachments and metadata are those of the session.
 """
 
@@ -23,7 +23,7 @@ _Schema = tuple[str | bytes, ...]
 
 @dataclass(slots=True)
 class TopicNames:
-    """Names topics for Foxglove, so that each has one schema: those of a session, and those of a fleet live."""
+    """Names topics for Foxglove, so that each has one schema. Used for sessions and for a live fleet."""
 
     schemas: dict[str, _Schema] = field(default_factory=dict)
     """Schema by topic."""

@@ -1,13 +1,12 @@
 """Puts recorded messages into the order in which they were published. Pure.
 
-The order in the file is that of receiving: a recorder that was away gets later from the publishers what it has missed.
-Stamps alone do not tell the order, either: if somebody sets the clock of a computer back by an hour, two hours have the
-same stamps. But each publisher numbers its messages. Where the numbers go on and the stamps go back, the clock was set.
-
-Such a step is seen by each key at its next message. So a step is known to lie between two times of receiving, and the
-fewest steps that explain all keys are those that happened. Between two steps the stamps tell the order. Nothing
-tells to which side of a step a message belongs if its key was silent for longer than the clock was set back, or if the
-recorder was away.
+The order in the file is the order of receiving. It may differ, because a recorder that was away gets the missed
+messages later from their publishers. Stamps alone do not show the order, either: if somebody sets the clock of a
+computer back by an hour, two hours have the same stamps. But each publisher numbers its messages. If the numbers go up
+and the stamps go back, the clock was set back. Each key shows such a step at its next message. So a step lies between
+two times of receiving, and the smallest set of steps that explains all keys is taken as the true one. Between two steps
+the stamps show the order. It is not known on which side of a step a message lies if its key was silent for longer than
+the clock was set back, or if the recorder was away.
 """
 
 from bisect import bisect_right
@@ -34,7 +33,7 @@ class RecordedMessage(Generic[Item]):
     at_ns: int
     """Its stamp."""
     stream: tuple[str, str]
-    """Its key, and the start of its publisher that numbered it."""
+    """Its key, and the boot id of the publisher that numbered it."""
     number: int
     item: Item
 
@@ -42,8 +41,8 @@ class RecordedMessage(Generic[Item]):
 def as_published(messages: Iterable[RecordedMessage[Item]]) -> Iterator[tuple[int, RecordedMessage[Item]]]:
     """Yield the messages of one computer in the order in which they were published.
 
-    Each has what the recorder's clock showed more than the stamp, ns. It is that of the fastest message between two
-    steps, and 0 if it is no more than a network and NTP explain.
+    Each comes with the lead of the recorder's clock over its stamp, ns. This is the lead of the fastest message between
+    two steps, or 0 if it is not larger than network delay and NTP explain.
     """
     streams: defaultdict[tuple[str, str], list[RecordedMessage[Item]]] = defaultdict(list)
     for each in messages:
@@ -76,7 +75,7 @@ def _received_at_latest(stream: list[RecordedMessage[Item]]) -> list[int]:
 
 
 def _steps_between(key: list[tuple[int, RecordedMessage[Item]]]) -> Iterable[tuple[int, int]]:
-    """Yield the times of receiving between which the clock was set back. `key`: messages in the order of publishing."""
+    """Yield the pairs of receive times between which the clock was set back. `key`: messages in publishing order."""
     for (before_ns, before), (latest_ns, each) in pairwise(key):
         if each.at_ns < before.at_ns - _CLOCK_STEP_NS:
             yield before_ns, latest_ns

@@ -1,10 +1,10 @@
 """Writes a session as a ROS 2 bag with standard messages only, which every ROS 2 tool can read. Needs rosbags.
 
-A topic is `/<car>/<topic>`, as in `/red/range`. What ROS has a message for gets it, in its units and with its words for
-"not measured". Everything else is a DiagnosticArray with all its fields as text: no message of the fleet is lost.
-
-Stamps are those of the gateway, the times of the bag those of the recorder. Frames are `<car>/<topic>`, as in
-`red/range`; where a sensor sits on its car nobody has measured, so there are no transforms.
+A topic is `/<car>/<topic>`, as in `/red/range`. If ROS has a standard message for a reading, that message is used, with
+ROS's units and its value for "not measured". Everything else becomes a DiagnosticArray with all fields as text, so no
+message of the fleet is lost. Stamps are by the gateway's clock, the times of the bag by the recorder's clock. Frames
+are `<car>/<topic>`, as in `red/range`. There are no transforms, because nobody has measured where the sensors sit on
+the cars.
 """
 
 import json
@@ -46,7 +46,7 @@ _NAN: Final = float("nan")
 _LOG_LEVELS: Final = {1: 10, 2: 20, 3: 30, 4: 40, 5: 50}
 """Level of foxglove.Log: that of rcl_interfaces/Log."""
 _COMMON: Final = frozenset({"stamp", "timestamp", "car"})
-"""Fields that stand in the header, and in the name of the topic."""
+"""Fields that are in the header or in the name of the topic, and so are left out."""
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
 
@@ -78,7 +78,7 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> Any:
 
 
 def _range(message: Any, header: Any) -> Any:
-    """Return the distance; +inf if there was no echo (REP-117)."""
+    """Return the distance, or +inf if there was no echo (REP-117)."""
     measured = message.range_m if message.HasField("range_m") else _NAN
     return _ros(
         "sensor_msgs/msg/Range",
@@ -93,7 +93,7 @@ def _range(message: Any, header: Any) -> Any:
 
 
 def _battery(message: Any, header: Any) -> Any:
-    """Return the voltage, and the charge as far as it is known. All else is NaN: not measured."""
+    """Return the voltage, and the charge if it is known. All other values are NaN, which means not measured."""
     none: Any = _STORE.types["sensor_msgs/msg/BatteryState"]
     return none(
         header=header,
@@ -148,12 +148,12 @@ _SIDES: Final = ("left_wheels", "right_wheels")
 
 
 def _wheels(message: Any, header: Any) -> Any:
-    """Return the speed of each side in m/s: their radius is not known."""
+    """Return the speed of each side in m/s and not in rad/s, because the radius of the wheels is not known."""
     return _joints(header, _SIDES, velocity=(message.left_m_s, message.right_m_s))
 
 
 def _odometer(message: Any, header: Any) -> Any:
-    """Return the way of each side in m."""
+    """Return the distance that each side has covered, m."""
     return _joints(header, _SIDES, position=(message.left_m, message.right_m))
 
 
@@ -163,7 +163,7 @@ def _arm(message: Any, header: Any) -> Any:
 
 
 def _pose(message: Any, header: Any) -> Any:
-    """Return a measured pose on the floor. What was not measured has a covariance of 0: unknown."""
+    """Return a measured pose on the floor. A value whose deviation is not known has a covariance of 0."""
     header.frame_id = message.frame or header.frame_id
     covariance = np.zeros(36)
     covariance[[0, 7]], covariance[35] = message.xy_std_m**2, message.heading_std_rad**2
@@ -211,12 +211,12 @@ _CONVERTERS: Final[Mapping[str, tuple[str, Callable[[Any, Any], Any]]]] = {
     "fleet.v1.Truth": ("geometry_msgs/msg/PoseStamped", _truth),
     "foxglove.Log": ("rcl_interfaces/msg/Log", _log),
 }
-"""The messages that ROS has one for, by their full name."""
+"""By full name: our messages for which ROS has a standard one."""
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def _diagnostics(message: Message, header: Any, key: str) -> Any:
-    """Return all fields of a message as text: numbers, lists and parts of it as JSON, times in ns, bytes in hex."""
+    """Return all fields of a message as text: numbers, lists and nested messages as JSON, times in ns, bytes in hex."""
     values = [
         _ros("diagnostic_msgs/msg/KeyValue", key=name, value=value if isinstance(value, str) else json.dumps(value))
         for name, value in plain(message).items()
@@ -234,7 +234,7 @@ def _diagnostics(message: Message, header: Any, key: str) -> Any:
 
 
 def topic_name(key: str) -> str:
-    """Return the topic of a key, without the fleet: its parts have letters, digits and _, and begin with no digit."""
+    """Return the topic of a key, without the fleet. Its parts have only letters, digits and _, with no digit first."""
     parsed = keys.parse(key)
     parts = (parsed.car, *parsed.topic.split("/")) if parsed is not None else tuple(key.split("/"))
     if len(parts) > 2 and parts[1] == "sensor":
@@ -280,7 +280,7 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
 
 
 def _convert(message: Message, key: str, publish_ns: int) -> tuple[str, Any]:
-    """Return the type of ROS, and the message."""
+    """Return the ROS type and the converted message."""
     header = _ros("std_msgs/msg/Header", stamp=_stamp(message_time_ns(message, publish_ns)), frame_id=_frame(key))
     kind, convert = _CONVERTERS.get(message.DESCRIPTOR.full_name, (DIAGNOSTICS, None))
     if convert is None:

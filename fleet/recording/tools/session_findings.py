@@ -31,7 +31,7 @@ class SessionCheckup:
     stops: Counter[str] = field(default_factory=Counter)
     """Ended stops by `shown`, `sent` or `failed`."""
     unshown: StopFindings = field(default_factory=StopFindings)
-    """The stops that a car did not show, or that did not stop it."""
+    """Stops that a car did not show, or that did not stop it."""
     refused: Counter[str] = field(default_factory=Counter)
     """Refused commands by reason, without stops."""
     broken: Counter[str] = field(default_factory=Counter)
@@ -43,7 +43,7 @@ class SessionCheckup:
     _decoder: MessageDecoder = field(default_factory=MessageDecoder)
 
     def watch(self, rows: Iterable[Row]) -> Iterator[Row]:
-        """Pass on rows and count what they are."""
+        """Pass rows on, and count them."""
         for row in rows:
             info, _, log_ns, _, data = row
             key = keys.parse(info.channel.topic)
@@ -68,7 +68,7 @@ class SessionCheckup:
                 self.refused[message.reason or message.phase] += 1
 
     def findings(self, verdict: SessionVerdict, name: str) -> Iterator[DoctorFinding]:
-        """Yield what is odd, the most important first. `name` is the session's, as a user types it."""
+        """Yield the findings, the most important first. `name` is the name of the session, as a user types it."""
         replay, verify = f"fleet replay {name}", f"fleet sessions verify {name}"
         for code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE):
             if stops := self.unshown.of(code):
@@ -95,7 +95,7 @@ class SessionCheckup:
             yield DoctorFinding("refused", f"Commands were refused or failed: {reasons}.", replay)
 
     def facts(self, verdict: SessionVerdict) -> Iterator[tuple[str, str]]:
-        """Yield what is known of the session, as names and texts."""
+        """Yield the facts known about the session, as names and texts."""
         yield "state", f"{'whole' if verdict.whole else 'not whole'}, {verdict.messages} messages"
         lost = sum(verdict.dropped.values()) + sum(verdict.missed.values())
         yield "lost", f"{verdict.missing_count} missing by number, {lost} by the recorder's count"
@@ -106,7 +106,7 @@ class SessionCheckup:
         yield "clock steps", str(steps)
 
     def as_dict(self, verdict: SessionVerdict, name: str) -> dict[str, Any]:
-        """Return the findings and what is known, for JSON."""
+        """Return the findings and the facts, for JSON."""
         found = [asdict(finding) for finding in self.findings(verdict, name)]
         stops = [each.as_dict() for each in self.unshown.stops]
         return {"session": verdict.session, "findings": found, "facts": dict(self.facts(verdict)), "stops": stops}

@@ -1,8 +1,8 @@
 """Finds the stops of a session that a car did not show, or that did not reach it: car, time and cause. Pure.
 
 A gateway records such a stop twice: as the last event of each command that asked for it, and in its log. Both have the
-same words, so they are one finding here. What the gateway said of the car just before is the likely cause: a link that
-was lost, a car in doubt, or one whose reports cannot show a stop.
+same words, so they become one finding here. The likely cause is in the last states before the stop: a lost link, a car
+in doubt, or a car whose reports cannot show a stop.
 """
 
 from collections.abc import Iterator
@@ -33,11 +33,11 @@ class UnshownStop:
     at_ns: int
     code: str
     asked: str
-    """Who asked for it, such as `stop by mia`. Empty if it was the gateway itself."""
+    """Who asked for it, such as `stop by mia`. Empty if the gateway itself stopped the car."""
     words: str
     """The words of the gateway."""
     cause: str
-    """What was known of the car just before."""
+    """What was known about the car just before, in words."""
 
     def describe(self) -> str:
         """Return car, time and cause."""
@@ -68,7 +68,7 @@ class StopFindings:
     """The newest states by car and topic."""
 
     def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
-        """Take in a message of `WATCHED_TOPICS`. `at_ns` is its time if it has no stamp."""
+        """Add a message of `WATCHED_TOPICS`. `at_ns` is its time if it has no stamp."""
         if topic.startswith("state/"):
             self._states.setdefault(car, {})[topic] = message
         elif not (code := failed_stop_code(topic, message)):
@@ -108,7 +108,7 @@ class StopFindings:
 
 
 def failed_stop_code(topic: str, message: Any) -> str:
-    """Return the code of a stop that failed, by a message of `event/command` or `event/log`. Empty if it is not one."""
+    """Return the code if a message of `event/command` or `event/log` reports a failed stop. Otherwise return ""."""
     if topic == "event/log":
         code = log_code(message)
         return code if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE) else ""
@@ -123,7 +123,7 @@ def asked_by(event: Any) -> str:
 
 
 def log_code(record: Any) -> str:
-    """Return the code of a log record: its name is the car's name and the code."""
+    """Return the code of a log record. The record's name consists of the car's name and the code."""
     code: str = record.name.replace("/", " ").rpartition(" ")[2]
     return code
 

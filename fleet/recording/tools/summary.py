@@ -33,7 +33,7 @@ class SessionState(StrEnum):
     RECORDING = "recording"
     CUT = "cut"  # the recorder did not close it
     DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is not an MCAP file
-    THINNED = "thinned"  # whole but for what the quota took
+    THINNED = "thinned"  # whole, except for files that the quota removed
     RECOVERED = "recovered"  # whole, but made from an incomplete session
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
 
@@ -46,7 +46,7 @@ class SessionSummary:
     path: str
     state: SessionState
     words: str = ""
-    """Why the session is not whole."""
+    """Why the session is not whole, in words."""
     started: str = ""
     """ISO 8601, UTC."""
     length_s: float = 0.0
@@ -64,9 +64,9 @@ class SessionSummary:
     kept: bool = False
     """True if the quota spares the session."""
     pins: Sequence[Mapping[str, Any]] = ()
-    """Times that the quota takes last, without those of marks."""
+    """Times that the quota removes last, without those of marks."""
     gone: Sequence[Mapping[str, Any]] = ()
-    """Files that the quota has taken."""
+    """Files that the quota has removed."""
     keys: Mapping[str, int] = field(default_factory=dict)
     """Messages by key."""
     start_ns: int = 0
@@ -131,7 +131,7 @@ def of_session(session: Session) -> SessionSummary:
         found.marks = list(description.marks)
         found.kept = description.kept
         found.pins, found.gone = list(description.pins), session_dir.gone_of(description)
-        found.stops = description.stops if description.closed else None  # else the last ones may be uncounted
+        found.stops = description.stops if description.closed else None  # otherwise the last ones may not be counted
     found.state, found.words = _state(session, read)
     if found.state is SessionState.WHOLE and (words := session.undescribed or session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
@@ -159,7 +159,8 @@ class _Span:
         if end_ns - first_ns <= MIN_CLOCK_STEP_NS:
             self._run = start_ns, max(end_ns, last_ns)
             return
-        # The chunk in which the clock stepped back has times from before and after: its last time is from before.
+        # The chunk in which the clock stepped back has times from before and after the step. Its last time is from
+        # before.
         within = last_ns >= end_ns
         end_ns = max(end_ns, last_ns)
         self.back_ns = max(self.back_ns, end_ns - first_ns)
@@ -173,7 +174,7 @@ class _Span:
 
 
 def growing(session: Session) -> Callable[[], bool]:
-    """Return a function that tells whether an unclosed session has grown since; it waits up to MAX_GROWTH_WAIT_S."""
+    """Return a function that returns whether an unclosed session has grown since. It waits up to MAX_GROWTH_WAIT_S."""
     began, before = time.monotonic(), _size(session.segments)
 
     def has_grown() -> bool:
@@ -196,7 +197,10 @@ def total(session: Session) -> int | None:
 
 
 def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]:
-    """Return the marks of a session from session.json, else from its messages. Those added later are in both cases."""
+    """Return the marks of a session, from session.json or else from its messages.
+
+    Marks that were added later always count.
+    """
     if any("added" not in mark for mark in about.marks):
         return list(about.marks)
     found: list[Mapping[str, Any]] = list(about.marks)
@@ -207,18 +211,18 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
 
 
 def stops_of(session: Session, about: SessionSummary) -> int:
-    """Return the number of stops of a session from session.json, else from the chunks that have events of commands."""
+    """Return the number of stops of a session, from session.json or else from the events of commands."""
     if about.stops is not None:
         return about.stops
     found = StopCount()
-    # A part: what it finds damaged is not said twice.
+    # Read a copy of the session, so that its damage is not reported twice.
     for _, event in _messages(session.part(session.segments), about, EVENTS.name):
         found.add(event)
     return found.count
 
 
 def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[tuple[int, Any]]:
-    """Yield the messages on the keys of a topic, with their times, ns. Only the chunks that have one are read."""
+    """Yield the messages on the keys of a topic, with their times, ns. Read only the chunks that contain one."""
     decoder = MessageDecoder()
     selected = tuple(key for key in about.keys if key.endswith(f"/{topic}"))
     for info, _, log_ns, _, data in session.rows(Selection(selected)) if selected else ():
@@ -246,7 +250,7 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
 
 
 def _recover(session: Session) -> str:
-    """Return the command that repairs this session, and not the newest one."""
+    """Return the command that repairs this session. It names the session, because the default is the newest one."""
     return f"fleet sessions recover {shlex.quote(session.name)}"
 
 

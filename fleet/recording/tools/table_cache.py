@@ -1,14 +1,15 @@
-"""Keeps the tables of a session as Parquet beside it, for questions to many sessions.
+"""Stores the tables of a session as Parquet beside it, for SQL questions about many sessions.
 
-The tables of one state of a session are in the directory `.tables-<digest>`. The digest is of its files, their sizes
-and times, of their description, and of the columns of our tables. So a session that grew has another
-directory, and the old one goes. A directory has its name only when it is whole: two questions at once make it twice,
-and one of the two is kept. Whoever deletes it loses nothing but time. A table whose columns are not those of this
+The tables for one state of a session are in the directory `.tables-<digest>`. The digest covers the session's files
+with their sizes and times, their description, and the columns of our tables. So a session that grew gets a new
+directory, and the old one is deleted. A directory gets its name only when it is complete: if two questions make it at
+the same time, one of the two is kept. Deleting a directory costs only time. A table whose columns are not those of this
 version is named `.foreign.parquet`.
 
-To read the descriptions of a thousand sessions takes as long as a question. So a directory has a stamp, an empty file
-named by the sizes and times of all files and of the description. While it is right, the description is not read. After
-a mark it is not: the description is read, says nothing new of the messages, and the stamp is replaced.
+Reading the descriptions of a thousand sessions takes as long as a question. So a directory has a stamp: an empty file
+whose name covers the sizes and times of all files and of the description. While the stamp fits, the description is not
+read. After a new mark it does not fit: then the description is read, and if it says nothing new about the messages,
+only the stamp is replaced.
 """
 
 import errno
@@ -47,21 +48,21 @@ from schemas.topics import TOPICS
 
 _PART: Final = ".part"
 _NOTE: Final = "damage"
-"""Name of the file that says what of the session could not be read."""
+"""Name of the file that describes the parts of the session that could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
 _OPEN: Final = "recording"
-"""Name of the empty file that says that the session was being recorded. If it has not ended since, it was cut."""
+"""Name of the empty file that says that the session was being recorded. If it was not closed since, it was cut."""
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
 _STAMP: Final = "stamp-"
-"""Beginning of the name of the empty file that tells for which state of the session the digest was made."""
+"""Prefix of the empty file whose name says for which state of the session the tables were made."""
 _FORMAT: Final = "4"
 """Increase it if the contents of a directory change, so that all directories are made again."""
 STALE_PART_S: Final = 600.0
-"""Minimum age of the last change in a directory that a killed process left half made. One that lives writes a table
-every few seconds: a thousand messages each."""
+"""Minimum age of the last change in an unfinished directory to count as left by a killed process. A running process
+writes to a table every few seconds."""
 _MAX_TRIES: Final = 4
-"""Maximum times that tables are made: another question deletes those of an old state of a session that grows."""
+"""Maximum number of attempts to make tables. Another question may delete them if the session has grown meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,20 +72,20 @@ class CachedTables:
     session: Path
     directory: Path
     words: str = ""
-    """What of the session could not be read, or an empty text if all was."""
+    """The parts of the session that could not be read, in words. Empty if all could be read."""
 
     names: tuple[str, ...] = ()
     """The files in the directory."""
 
     @classmethod
     def of(cls, session: Path, directory: Path) -> Self:
-        """Return what is in a directory. Raises OSError, for example if another question deletes it now."""
+        """Return the tables in a directory. Raises OSError, for example if another question deletes them now."""
         names = tuple(sorted(os.listdir(directory)))  # noqa: PTH208 - a path for each name costs half of a question
         note = directory / _NOTE
         return cls(session, directory, note.read_text(encoding="utf-8") if _NOTE in names else "", names)
 
     def with_words_of_now(self) -> Self:
-        """Return the tables of a session that was being recorded with what is to say of it now."""
+        """Return the tables. If the session was being recorded when they were made, update `words` to its state now."""
         return replace(self, words=self.words or _words(Session(self.session))) if _OPEN in self.names else self
 
     def files(self, message: str) -> Iterator[Path]:
@@ -105,7 +106,7 @@ class CachedTables:
         return f"{_STAMP}{stamp}" in self.names
 
     def put(self, stamp: str) -> None:
-        """Note the state of the session for the next question, where the directory can be written."""
+        """Note the state of the session for the next question, if the directory can be written."""
         with suppress(OSError):
             (self.directory / f"{_STAMP}{stamp}").touch()
             for name in self.names:
@@ -118,7 +119,7 @@ class CachedTables:
 
 
 def tables_of(session: Path) -> CachedTables:
-    """Return the tables of a session, made now if they are not there.
+    """Return the tables of a session. Make them now if they do not exist.
 
     Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere.
     """
@@ -139,10 +140,10 @@ def tables_of(session: Path) -> CachedTables:
         for place in places:
             try:
                 return _made(session, place, state.stamp)
-            except FileNotFoundError:  # the session is gone, or another question knows a newer state of it
+            except FileNotFoundError:  # the session is gone, or another question has seen a newer state of it
                 break
-            # Reading raises none: what cannot be read is damage. So the disk is full or broken, or the folder is
-            # read-only, and another disk may take the tables.
+            # Reading does not raise OSError, because unreadable parts count as damage. So the disk is full or broken,
+            # or the folder is read-only, and another disk may have room for the tables.
             except OSError as error:
                 errors.append(error)
         else:
@@ -153,7 +154,7 @@ def tables_of(session: Path) -> CachedTables:
 
 
 def _stamped(session: Path, state: "_State") -> CachedTables | None:
-    """Return the tables whose stamp is that of this state, from the session or else from the temporary files."""
+    """Return the tables whose stamp fits this state, from the session or else from the temporary files."""
     stamp = state.stamp
     elsewhere = ((home, _names(home)) for home in _homes(session) if home != session)
     for home, names in chain([(session, state.names)], elsewhere):
@@ -168,7 +169,7 @@ def _stamped(session: Path, state: "_State") -> CachedTables | None:
 
 def _made(session: Path, place: Path, stamp: str) -> CachedTables:
     """Make the tables of a session. Raises OSError, a FileNotFoundError if the session or the tables are gone."""
-    if place.parent != session:  # which must not appear again when the quota has deleted it
+    if place.parent != session:  # never create the session's directory again after the quota has deleted it
         place.parent.mkdir(parents=True, exist_ok=True)
     _drop_stale_parts(place.parent)
     part = Path(tempfile.mkdtemp(prefix=f"{place.name}-", suffix=_PART, dir=place.parent))
@@ -192,7 +193,7 @@ def _made(session: Path, place: Path, stamp: str) -> CachedTables:
 
 
 def _words(session: Session) -> str:
-    """Return what is not whole in a session, as `fleet find` and `fleet sessions` print it. Empty if it is whole."""
+    """Return the damage of a session in words, as `fleet find` and `fleet sessions` print it. Empty if it is whole."""
     return session.damage_words or of_session(session).words
 
 
@@ -218,17 +219,17 @@ def _facts(columns: Sequence[Column]) -> list[tuple[str, str]]:
 
 
 def drop_orphans(place: Path) -> None:
-    """Delete the tables of single files of a directory that are gone. Those of a directory went with it."""
+    """Delete the tables of single files that are gone. Tables of a session's directory were deleted with it."""
     for home in place.glob(".*.mcap"):
         if home.is_dir() and not (place / home.name[1:]).exists():
             for tables in home.glob(f"{TABLES_PREFIX}*"):
                 shutil.rmtree(tables, ignore_errors=True)
-            with suppress(OSError):  # somebody else's directory
+            with suppress(OSError):  # the directory has other files
                 home.rmdir()
 
 
 def _drop_stale_parts(home: Path) -> None:
-    """Delete what a process left that was killed, or lost its power."""
+    """Delete unfinished directories of processes that were killed or lost power."""
     for part in home.glob(f"{TABLES_PREFIX}*{_PART}"):
         with suppress(OSError):
             newest = max(each.stat().st_mtime for each in (part, *part.iterdir()))
@@ -237,18 +238,21 @@ def _drop_stale_parts(home: Path) -> None:
 
 
 def _drop_others(place: Path) -> None:
-    """Delete the tables of other states of the session. One that another question reads goes at the next time."""
+    """Delete the tables of other states of the session.
+
+    A file that another question is reading is deleted next time.
+    """
     for other in place.parent.glob(f"{TABLES_PREFIX}*"):
         if other != place and not other.name.endswith(_PART):
             shutil.rmtree(other, ignore_errors=True)
 
 
 def _homes(session: Path) -> Iterator[Path]:
-    """Yield where the tables may be: in the session, or for a folder that is read-only among temporary files."""
+    """Yield the places where the tables may be: in the session, or among temporary files if the folder is read-only."""
     home = session if session.is_dir() else session.parent / f".{session.name}"
     yield home
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
-    # Each user has a directory: another one's cannot be written.
+    # Each user has an own directory, because that of another user cannot be written.
     user = f"zenoh-car-fleet-tables-{os.getuid() if hasattr(os, 'getuid') else 0}"
     yield Path(tempfile.gettempdir()) / user / owner / session.name
 
@@ -299,7 +303,7 @@ class _State:
 
     def digest(self, session: Path) -> str:
         """Return the digest of this state. It reads the description."""
-        # Where a version names a column differently, all are made again.
+        # If a version names a column differently, all tables are made again.
         return _hash(_FORMAT, _layouts_text(), *self.segments, _described(session))
 
 
@@ -315,7 +319,7 @@ def _hash(*facts: str) -> str:
 
 
 def _described(session: Path) -> str:
-    """Return what the description says of the messages: from it follows what is missing. A new mark changes nothing."""
+    """Return the part of the description that is about the messages. A new mark does not change it."""
     info = SessionInfo.read(session)
     files = [each["file"] for each in indexed_segments(session)]
     told = None if info is None else (info.closed, info.messages, info.error, info.gone, info.origin)

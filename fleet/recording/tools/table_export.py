@@ -23,7 +23,7 @@ BATCH_BYTES: Final = 4 << 20
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
 STRAY_PREFIX: Final = "stray."
-"""Beginning of the names of tables with messages whose type is not the type of their key."""
+"""Prefix of tables with messages whose type is not the type of their key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,10 @@ class Exported:
 
 @dataclass(slots=True)
 class _Batch:
-    """Buffered messages of a table, by column: one object per row would cost a third more time in the collector."""
+    """Buffered messages of a table, by column.
+
+    One object per row would take a third more time for garbage collection.
+    """
 
     infos: list[ChannelInfo] = field(default_factory=list)
     log_ns: list[int] = field(default_factory=list)
@@ -157,7 +160,7 @@ class _Export:
                 self._write(table)
         for table in list(self.tables.values()):
             self._write(table)
-        if (None, False) in self.tables:  # what the others could not decode
+        if (None, False) in self.tables:  # messages that the other tables could not decode
             self.tables[None, False].write()
 
     def _write(self, table: _Table) -> None:
@@ -204,7 +207,7 @@ class _Export:
 
 
 def is_stray(info: ChannelInfo) -> bool:
-    """Return True if a channel has a protobuf type, and its key is ours and has another."""
+    """Return True if a channel's protobuf type is not the one that we use for its key."""
     own = own_type(info.channel.topic)
     return bool(own) and message_of(info) not in ("", own)
 
@@ -222,7 +225,7 @@ def own_type(key: str) -> str:
 def export(rows: Iterable[Row], out: Path, sink: type[FileSink]) -> Exported:
     """Write the tables of messages into an existing directory. Raises OSError if that fails, or FormatMissing.
 
-    After an error none of its files are left.
+    After an error, no files are left behind.
     """
     return _export(rows, lambda name, columns: sink(out / f"{name}{sink.ending}", columns))
 

@@ -1,7 +1,8 @@
-"""Writes tables as CSV with the standard library, as Parquet or into memory with pyarrow, imported only then.
+"""Writes tables as CSV with the standard library, or as Parquet and into memory with pyarrow.
 
-Times are UTC and say so: `2026-03-14T15:16:17.123456789Z` in CSV, `timestamp[ns, UTC]` in memory. Parquet has them in
-microseconds by default: DuckDB subtracts no times in nanoseconds (docs/explanation/measurements.md#mcap).
+Times are marked as UTC: `2026-03-14T15:16:17.123456789Z` in CSV, `timestamp[ns, UTC]` in memory. Parquet has
+microseconds by default, because DuckDB cannot subtract times in nanoseconds (docs/explanation/measurements.md#mcap).
+pyarrow is imported only when it is needed.
 """
 
 import csv
@@ -16,9 +17,9 @@ from fleet.recording.tools.tables import Column, ColumnKind, Values
 from schemas.suggestion import how_to_install
 
 MAX_ARROW_NS: Final = 2**63 - 1
-"""Last time that 64 bits of nanoseconds can hold: in the year 2262. The first is as long before 1970."""
+"""Last time that 64 bits of nanoseconds can hold: in the year 2262. The first one is as long before 1970."""
 MAX_CACHED_SECONDS: Final = 4096
-"""Maximum seconds cached as text."""
+"""Maximum number of seconds that are cached as text."""
 
 
 TimeUnit = Literal["us", "ns"]
@@ -33,20 +34,20 @@ class FormatMissing(ImportError):
 
 
 class Sink(Protocol):
-    """One table to fill; every method may raise OSError."""
+    """One table to fill. Every method may raise OSError."""
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
 
     @property
     def undated(self) -> int:
-        """Times that the format cannot hold. They are null."""
+        """Number of times that the format cannot hold. They are null."""
 
     def close(self) -> None:
         """End the table."""
 
     def discard(self) -> None:
-        """Remove the table, whole or not."""
+        """Remove the table, complete or not."""
 
 
 class FileSink(Sink, Protocol):
@@ -89,12 +90,12 @@ class CsvSink:
 
 
 def _part(path: Path) -> Path:
-    """Return the name of a file until it is whole."""
+    """Return the name that a file has until it is complete."""
     return path.with_name(f"{path.name}.part")
 
 
 def _remove(file: IO[Any], path: Path) -> None:
-    with suppress(OSError):  # the failed disk, which is why it is removed
+    with suppress(OSError):  # the disk has failed, which is why the file is removed
         file.close()
     for each in (_part(path), path):
         each.unlink(missing_ok=True)
@@ -127,7 +128,7 @@ def _times(column: Values) -> Values:
     seconds = _SecondTexts()
     try:
         return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}Z" for ns in column]
-    except (OverflowError, ValueError, OSError):  # some are not dates: the clock of another writer was wrong
+    except (OverflowError, ValueError, OSError):  # some are not dates, because the clock of another writer was wrong
         return [None if ns is None else _text_of_time(ns) for ns in column]
 
 
@@ -241,7 +242,7 @@ class ArrowSink:
         return self._pa.Table.from_batches(self._batches, self.schema)
 
     def close(self) -> None:
-        """Keep the rows."""
+        """Do nothing: the rows stay in memory."""
 
     def discard(self) -> None:
         """Forget the rows."""
@@ -284,14 +285,14 @@ class ParquetSink:
 
     def discard(self) -> None:
         """Remove the file."""
-        # An open writer would write its footer when it is collected.
+        # An open writer would still write its footer when it is garbage-collected.
         with suppress(OSError):
             self._writer.close()
         _remove(self._file, self._path)
 
     @property
     def undated(self) -> int:
-        """Times that the format cannot hold. They are null."""
+        """Number of times that the format cannot hold. They are null."""
         return self._arrow.undated
 
 

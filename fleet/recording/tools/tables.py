@@ -1,8 +1,9 @@
-"""Converts messages to tidy tables: one table per message type, one row per message. Pure; knows no file format.
+"""Converts messages to tidy tables: one table per message type, one row per message. Pure, without file formats.
 
 Every table begins with the same columns. `car` comes from the key, so the field of a message is left out. A field with
 a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are None.
-The request of a command has a column for each field (`request_motion`), None if another command was requested.
+The request of a command has a column for each field (`request_motion`). It is None if the request was for another
+command.
 """
 
 import json
@@ -69,7 +70,7 @@ OTHER_COLUMNS: Final = (
     Column("text", ColumnKind.TEXT),
     Column("data", ColumnKind.BYTES),
 )
-"""Columns of messages that are not protobuf: UTF-8 as text, anything else as bytes."""
+"""Columns of messages that are not protobuf: UTF-8 as text, other payloads as bytes."""
 
 _COLUMN_KINDS: Final = {
     FieldDescriptor.CPPTYPE_DOUBLE: ColumnKind.FLOAT,
@@ -118,7 +119,7 @@ class RequestColumns:
     FIELD: Final = "request"
 
     def __init__(self, descriptor: Any) -> None:
-        # The schema of the recording has the commands of its time.
+        # Use the commands of the recording's own schema, which may be older than ours.
         commands = {
             name.removesuffix("Command").lower(): command
             for name, command in descriptor.file.message_types_by_name.items()
@@ -130,7 +131,7 @@ class RequestColumns:
         for field in (each for command in commands.values() for each in command.fields if each.name not in event):
             fields.setdefault(field.name, field)
         self.columns = [Column(f"{self.FIELD}_unreadable", ColumnKind.TEXT)]
-        """The first one has the request as text (else hexadecimal) if it is not the message of its verb."""
+        """The first column has the request as text or hexadecimal if it cannot be parsed as the message of its verb."""
         self._fillers: dict[str, Callable[[Sequence[Any]], Values]] = {}
         for name, field in fields.items():
             unit = name.rpartition("_")[2]

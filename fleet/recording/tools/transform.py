@@ -1,4 +1,4 @@
-"""Makes new sessions from old ones: recovers a damaged one, cuts out a part, merges several. Never writes to old ones.
+"""Makes new sessions from old ones: recovers, cuts and merges them. Never changes the old sessions.
 
 A new session is written to a temporary directory and renamed at the end, so an interruption leaves no partial session.
 """
@@ -26,19 +26,19 @@ MAX_SEGMENT_PAYLOAD_BYTES: Final = 256 << 20
 
 
 class Exists(Exception):
-    """The new directory exists already. The message says what to do."""
+    """The new directory already exists. The message says what to do."""
 
 
 @contextmanager
 def atomic_directory(out: Path) -> Iterator[Path]:
-    """Yield a temporary directory, and rename it to `out` if no error occurs. Raises Exists if there is an `out`."""
+    """Yield a temporary directory, and rename it to `out` if no error occurs. Raises Exists if `out` is not empty."""
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise Exists(f"{out} is there already: name a new directory")
+        raise Exists(f"{out} already exists: name a new directory")
     out.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".new", dir=out.parent))
     try:
         new = scratch / out.name
-        new.mkdir()  # with default permissions: mkdtemp grants access only to us
+        new.mkdir()  # this one has default permissions: mkdtemp grants access only to us
         yield new
         if out.exists():
             out.rmdir()
@@ -58,7 +58,7 @@ def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int,
     """
     with atomic_directory(out) as new:
         count = _copy(watched(session.rows()), new, session)
-        # Read the damage after reading: it names the lost times then. A check of all CRCs would add nothing.
+        # Get the damage after reading, because then it names the lost times. A check of all CRCs would add nothing.
         words = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
             raise NoSession(f"{session.path} has no intact message: {words or 'it is empty'}")
@@ -95,7 +95,7 @@ def _sum(counts: Iterable[object]) -> int | None:
 
 
 def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Progress = iter) -> int:
-    """Write a part to a new session, and return its number of messages. `cars` selects their messages and all services.
+    """Write a part to a new session, and return its number of messages. With `cars`: messages of these and of services.
 
     Raises Exists, OSError, and NoSession if the part is empty.
     """
@@ -111,7 +111,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
         count = _copy(watched(part()), new, session)
         lost = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
-            raise NoSession(f"nothing of {session.path} lies there")
+            raise NoSession(f"{session.path} has no messages there")
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
         about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
         _described(session, new, count, about, selection).write(new)
@@ -122,9 +122,9 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
 def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> tuple[int, int, str]:
     """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
 
-    What several recorders received is written once: the same key, number, time of publication and payload. Return the
-    number of messages, of those that came again, and the losses in words. Raises Exists, OSError, and NoSession if the
-    sessions are of several fleets, or none has an intact message.
+    A message that several recorders received is written once. It is recognized by its key, number, publish time and
+    payload. Return the number of messages, the number of duplicates, and the losses in words. Raises Exists, OSError,
+    and NoSession if the sessions are of several fleets, or none has an intact message.
     """
     fleets = {each.description.fleet for each in sessions if each.description is not None}
     if len(fleets) > 1:
@@ -138,7 +138,9 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
 
     def once() -> Iterator[Row]:
         nonlocal twice
-        seen: set[int] = set()  # of 64 bits each: two of ten million messages are the same once in 400,000 merges
+        seen: set[int] = (
+            set()
+        )  # hashes of 64 bits: with ten million messages, two are equal by chance once in 400,000 merges
         for row in heapq.merge(*map(counted, range(len(sessions))), key=lambda row: row[2]):
             info, sequence, _, publish_ns, payload = row
             told = hash((info.channel.topic, sequence, publish_ns, payload))
@@ -170,7 +172,7 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
 
 
 def _losses(session: Session, count: int) -> str:
-    """Return in words what could not be read of a session, or was lost before. `count` messages were read."""
+    """Return the losses of a session in words: unreadable parts and earlier losses. `count` messages were read."""
     found = (session.damage_words, session.lost_extras, session.lacking(count), lost_words(session))
     return "; ".join(filter(None, found))
 
@@ -201,7 +203,7 @@ def _copy(rows: Iterable[Row], new: Path, session: Session, extras: Sequence[Ext
 def _described(
     session: Session, new: Path, count: int, origin: Mapping[str, object], selection: Selection = EVERYTHING
 ) -> session_dir.SessionInfo:
-    """Return the description of the new session, whose segments are in `new` already."""
+    """Return the description of the new session. Its segments must already be in `new`."""
     first = last = None
     fleet = ""
     for index in Session(new).indexes().values():
@@ -220,7 +222,7 @@ def _described(
         origin = {**origin, "cars": before["cars"]}
     gone = [each for each in session_dir.gone_of(old) if _has(selection, each["from"], each["to"])] if old else []
     if old is not None and gone:
-        words = f"the quota had taken {len(gone)} {'files' if len(gone) > 1 else 'file'}"
+        words = f"the quota had removed {len(gone)} {'files' if len(gone) > 1 else 'file'}"
         origin = {**origin, "lost": "; ".join(str(each) for each in (origin.get("lost"), words) if each)}
         origin["missing"] = _sum((origin.get("missing"), session_dir.gone_messages(old)))
     base = old if old is not None else session_dir.SessionInfo(fleet, time_spec.iso(first), "", {})
@@ -238,7 +240,7 @@ def _described(
         closed=True,
         messages=count,
         error="",
-        stops=None,  # of the old session
+        stops=None,  # the count is that of the old session
         format=session_dir.FORMAT_VERSION,
         origin=origin,
     )
@@ -253,7 +255,7 @@ def _copy_others(session: Session, new: Path) -> None:
 
 
 def _has(selection: Selection, begin: object, end: object) -> bool:
-    """Return True if a stored span of time has a moment in the selection, or is invalid: somebody wrote it."""
+    """Return True if a stored span of time overlaps the selection, or if it is invalid, as after an edit by hand."""
     try:
         return selection.overlaps(time_spec.iso_ns(str(begin)), time_spec.iso_ns(str(end)))
     except (ValueError, OverflowError):

@@ -17,9 +17,9 @@ from schemas.local_time import exact
 from schemas.printable import printable
 
 MAX_CLOCK_OFFSET_S: Final = 0.5
-"""Maximum offset of a publisher's clock from the recorder's that is not reported."""
+"""Maximum offset between the publisher's and the recorder's clock that is not reported."""
 MAX_LISTED_LINES: Final = 20
-"""Maximum gaps to print; --json lists all."""
+"""Maximum number of gaps to print. --json lists all."""
 
 
 @dataclass(slots=True)
@@ -52,15 +52,15 @@ class SessionVerdict:
     lost: str = ""
     """Losses of the session from which this one was made."""
     gone: list[dict[str, Any]] = field(default_factory=list)
-    """Files that the quota has taken. Gaps there are in them and not in `missing`."""
+    """Files that the quota has removed. The gaps that this makes are not listed in `missing`."""
     recording: bool = False
-    """True if the session grew during the verification: its end is still to come."""
+    """True if the session grew during the verification, so that it has no end yet."""
     missing: list[dict[str, Any]] = field(default_factory=list)
-    """Gaps by key and publisher: sequence numbers, and the times between which they should have come."""
+    """Gaps by key and publisher: sequence numbers, and the times between which these messages should have come."""
     twice: list[dict[str, Any]] = field(default_factory=list)
     """Duplicates by key and publisher."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """Messages by key that the recorder dropped for want of space."""
+    """Messages by key that the recorder dropped for lack of space."""
     missed: dict[str, int] = field(default_factory=dict)
     """Messages by key that never reached the recorder, by its own count."""
     undecoded: dict[str, int] = field(default_factory=dict)
@@ -89,7 +89,7 @@ class SessionVerdict:
         return {"whole": self.whole, "missing_count": self.missing_count, **asdict(self)}
 
     def words(self) -> Iterable[str]:
-        """Yield the lines of the report; the first is the verdict."""
+        """Yield the lines of the report. The first one is the verdict."""
         length = time_spec.words(max(self.last_ns - self.first_ns, 0) / 1e9)
         span = f", {exact(self.first_ns)} to {exact(self.last_ns)} ({length})" if self.messages else ""
         state = "whole" if self.whole else "NOT whole"
@@ -103,7 +103,7 @@ class SessionVerdict:
         if self.ended:
             yield f"  end: {self.ended}"
         for one in self.gone:
-            yield f"  gone for the quota: {one['file']}, {one['from']} to {one['to']}"
+            yield f"  removed by the quota: {one['file']}, {one['from']} to {one['to']}"
         for one in self.missing[:MAX_LISTED_LINES]:
             yield f"  missing: {_missing_words(one)}"
         if len(self.missing) > MAX_LISTED_LINES:
@@ -244,7 +244,7 @@ def verify(
     verifier.end()
     read = dict(session.damage)
     session.check()
-    # Damage found by reading names the lost messages, so it overrides damage found by CRC.
+    # Damage that reading finds names the lost messages, so it replaces damage that the CRC check finds.
     verdict.damage = {path.name: words for path, words in sorted((session.damage | read).items())}
     description = session.description
     if description is not None and (gone := session_dir.gone_of(description)):

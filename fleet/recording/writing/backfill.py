@@ -1,22 +1,23 @@
 """Requests messages that a recorder missed from the caches of their publishers. session_writer.py drops duplicates.
 
-A recording with holes is worst exactly where it matters: the moment when the network broke is the moment that somebody
-will want to look at. A subscriber alone cannot help that, since what was published while it was away is gone. So each
-publisher keeps what it said last: ten seconds at the rate of its topic, at least a hundred publications
-(`Topic.cache_size`), which is minutes of a state and hours of an event.
+A recording has holes exactly where they matter most: the moment when the network broke is the moment that somebody will
+want to look at. A subscriber alone cannot prevent that, because messages that were published while it was away are
+gone. So each publisher caches its last publications: ten seconds at the rate of its topic, but at least a hundred
+(`Topic.cache_size`). For a state this is minutes, for an event hours.
 
-When to ask? After the recorder's own link to the hub is back; after a gap in the numbers of a publisher, which is how
-one notices that it was the *car* that was cut off; and at the start, when an interrupted session goes on. One question
-is not enough. Others reconnect half a second later than we do, and on a loaded machine later still, so each cause plans
-several questions (`QUERY_AFTER_...`). The answers overlap, and that is fine: every message has a number, and the writer
-knows which ones it has.
+When should the recorder ask? After its own link to the hub is back. After a gap in the numbers of a publisher, which
+shows that the *car* was cut off. And at the start, if it continues an interrupted session. One query is not enough,
+because others may reconnect half a second later than we do, and on a loaded machine even later. So each cause plans
+several queries (`QUERY_AFTER_...`). Their answers overlap, but that does no harm: every message has a number, and the
+writer knows which ones it has.
 
-From when on? The window of a question is relative ("the last 13 s") and is counted by the publisher when the question
-arrives, with its own clock. That survives a clock that is wrong by an hour, which an absolute time would not. But it
-means that every delay of the question moves the window on, at the end where the oldest missing message is. So the
-length is counted anew for each key, right before it is asked, and has a margin for the way.
+How far back should it ask? The window of a query is relative ("the last 13 s"), and the publisher counts it back from
+the arrival of the query, with its own clock. So it works even if that clock is wrong by an hour, unlike an absolute
+time. But every delay of the query moves the window forward, and the oldest missing message falls out of it. So the
+length of the window is computed anew for each key, just before its query, and has a margin for the delay.
 
-What cannot be had again is said: the writer counts it, the status shows it, and `sessions verify` names it.
+Messages that cannot be fetched are not hidden: the writer counts them, the status shows the count, and `sessions
+verify` lists the gaps.
 """
 
 import threading
@@ -32,9 +33,11 @@ from schemas.bus import Bus
 
 BACKFILL_POLL_INTERVAL_S: Final = 0.2
 QUERY_AFTER_START_S: Final = (1.0,)
-"""Delay of the query after the start: a publisher that started with us may have missed our subscription."""
+"""Delay of the query after the start. It is for publishers that started with us and may have missed our
+subscription."""
 QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
-"""Delays of the queries after a reconnect: others retry within half a second, and a loaded machine delays them."""
+"""Delays of the queries after a reconnect. Others retry within half a second, and a loaded machine delays them
+further."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
 GAP_MARGIN_S: Final = 2.0
 """Time that the network may have taken for the last message before a gap, and takes for the query: a publisher counts
@@ -42,9 +45,9 @@ the window from when the query arrives."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
 MAX_SINGLE_KEYS: Final = 16
-"""Maximum keys to query one by one. For more keys, query everything."""
+"""Maximum number of keys to query one by one. If there are more, query everything."""
 MAX_ANSWERS: Final = 200_000
-"""Maximum answers in the queue to the writer. The rest is a gap again, and requested again."""
+"""Maximum number of answers in the queue to the writer. The rest stays a gap, and is requested again."""
 
 
 class Backfill:
@@ -78,7 +81,7 @@ class Backfill:
     def request(self, keys: Mapping[str, float]) -> None:
         """Request a backfill of these keys. Values: age of the last message before the gap, s.
 
-        A car may have been cut off for long. Its gateway goes on, and others hear it again only after that.
+        The gap may be long: while a car is cut off, its gateway keeps publishing, and others hear it only after that.
         """
         now = time.monotonic()
         with self._lock:
@@ -131,7 +134,8 @@ class Backfill:
         query_all = self._query_all or len(self._keys) > MAX_SINGLE_KEYS
         for expression in self._all if query_all else sorted(self._keys):
             found = []
-            # Counted anew for each: on a bad network the answers to one take seconds, and its window would move on.
+            # Compute the window anew for each key: on a bad network, the answers for one key take seconds, and the
+            # window of the next one would be too short.
             for sample in self._bus.recall(expression, time.monotonic() - self._missing_since):
                 found.append(sample)
                 if len(found) + len(self._answers) > MAX_ANSWERS:

@@ -1,4 +1,4 @@
-"""The space on a recorder's disk: how much is free, how much each step needs, and the words if there is less."""
+"""The space on a recorder's disk: how much is free, how much each step needs, and texts for a lack of space."""
 
 import os
 import shutil
@@ -13,23 +13,22 @@ FREE_WARNING_FACTOR: Final = 4
 MIN_START_BYTES: Final = 500_000
 """Minimum free space above the reserve to begin a session."""
 MAX_RESUME_BYTES: Final = 5 * MB
-"""Maximum space above the reserve to wait for before resuming. With less, files of a second follow each other.
-
-More would keep a small disk, on which a session can begin, from ever recording again."""
+"""Maximum space above the reserve to wait for before resuming. If it were less, the recorder would write one file of a
+second after the other. If it were more, recording might never resume on a small disk."""
 PROBE_BYTES: Final = 4096
-"""Size of the file that tries whether a directory takes files: a block of most disks."""
+"""Size of the test file that shows whether a directory can be written: one block of most disks."""
 MIN_CLOSE_BYTES: Final = 200_000
 """Minimum free space to write the end of a session: the index of its last file needs it."""
 
 
 def free_bytes(path: Path) -> int:
-    """Return the free space on the disk where `path` is or would be. Raises OSError if the system does not tell it."""
+    """Return the free space on the disk where `path` is or would be. Raises OSError if it cannot be determined."""
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
 
 
 @dataclass(frozen=True, slots=True)
 class Reserve:
-    """The space that a recording leaves free. If less is free, it pauses."""
+    """The space that a recording leaves free. If less is free, the recording pauses."""
 
     bytes: int = 50 * MB
 
@@ -40,16 +39,16 @@ class Reserve:
 
     @property
     def to_resume(self) -> int:
-        """Free space at which a paused recording goes on."""
+        """Free space at which a paused recording continues."""
         return self.bytes + max(min(self.bytes, MAX_RESUME_BYTES), MIN_START_BYTES)
 
     @property
     def to_end(self) -> int:
-        """Free space that must stay when a file ends."""
+        """Free space that must remain when a file is ended."""
         return self.bytes + MIN_CLOSE_BYTES
 
     def why_broken(self, free: int) -> str:
-        """Return why recording pauses with this much free space. Empty if it need not."""
+        """Return why recording must pause with this much free space. Empty if it need not."""
         broken = f"{free / MB:.1f} MB are left on the disk, {self.bytes / MB:g} MB must stay free"
         return broken if free < self.bytes else ""
 
@@ -59,7 +58,10 @@ class Reserve:
         return "" if plenty else f"{root}: the disk is nearly full, {free / MB:.0f} MB are left"
 
     def why_unwritable(self, root: Path) -> str:
-        """Return why no session can begin in this directory, which is made if it is missing. Empty if one can."""
+        """Return why no session can begin in this directory. Empty if one can.
+
+        The directory is created if it is missing.
+        """
         try:
             root.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=root) as file:

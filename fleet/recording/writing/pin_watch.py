@@ -1,11 +1,11 @@
-"""Finds what is to be pinned, in the messages as they come: conditions of the fleet file, and stops. Pure.
+"""Finds the times to pin in the messages as they come: conditions of the fleet file, and stops. Pure.
 
-Conditions have the meaning of `fleet find`: the same evaluator gets the same readings with their own times. A pin is
-on the recorder's clock, as its files are: so it lies around the moment at which the reading came. A backfilled
-reading came late, and its file is that of its coming: its pin lies around its own time, and lasts until it came.
+Conditions are evaluated as in `fleet find`: the same evaluator gets the same readings with their own times. Pins are on
+the recorder's clock, like its files. So a pin lies around the moment at which the reading came. A backfilled reading
+came late and is in a later file. So its pin lies around the reading's own time, and lasts until it came.
 
-A STOP of all cars is one command with one id, reported by each gateway. So it is known by its second car, or by its
-only one if there are no others.
+A STOP of all cars is one command with one id, which each gateway reports. So it is recognized when a second car reports
+it, or the only car if there are no others.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -30,17 +30,20 @@ _EVENTS: Final = ("event/command", "event/log")
 
 
 class ConditionPins:
-    """The pins of conditions, from readings that come in the order of their times; those out of order do not count."""
+    """The pins of conditions, from readings in the order of their times. Readings out of order do not count."""
 
     def __init__(self, rules: Sequence[PinRule]) -> None:
         self._rules = rules
         self._cars: dict[str, list[CarCondition]] = {}
         """The conditions of the rules, by car."""
         self.topics: Collection[str] = {topic_of(name) for rule in rules for name in rule.condition.names}
-        """The topics that they use."""
+        """The topics that the conditions use."""
 
     def add(self, car: str, topic: str, message: Any, at_ns: int, came_ns: int) -> Iterable[Pin]:
-        """Take in a reading, and yield pins. `at_ns` is its own time, `came_ns` the recorder's time for it."""
+        """Evaluate a reading, and yield pins.
+
+        `at_ns` is its own time, `came_ns` the recorder's time at which it came.
+        """
         if car not in self._cars:
             self._cars[car] = [CarCondition(rule.condition) for rule in self._rules]
         for rule, condition in zip(self._rules, self._cars[car], strict=True):
@@ -59,7 +62,7 @@ class PinWatch:
         self._rules = rules
         self._conditions = ConditionPins(rules)
         self._keys: dict[str, tuple[str, str] | None] = {}
-        """Car and topic of each key, or None if it is of no use here."""
+        """Car and topic of each key, or None if the key is not watched."""
         self._cars: set[str] = set()
         self._stopped: dict[str, set[str]] = {}
         """The cars that each stop has reached, by its id."""
@@ -78,13 +81,13 @@ class PinWatch:
             return wanted
 
     def add(self, key: str, encoding: str, payload: bytes, published_ns: int, came_ns: int) -> list[Pin]:
-        """Take in a message that came just now, and return what it pins."""
+        """Evaluate a message that came just now, and return its pins."""
         return self._add(self._conditions, key, encoding, payload, published_ns, came_ns)
 
     def add_late(self, batch: Iterable[tuple[int, str, str, bytes]], came_ns: int) -> Iterator[Pin]:
-        """Take in backfilled messages (time, key, encoding, payload), and yield what they pin.
+        """Evaluate backfilled messages (time, key, encoding, payload), and yield their pins.
 
-        Conditions see them by themselves, in the order of their times.
+        Conditions get only these messages, in the order of their times.
         """
         late = ConditionPins(self._rules)
         for published_ns, key, encoding, payload in sorted(batch):

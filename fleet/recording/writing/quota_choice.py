@@ -1,13 +1,14 @@
-"""Decides what the quota takes when the sessions are too large together. Pure; quota_removal.py removes it.
+"""Decides what the quota removes when the sessions together are too large. Pure; quota_removal.py removes the files.
 
 The unit is a segment: a file, with a quota of one minute. A segment is pinned if a pin of any session of its fleet
 touches its time, because the time before a pin may be in another session.
 
-Unpinned segments go first, the oldest of all sessions. Pinned ones may have half of the quota: if they have more, the
-oldest of them go before anything else. So a condition that is always true leaves room for what comes. Tables for
-questions go with the first segment of their session, as they are of no use then. If no other segment is left, all
-tables go, which can be made again. What is pinned stays within its half, even where marked sessions, which stay whole,
-leave less than that: all together are more than the quota then, and the recorder says so.
+Unpinned segments are removed first, the oldest of all sessions before the others. Pinned segments may fill half of the
+quota. If they fill more, the oldest of them are removed before anything else. So even if a condition is always true,
+there is room for new recordings. The tables of a session (for SQL questions) are removed with its first segment,
+because they no longer fit. If only pinned segments are left, all tables are removed, because they can be made again.
+Pinned segments may fill their half even if marked sessions, which are never removed, fill the rest: then everything
+together exceeds the quota, and the recorder warns.
 """
 
 from bisect import bisect_right
@@ -16,11 +17,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 PINNED_SHARE: Final = 0.5
-"""Maximum share of the quota that pinned segments have: the other half is for what comes."""
+"""Maximum share of the quota for pinned segments. The other half is for new recordings."""
 
 
 class Spans:
-    """Times of pins, as one search."""
+    """Merged times of pins, for a fast search."""
 
     def __init__(self, spans: Iterable[tuple[int, int]]) -> None:
         self._begins: list[int] = []
@@ -33,7 +34,7 @@ class Spans:
                 self._ends.append(end_ns)
 
     def touch(self, begin_ns: int, end_ns: int) -> bool:
-        """Return True if one of them has a moment in common with this time."""
+        """Return True if one of them overlaps this span of time."""
         index = bisect_right(self._begins, end_ns) - 1
         return index >= 0 and self._ends[index] >= begin_ns
 
@@ -54,31 +55,31 @@ class StoredSegment:
 
 @dataclass(frozen=True, slots=True)
 class StoredSession:
-    """A session that the quota may take from."""
+    """A session from which the quota may remove files."""
 
     name: str
     segments: tuple[StoredSegment, ...]
     table_bytes: int = 0
-    """Size of its tables for questions."""
+    """Size of its tables for SQL questions."""
     other_bytes: int = 0
-    """Size of its other files. They go with its last segment."""
+    """Size of its other files. They are removed with its last segment."""
 
 
 @dataclass(slots=True)
 class Taking:
-    """Segments, tables and whole sessions that go for the quota, in this order."""
+    """Segments, tables and whole sessions that the quota removes, in this order."""
 
     segments: list[StoredSegment] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)
     """Sessions that lose their tables."""
     removed: list[str] = field(default_factory=list)
-    """Sessions that lose all."""
+    """Sessions that are removed as a whole."""
     freed: int = 0
     """Size of all of it, bytes."""
 
 
 def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:
-    """Return what to take so that `over` bytes are free. It is less if that is not enough."""
+    """Return what to remove so that `over` bytes are freed, or less if there is not enough to remove."""
     taking = Taking()
     stored = {session.name: session for session in sessions}
     left = {session.name: len(session.segments) for session in sessions}
@@ -101,7 +102,7 @@ def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:
             taking.freed += stored[segment.session].other_bytes
 
     for session in sessions:
-        if not session.segments and taking.freed < over:  # its recorder was killed before the first
+        if not session.segments and taking.freed < over:  # its recorder was killed before the first segment
             taking.removed.append(session.name)
             taking.freed += session.table_bytes + session.other_bytes
     for segment in pinned:

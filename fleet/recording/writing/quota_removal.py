@@ -1,7 +1,7 @@
-"""Removes what is too much for the quota of a recorder (fleet/quota.py).
+"""Removes recordings that exceed the quota of a recorder (fleet/quota.py). quota_choice.py decides what is removed.
 
-quota_choice.py decides what goes. What is gone is listed: the segments of a session in its session.json, whole sessions
-in `removed.json` beside them.
+All removals are listed: segments in the session.json of their session, whole sessions in `removed.json` beside the
+sessions.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from fleet.recording.writing.disk_space import MB
 from fleet.recording.writing.quota_choice import Spans, StoredSegment, StoredSession, Taking, choose
 
 MAX_REMOVED: Final = 1000
-"""Maximum removed sessions that `removed.json` lists, the newest: 200 bytes each."""
+"""Maximum number of removed sessions in `removed.json`, with 200 bytes each. The newest ones are listed."""
 _UNCLOSED_IN_USE_S: Final = 60.0
 """Age below which an unclosed session may still belong to another recorder."""
 
@@ -33,7 +33,7 @@ class Enforced:
     """Result of one enforcement of the quota."""
 
     removed: list[Path] = field(default_factory=list)
-    """Sessions of which nothing is left."""
+    """Sessions that were removed as a whole."""
     news: list[str] = field(default_factory=list)
     """News for a person: each removed session, and the first minutes that a session loses."""
     warning: str = ""
@@ -43,11 +43,11 @@ class Enforced:
 def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> Enforced:
     """Remove segments below `root` until all sessions fit.
 
-    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: those of
-    `keep`, whose session.json may not have them yet.
+    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: the pins of
+    `keep`, because its session.json may not have them yet.
     """
     done = Enforced()
-    if not quota.total:  # without a look at the disk
+    if not quota.total:  # do not even look at the disk
         return done
     paths = [path.parent for path in root.glob(f"*/{SESSION_FILE}")]
     over = quota.excess(sum(map(_size, paths)))
@@ -100,11 +100,14 @@ def _start_ns(info: SessionInfo) -> int:
 
 
 def _segment(file: Path, entry: Mapping[str, Any] | None, before_ns: int) -> StoredSegment:
-    """Return the facts of a segment. entry: of index.json; before_ns: the end of the one before. Raises OSError."""
+    """Return the facts about a segment. entry: its entry in index.json. before_ns: end of the previous segment.
+
+    Raises OSError.
+    """
     state = file.stat()
     first_ns, last_ns, messages = ((entry or {}).get(name) for name in ("first_ns", "last_ns", "messages"))
     if not (isinstance(first_ns, int) and isinstance(last_ns, int) and isinstance(messages, int)):
-        # A file without an index ends when it was written last.
+        # For a file without an index, use the time of its last write as its end.
         first_ns, last_ns, messages = before_ns, max(state.st_mtime_ns, before_ns), None
         with contextlib.suppress(NotMcap):
             index = McapReader(file).index()
@@ -117,7 +120,7 @@ def _segment(file: Path, entry: Mapping[str, Any] | None, before_ns: int) -> Sto
 
 
 def _take(session: Path, info: SessionInfo, taking: Taking, done: Enforced) -> int:
-    """Take from one session, and return the freed size in bytes. 0 if it cannot be changed."""
+    """Remove the chosen files of one session, and return the freed size in bytes. 0 if it cannot be changed."""
     before = _size(session)
     segments = [each for each in taking.segments if each.session == session.name]
     try:
@@ -125,7 +128,7 @@ def _take(session: Path, info: SessionInfo, taking: Taking, done: Enforced) -> i
             _remove(session)
             done.removed.append(session)
             done.news.append(f"{session} is removed, the oldest session without a mark: the quota is full")
-            with contextlib.suppress(OSError):  # the disk is full: the news says it, too
+            with contextlib.suppress(OSError):  # the disk is full, but the news names the session, too
                 _list_removed(session, info, segments)
             return before
         for tables in session.glob(f"{session_dir.TABLES_PREFIX}*"):
@@ -134,16 +137,23 @@ def _take(session: Path, info: SessionInfo, taking: Taking, done: Enforced) -> i
             had_pinned = any(each.get("pinned") for each in info.gone)
             _remove_segments(session, segments)
             if not info.gone:
-                done.news.append(f"{session}: the quota is full and takes its minutes, the oldest unpinned ones first")
+                done.news.append(
+                    f"{session}: the quota is full, so its minutes are removed, the oldest unpinned ones first"
+                )
             if not had_pinned and any(each.pinned for each in segments):
-                done.news.append(f"{session}: pinned minutes are gone, too: pins have at most half of the quota")
-    except OSError:  # perhaps another user's; the warning reports the excess
+                done.news.append(
+                    f"{session}: pinned minutes were removed, too, because pins may fill only half of the quota"
+                )
+    except OSError:  # perhaps it belongs to another user; the warning reports the excess
         pass
     return before - _size(session)
 
 
 def _remove_segments(session: Path, segments: Iterable[StoredSegment]) -> None:
-    """Delete segments, and list them in session.json first: else they would be damage. Raises OSError."""
+    """Delete segments. List them in session.json first, because otherwise they would count as damage.
+
+    Raises OSError.
+    """
     gone = [
         {
             "file": each.file,
@@ -166,7 +176,7 @@ def _remove_segments(session: Path, segments: Iterable[StoredSegment]) -> None:
 
 
 def _list_removed(session: Path, info: SessionInfo, segments: Iterable[StoredSegment]) -> None:
-    """Add a session to the list of those that are removed. Raises OSError."""
+    """Add a session to the list of removed sessions. Raises OSError."""
     gone = session_dir.gone_of(info)
     times = [(each["from"], each["to"]) for each in gone] + [
         (iso(each.begin_ns), iso(each.end_ns)) for each in segments
@@ -192,7 +202,7 @@ def _remove(session: Path) -> None:
     except OSError as error:
         if error.errno != errno.ENOTEMPTY:
             raise
-        shutil.rmtree(session)  # a question was making its tables in it, and fails now
+        shutil.rmtree(session)  # a question was writing its tables there, and fails now
 
 
 def _size(session: Path) -> int:
@@ -208,7 +218,7 @@ def _may_go(session: Path, description: SessionInfo) -> bool:
     if description.kept:
         return False
     try:
-        # Not session.json if there is a segment: the quota itself writes it.
+        # Do not look at session.json if there is a segment, because the quota itself writes it.
         files = [*session.glob(session_dir.SEGMENTS)] or [session / SESSION_FILE]
         newest = max(each.stat().st_mtime for each in files)
     except OSError:

@@ -1,8 +1,8 @@
 """The clock of a recorder's receive times: the wall clock, but it never goes back. No I/O.
 
-Readers sort by receive time. If somebody sets the wall clock back by an hour, a session would tell two hours at once: a
-replay would mix them, and `sessions verify` would find gaps. So receive times go on, and only the publish times follow
-the clock. The next recorder begins with the time of the wall clock again.
+Readers sort by receive time. If receive times followed a wall clock that is set back by an hour, a session would
+contain the same hour twice: a replay would mix the two, and `sessions verify` would find gaps. So receive times keep
+running, and only the publish times follow the clock. The next recorder starts at the wall clock again.
 """
 
 import time
@@ -10,11 +10,12 @@ from collections.abc import Callable
 from typing import Final
 
 SET_BACK_NS: Final = 1_000_000_000
-"""Minimum by which a wall clock is set back. NTP corrects less than this slowly, and the receive times follow it."""
+"""Minimum backward step that counts as a wall clock being set back. NTP corrects smaller errors slowly, and the receive
+times follow these corrections."""
 
 
 class ReceiveClock:
-    """Follows the wall clock forward, also over a sleep of the computer."""
+    """A clock that follows the wall clock forward, also over a sleep of the computer."""
 
     def __init__(
         self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
@@ -25,7 +26,7 @@ class ReceiveClock:
         self._ahead_ns = self._last_ns - monotonic_ns()
 
     def ns(self) -> int:
-        """Return the time, ns since the epoch; never less than before."""
+        """Return the time, ns since the epoch. It is never less than before."""
         monotonic_ns = self._monotonic_ns()
         ahead_ns = self._wall_ns() - monotonic_ns
         if ahead_ns > self._ahead_ns - SET_BACK_NS:

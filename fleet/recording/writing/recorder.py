@@ -1,8 +1,8 @@
 """Records all messages of one fleet into sessions. The recorder is one more subscriber and has no policy.
 
 It runs three threads:
-- The reader drains the subscriptions and never touches a disk. So a hanging disk shows as drops here and does not
-  stall the publishers.
+- The reader drains the subscriptions and never touches a disk. So if the disk hangs, messages are dropped here, but the
+  publishers do not stall.
 - The backfill asks publishers for missed messages (backfill.py).
 - The writer writes (session_writer.py), flushes and publishes the status every second, and answers queries.
 """
@@ -40,23 +40,24 @@ from schemas.words import Level, RecorderState, RecorderVerb
 
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum size of the queue to the writer: some seconds of 100 cars, and little memory for a small computer."""
+"""Maximum size of the queue to the writer. This is some seconds of 100 cars, and little memory even for a small
+computer."""
 FLUSH_INTERVAL_S: Final = 1.0
-"""Interval of flush and status, and the most that a crash loses."""
+"""Interval of flush and status. A crash loses at most the messages of this time."""
 READ_INTERVAL_S: Final = 0.01
-"""Interval at which subscriptions are drained. A log_time has this resolution; a publish_time is exact."""
+"""Interval at which subscriptions are drained. A log_time has this resolution, while a publish_time is exact."""
 WRITE_INTERVAL_S: Final = 0.05
 """Interval at which the queue is written."""
 SUBSCRIBER_QUEUE_SIZE: Final = 16_384
-"""Maximum messages in the queue of one subscription: three seconds of 100 cars."""
+"""Maximum number of messages in the queue of one subscription: three seconds of 100 cars."""
 MAX_READ_BATCH: Final = 4_096
-"""Maximum messages read from one subscription before the next one."""
+"""Maximum number of messages that are read from one subscription before the next one."""
 SHUTDOWN_DRAIN_S: Final = 0.3
-"""Time at shutdown for messages that are still in transit, and timeout of the hub's answer after it."""
+"""Time at shutdown for messages in transit, and then the timeout for an answer of the hub."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""Maximum delay of both together. Beyond it, hub or recorder stood still, and the time starts again."""
+"""Maximum delay of both together. After a longer delay, hub or recorder stood still, and both are done again."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
-"""Maximum time for all of it, on a machine that stays too busy."""
+"""Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
 
 
@@ -114,7 +115,8 @@ class Recorder:
         self._options = options or Options()
         self._pin_rules = pins
         self._read_people = people
-        """Returns the people in the fleet file, who may start and stop. None means those whom the gateways know."""
+        """Returns the people in the fleet file, who may start and stop. If None, the people that the gateways know
+        may."""
         self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes
@@ -146,7 +148,7 @@ class Recorder:
             self._subscribers.append(self._bus.subscribe_channel(expression, SUBSCRIBER_QUEUE_SIZE))
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._overflow: dict[tuple[str, Hashable], tuple[int, int]] = {}
-        """Messages that did not fit the queue: their count and the last number, by key and sender."""
+        """Messages that did not fit into the queue, by key and sender: their count and the number of the last one."""
         session = self._session.path
         self._service.declare_publishers()
         self._last = self._status()
@@ -296,17 +298,17 @@ class Recorder:
             self._add_backfilled(backfilled)
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
-            if self._session.gaps and has_room:  # a writer that is behind would only fall behind further
+            if self._session.gaps and has_room:  # a writer that is behind would only fall further behind
                 now_ns = self._now()
                 self._backfill.request({key: (now_ns - before) / 1e9 for key, before in self._session.gaps.items()})
                 self._session.gaps.clear()
-        # Only now: messages count against the limit until they are written.
+        # Do this last, because messages count against the limit until they are written.
         with self._lock:
             self._queued_messages -= len(batch)
             self._queued_bytes -= sum(len(item[1]) for item in batch)
 
     def _pin(self, batch: Sequence[_Item]) -> None:
-        """Pin what is worth it in messages that have come."""
+        """Add the pins that new messages cause."""
         watch = self._pin_watch
         for key, payload, encoding, stamp, _, received_ns in batch:
             if watch.is_watched(key):
@@ -315,9 +317,9 @@ class Recorder:
                     self._session.pin(pin)
 
     def _take_marks(self, batch: Sequence[_Item]) -> None:
-        """Keep the session also for the marks that the recorder of another site has set."""
+        """Add marks that the recorder of another site has set, so that this session is kept, too."""
         if self._service.speaks_for_fleet:
-            return  # it sets them itself
+            return  # this recorder sets the marks itself
         for key, payload, encoding, _, _, received_ns in batch:
             if key == self._service.mark_key:
                 with contextlib.suppress(messages.BadPayload, OSError):  # the message itself is recorded in any case
@@ -357,12 +359,13 @@ class Recorder:
         self._report_news(session)
 
     def _report_news(self, session: SessionWriter) -> None:
-        """Notify of what the quota took, and each failed copy and new state once."""
+        """Report removals by the quota, failed copies, and each new state once."""
         for words in (*session.quota_news, *session.uncopied):
             self._notify(words)
         session.quota_news.clear()
         session.uncopied.clear()
-        # Numbers in the words change all the time: a pause is news once, a warning once for each text before its comma.
+        # Numbers in the texts change all the time. So report a pause once, and a warning once for each text before its
+        # comma.
         now = {"full": session.full} if session.full else {}
         if session.warning:
             now["warning"] = session.warning.partition(",")[0]
@@ -452,7 +455,10 @@ class Recorder:
                 raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(RecorderVerb)}.")
 
     def _check_sender(self, query: zenoh.Query, verb: str) -> None:
-        """Refuse a command that is for leads, by the same rule as the plan. Without `people:` everyone may."""
+        """Refuse a command that only leads may send, by the same rule as for the plan.
+
+        Without `people:` everyone may.
+        """
         people = self._people()
         if people.roles is None:
             return
@@ -483,7 +489,7 @@ class Recorder:
         except OSError as error:
             raise _CommandRefused(f"No session can be made in {self._root}: {error.strerror}") from None
         self._recording = True
-        self._pin_watch = PinWatch(self._pin_rules)  # what came meanwhile is not known
+        self._pin_watch = PinWatch(self._pin_rules)  # messages that came meanwhile were not watched
         self._publish()
 
     def _stop_session(self) -> None:
@@ -504,7 +510,9 @@ class Recorder:
         except (ValueError, KeyError, TypeError, AttributeError):
             raise _CommandRefused('A mark is JSON, such as {"text": "the cat came", "by": "me"}') from None
         if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
-            raise _CommandRefused(f"text needs 1 to {MAX_MARK_CHARACTERS} characters, by at most {MAX_MARK_CHARACTERS}")
+            raise _CommandRefused(
+                f"`text` must have 1 to {MAX_MARK_CHARACTERS} characters, `by` at most {MAX_MARK_CHARACTERS}"
+            )
         now = self._now()
         self._service.publish_mark(messages.log_message(now, Level.INFO, by, text), now)
         with contextlib.suppress(OSError):  # the disk is full: the bus has the mark, and `close` writes it

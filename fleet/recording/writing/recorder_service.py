@@ -1,10 +1,10 @@
 """Publishes the status and the marks of a recorder, answers questions, and declares its token.
 
-A fleet has one recorder, and one more at each other site (`fleet record --site north`). All of them record all that
-they can see. Commands of people go to one of them: that of the fleet where it can be reached, else the site with the
-first name. So while two sites are cut off from one another, marks are set and the status is told on both sides.
+A fleet has one recorder, and one more at each other site (`fleet record --site north`). Each records all messages that
+reach it. Commands of people go to one of them: to the fleet's recorder if it can be reached, or else to the recorder of
+the site whose name sorts first. So while two sites are cut off from each other, marks and status work on both sides.
 
-The recorder of a site tells its status under a key of its own, too: `fleet/@recorder/north/status`.
+The recorder of a site also publishes its status under its own key, `fleet/@recorder/north/status`.
 """
 
 import contextlib
@@ -29,9 +29,9 @@ class AnotherRecorder(Exception):
 
 
 def speaks_for_fleet(site: str, others: Iterable[str]) -> bool:
-    """Return True if a recorder carries out the commands for the fleet, beside others. A site is empty for the first.
+    """Return True if the recorder of `site` carries out the commands for the fleet. `others` are the other sites.
 
-    Each recorder decides it by itself from the tokens that it sees.
+    The site of the fleet's own recorder is empty. Each recorder decides this for itself, by the tokens that it sees.
     """
     return all(site <= other for other in others)
 
@@ -48,7 +48,7 @@ class RecorderService:
         self._fleet_status = f"{fleet}/{STATUS_TOPIC.name}"
         self.mark_key = f"{fleet}/{MARK_TOPIC.name}"
         self._others: set[str] = set()
-        """Sites of the other recorders that are there."""
+        """Sites of the other recorders on the bus."""
         self._lock = threading.Lock()
 
     def refuse_a_second(self) -> None:
@@ -67,21 +67,21 @@ class RecorderService:
 
     def declare_publishers(self) -> None:
         """Declare the publishers."""
-        status = dict.fromkeys((self._fleet_status, self._own_status))  # the same but at another site
+        status = dict.fromkeys((self._fleet_status, self._own_status))  # the two keys are equal, except at another site
         self._status = [self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER) for key in status]
         self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
 
     def open(self, on_query: Callable[[zenoh.Query, str], object]) -> None:
-        """Answer from now on. on_query: as of `Bus.queryable`; it gets what this recorder carries out.
+        """Answer queries from now on. on_query: as for `Bus.queryable`. It gets the queries for this recorder.
 
-        Its text is the key of the answer: a question may have wildcards.
+        It also gets the key of the answer, because a query may have wildcards.
         """
 
         def for_fleet(query: zenoh.Query) -> object:
             if self.speaks_for_fleet:
                 asked = str(query.key_expr)
                 return on_query(query, asked if "/@cmd/" in asked else self._fleet_status)
-            with query:  # another one answers
+            with query:  # another recorder answers
                 return True
 
         if self._site:
@@ -91,11 +91,12 @@ class RecorderService:
         for expression in keys.command_keys(self._fleet, keys.RECORDER):
             self._bus.queryable(expression, for_fleet)
         self._bus.token(self._token)
-        # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
+        # Declaring does not wait for the hub. But an answer of the hub comes only after it has told everybody about our
+        # subscriptions.
         self.wait_for_hub()
 
     def wait_for_hub(self, timeout_s: float = 5.0) -> None:
-        """Wait for the hub's answer to a question that comes after all that was sent before."""
+        """Send the hub a query and wait for the answer. The hub then has everything that was sent before."""
         with contextlib.suppress(zenoh.ZError):  # without a bus nothing is in transit
             self._bus.tokens(self._token, timeout_s)
 

@@ -15,7 +15,7 @@ RESUME_WINDOW_S: Final = 3 * CACHE_S
 
 @dataclass(frozen=True, slots=True)
 class ResumePoint:
-    """End of an interrupted session, from which a new one continues, and the messages that it already holds."""
+    """End of an interrupted session, at which a new one continues, and the messages that are already recorded."""
 
     name: str
     """Name of the interrupted session, or an empty text if there is none."""
@@ -26,12 +26,12 @@ class ResumePoint:
 
 
 def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
-    """Return the resume point of the latest session below `root`; without a name if that session was closed."""
+    """Return the resume point of the latest session below `root`. It has no name if that session was closed."""
     session = _find_latest(root, fleet, now_ns)
     if session is None:
         return ResumePoint("", now_ns)
     start_ns = now_ns - int(RESUME_WINDOW_S * 1e9)
-    # A recorder that was killed twice may not have backfilled the first gap yet: read its predecessors too.
+    # If the recorder was killed twice, the first gap may not be backfilled yet. So read the sessions before it, too.
     chain = [session, *_predecessors(session, start_ns)]
     known = frozenset(
         (row.key, row.sequence, row.published_ns) for each in chain for row in each.messages(start_ns=start_ns)
@@ -64,7 +64,7 @@ def _started_ns(session: Session) -> int:
 
 
 def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:
-    """Return the latest session if its recorder ended a moment ago without closing it; else None."""
+    """Return the latest session if its recorder ended a moment ago without closing it. Otherwise return None."""
     paths = sorted(root.glob(f"*/{session_dir.SESSION_FILE}"), key=lambda path: path.parent.name)
     for path in reversed(paths):
         description = session_dir.SessionInfo.read(path.parent)

@@ -1,4 +1,4 @@
-"""Counts what one segment has of each key: for index.json, and the stops of the session."""
+"""Counts the messages of each key in one segment for index.json, and the stops of the session."""
 
 import contextlib
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class KeyState:
         self.channel = channel
         self.count = self.first = self.final = 0
         self.seen_ns = 0
-        """When its newest message was received, also in an earlier segment; 0: none was."""
+        """When the newest message of the key was received, also in an earlier segment. 0 if there was none."""
         self.has_events = messages.name_in(str(encoding)) == EVENTS.message
         """True for the events of commands, in which stops are counted."""
 
@@ -50,7 +50,7 @@ class SegmentCounts:
         return not any(state.count for state in self._by_encoding.values())
 
     def find(self, key: str, encoding: zenoh.Encoding) -> KeyState | None:
-        """Return the state of a key and an encoding, and make it the newest. None if there is none."""
+        """Return the state of a key and an encoding, and make it the key's newest. None if there is none."""
         if (state := self._by_encoding.get((key, str(encoding)))) is not None:
             self.states[key] = state
         return state

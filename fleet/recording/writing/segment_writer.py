@@ -1,7 +1,8 @@
 """Writes one MCAP file: channels, schemas and messages. session_writer.py assigns messages to files. No threads.
 
-The writer of the mcap package is of no use after an error: its index has chunks that the file lacks. So it writes into
-memory, and only `flush` and `finish` write to the disk. What a full disk does not take waits for the next try.
+The writer of the mcap package cannot be used after an error, because its index then has chunks that the file lacks. So
+it writes into memory, and only `flush` and `finish` write to the disk. If the disk is full, the data stays in memory
+for the next try.
 """
 
 import contextlib
@@ -22,12 +23,12 @@ _LOSS_METADATA: Final = "recording"
 
 
 class _Tail:
-    """The end of a file that is not on the disk yet. The part of a file's interface that the mcap writer uses."""
+    """The end of a file that is not on the disk yet. It has the methods of a file that the mcap writer uses."""
 
     def __init__(self) -> None:
         self.data = bytearray()
         self.start = 0
-        """Where in the file the data belongs."""
+        """Position of the data in the file."""
 
     def write(self, data: bytes) -> int:
         self.data += data
@@ -40,13 +41,16 @@ class _Tail:
         """Do nothing: `Segment.flush` writes to the disk."""
 
     def drop(self) -> None:
-        """Forget data that is on the disk."""
+        """Forget data that is on the disk now."""
         self.start += len(self.data)
         self.data = bytearray()
 
 
 class Segment:
-    """One MCAP file to write. `flush` and `finish` may raise OSError: call them again when there is room, or `cut`."""
+    """One MCAP file to write.
+
+    If `flush` or `finish` raises OSError, call it again when there is room, or call `cut`.
+    """
 
     def __init__(self, path: Path, about: Mapping[str, str]) -> None:
         self._file = FileIO(path, "xb")
@@ -68,12 +72,12 @@ class Segment:
 
     @property
     def bytes(self) -> int:
-        """Return the size on the disk: that of the last flush."""
+        """Return the size on the disk, which is the size at the last flush."""
         return self._tail.start
 
     @property
     def waiting_bytes(self) -> int:
-        """Return the size of what the disk has not taken yet."""
+        """Return the size of the data that is not on the disk yet."""
         return len(self._tail.data)
 
     def channel(self, key: str, encoding: str) -> int:
@@ -83,7 +87,10 @@ class Segment:
         return channel
 
     def _schema(self, encoding: str) -> tuple[str, int]:
-        """Return (MCAP message encoding, schema id) of a Zenoh encoding; id 0 if its schema is unknown."""
+        """Return MCAP's message encoding and the schema id of a Zenoh encoding.
+
+        The id is 0 if its schema is unknown.
+        """
         name = messages.name_in(encoding)
         if name is None:
             return ("json" if encoding.partition(";")[0] == messages.JSON else encoding), 0
@@ -96,7 +103,7 @@ class Segment:
         return "protobuf", self._schemas[name]
 
     def flush(self, *, sync: bool = False) -> None:
-        """End the chunk and pass all data to the operating system; with `sync`, to the disk."""
+        """End the chunk, and pass all data to the operating system, or with `sync` to the disk."""
         if not self._finished:
             self._writer.flush()
         self._write(sync=sync)
@@ -112,7 +119,7 @@ class Segment:
         self._file.close()
 
     def cut(self) -> None:
-        """Close a file that the disk takes no end of."""
+        """Close the file without its end, because the disk has no room for it."""
         self._file.close()
 
     def _write(self, *, sync: bool) -> None:
@@ -123,7 +130,7 @@ class Segment:
             if sync:
                 os.fsync(self._file.fileno())
         except OSError:
-            with contextlib.suppress(OSError):  # half a chunk is of no use, and takes room
+            with contextlib.suppress(OSError):  # half a chunk is useless and fills the disk
                 self._file.truncate(start)
             raise
         self._tail.drop()

@@ -1,6 +1,6 @@
 """Writes one session: assigns messages to segments, tracks gaps, rolls files over and buffers while the disk is full.
 
-All methods are called from one thread. The module knows no bus and starts no thread.
+All methods are called from one thread. The module does not use the bus and starts no thread.
 """
 
 import contextlib
@@ -36,7 +36,10 @@ OVERFLOW_BATCH_BYTES: Final = 100_000
 
 
 class Sync(StrEnum):
-    """When to wait for the disk. Flushed data survives our crash; only a crash of the operating system loses it."""
+    """When to wait for the disk.
+
+    Flushed data survives a crash of ours, and is lost only if the operating system crashes.
+    """
 
     NEVER = "never"
     SEGMENT = "segment"
@@ -50,7 +53,8 @@ class Options:
     segment_bytes: int = 512 * MB
     """Size at which a segment is rolled over."""
     segment_s: float = 600.0
-    """Age at which a segment is rolled over. The index of an open file grows in memory: 0.1 MB/s for 100 cars."""
+    """Age at which a segment is rolled over. It is limited because the index of an open file grows in memory, by 0.1
+    MB/s for 100 cars."""
     sync: Sync = Sync.SEGMENT
     quota: Quota = field(default_factory=Quota)
     reserve: Reserve = field(default_factory=Reserve)
@@ -81,12 +85,12 @@ class SessionWriter:
         self._irregular_keys: set[str] = set()
         """Keys whose sequence numbers were not always consecutive."""
         self.gaps: dict[str, int] = {}
-        """Keys with new gaps, each with the time of the last message before, 0 if there was none. The recorder requests
-        a backfill and clears them."""
+        """Keys with new gaps, each with the time of the last message before the gap (0 if there was none). The recorder
+        requests a backfill for them and clears them."""
         self._drops: dict[str, int] = {}
-        """Messages by key that a full disk cost, or a full queue if they had no number."""
+        """Messages by key that were lost to a full disk, or to a full queue if they had no number."""
         self._overflows: dict[str, int] = {}
-        """Numbered messages by key that did not fit the recorder's queue: gaps that a backfill may close."""
+        """Numbered messages by key that did not fit into the recorder's queue. A backfill may still fetch them."""
         self.recovered: dict[str, int] = {}
         """Messages by key that a backfill restored."""
         self.full = ""
@@ -95,14 +99,15 @@ class SessionWriter:
         """Losses at the end of the session because the disk was full."""
         self.warning = ""
         self.quota_news: list[str] = []
-        """News of the quota for a person. The recorder reports and clears them."""
+        """News about the quota for a person. The recorder reports and clears them."""
         self._pins = PinList()
         self._pins_unwritten = False
         self._index: list[dict[str, Any]] = []
         self._written = self._closed_bytes = self._buffered_bytes = 0
         self._stops = StopCount()
         self._unended = 0
-        """Rows at the beginning of the buffer that are in a segment whose end did not fit on a full disk."""
+        """Number of rows at the beginning of the buffer that are in a segment whose end did not fit on the full
+        disk."""
         self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
         self._open(now_ns, self._options.reserve.to_begin)
@@ -119,7 +124,8 @@ class SessionWriter:
         received_ns: int,
     ) -> None:
         """Write one publication unchanged."""
-        # Every message takes this path: each call in it costs. So the consecutive number is checked here.
+        # Every message takes this path, and each call costs time. So the usual case, a consecutive number, is checked
+        # here.
         state = self._states.get(key)
         if state is None or state.encoding != encoding:
             state = self._key_state(key, encoding)
@@ -210,17 +216,17 @@ class SessionWriter:
 
     @property
     def free_bytes(self) -> int:
-        """Return the free space on the disk in bytes. Raises OSError if the system does not tell it."""
+        """Return the free space on the disk in bytes. Raises OSError if it cannot be determined."""
         return shutil.disk_usage(self.path).free if self._made else free_bytes(self._root)
 
     @property
     def drops(self) -> dict[str, int]:
-        """Return the messages by key that a full disk or queue cost, without those that a backfill restored."""
+        """Return by key the messages lost to a full disk or queue, without those that a backfill restored."""
         counts = {key: self._drops.get(key, 0) + self._unrestored(key) for key in (*self._drops, *self._overflows)}
         return {key: count for key, count in counts.items() if count}
 
     def _unrestored(self, key: str) -> int:
-        """Return how many of the messages that did not fit the queue are missing."""
+        """Return how many of the messages that did not fit into the queue are still missing."""
         overflows = self._overflows.get(key, 0)
         return min(overflows, self._trackers[key].missing) if overflows else 0
 
@@ -239,7 +245,7 @@ class SessionWriter:
 
     def tick(self, now_ns: int) -> None:
         """Flush, roll over to the next segment if it is due, and check the disk."""
-        self._write_pins()  # before the messages: a crash then costs no pin of a message that is here
+        self._write_pins()  # write pins before messages, so that after a crash no recorded message lacks its pin
         if self.full:
             self._resume(now_ns)
             return
@@ -265,13 +271,13 @@ class SessionWriter:
             self.description.write(self.path)
 
     def pin(self, pin: Pin) -> None:
-        """Pin a time. It is in session.json after the next tick."""
+        """Pin a time. The pin is in session.json after the next tick."""
         self._pins_unwritten = self._pins.add(pin) or self._pins_unwritten
 
     def _write_pins(self) -> None:
         if self._pins_unwritten and self._made:
             self._describe_pins()
-            with contextlib.suppress(OSError):  # the disk is full or failed; the status names it
+            with contextlib.suppress(OSError):  # the disk is full or has failed; the status says so
                 self.description.write(self.path)
                 self._pins_unwritten = False
 
@@ -291,7 +297,7 @@ class SessionWriter:
         if self._segment is not None:
             self._segment.cut()
             if self._index and self._counts.is_empty:
-                self._segment.path.unlink(missing_ok=True)  # an empty one
+                self._segment.path.unlink(missing_ok=True)  # the segment is empty
             else:
                 self._add_to_index()
             self.cost = "The disk is full: the last file has no end, but all its messages"
@@ -316,7 +322,7 @@ class SessionWriter:
         dropped = sum(self._drops.values())
         words = f"{why}. The {self._written} messages before are intact; {dropped} are lost"
         self.description.error = words
-        with contextlib.suppress(OSError):  # the failed disk, which `words` already names
+        with contextlib.suppress(OSError):  # the disk has failed, as `words` already says
             self._write_info(now_ns, closed=False)
             session_dir.release(self.path)
         return words
@@ -326,7 +332,7 @@ class SessionWriter:
     def _open(self, now_ns: int, room_bytes: int) -> bool:
         """Begin a segment, and the session before its first one. If space is short, pause and return False."""
         free = self.free_bytes
-        if self._unflushed:  # else a large first message would begin an empty file at each attempt
+        if self._unflushed:  # otherwise, if the first message is large, each attempt would begin an empty file
             room_bytes += len(self._unflushed[0][2])
         if why := shortage(free, room_bytes):
             self._pause(why)
@@ -383,7 +389,7 @@ class SessionWriter:
         self._written += len(rows)
 
     def _try_to_finish(self) -> None:
-        """Flush and finish the segment, if there is one and the disk takes its end."""
+        """Flush and finish the segment, if there is one and the disk has room for its end."""
         try:
             if self._segment is not None:
                 self._flush()
@@ -403,7 +409,7 @@ class SessionWriter:
         self._index.append(self._counts.entry(self._segment.path.name, self._segment.bytes))
         self._closed_bytes += self._segment.bytes
         self._segment = None
-        with contextlib.suppress(OSError):  # a cache; session.json is written again at the end
+        with contextlib.suppress(OSError):  # index.json is only a cache, and session.json is written again at the end
             session_dir.replace(self.path / session_dir.INDEX_FILE, {"segments": self._index})
             self._write_info(None, closed=False)
 
@@ -412,7 +418,7 @@ class SessionWriter:
     def _on_write_error(self, error: OSError) -> None:
         """Pause if the disk is full, with the unflushed messages as buffer. Raise any other error.
 
-        The segment stays as it was flushed last, and keeps its end until there is room for it.
+        The segment stays as at its last flush. Its end is kept in memory until there is room for it.
         """
         if not session_dir.is_full(error):
             raise error
@@ -421,7 +427,7 @@ class SessionWriter:
         self._pause(f"{error.strerror or error}")
 
     def _pause(self, words: str) -> None:
-        """Pause, or say why it still pauses."""
+        """Pause, or update the reason of a pause."""
         began, self.full = not self.full, f"{self._root}: {words}. Recording pauses until there is room."
         self.warning = ""
         self._buffered_bytes = sum(len(row[2]) for row in self._unflushed)
@@ -429,11 +435,11 @@ class SessionWriter:
             return
         self.description.error = self.full
         if self._made:
-            with contextlib.suppress(OSError):  # the status names it, and session.json is written at the end
+            with contextlib.suppress(OSError):  # the status gives the reason, and session.json is written at the end
                 self._write_info(None, closed=False)
 
     def _on_room(self) -> None:
-        """Record again. The pause stays in session.json, as one that is over."""
+        """Record again. session.json keeps a note of the pause, in the past tense."""
         if self.full:
             self.description.error = (
                 f"{self.description.error.partition('. Recording pauses')[0]}. Recording had paused."
@@ -454,7 +460,10 @@ class SessionWriter:
         self._drops[key] = self._drops.get(key, 0) + 1
 
     def drop_received(self, key: str, sender: Hashable, number: int, count: int) -> None:
-        """Count messages that did not fit the queue. `number` is the last one's. Without numbers, `sender` is None."""
+        """Count messages that did not fit into the queue. `number` is that of the last.
+
+        Without numbers, `sender` is None.
+        """
         if sender is None:
             self._drops[key] = self._drops.get(key, 0) + count
             return
@@ -506,7 +515,7 @@ class SessionWriter:
             self._pause(f"{len(self._unflushed)} waiting messages need more space")
 
     def _write_buffered(self, keep_bytes: int) -> list[Row]:
-        """Write the buffer while this much stays free, and return the rest."""
+        """Write the buffer as long as `keep_bytes` stay free, and return the rest."""
         rows, self._unflushed = self._unflushed, []
         done = size = 0
         most = self.free_bytes - keep_bytes
@@ -534,7 +543,7 @@ class SessionWriter:
         for name, source in self._options.copied.items():
             try:
                 shutil.copyfile(source, self.path / name)
-            except OSError as error:  # recording goes on without the copy
+            except OSError as error:  # recording continues without the copy
                 self.uncopied.append(f"{source} could not be copied into {self.path}: {error.strerror or error}")
         if self.uncopied:
             self.description.error = "; ".join(self.uncopied)

@@ -96,7 +96,7 @@ def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> N
     assert invitation.wait() == ""
     assert invitation.joined_from == "127.0.0.1"
     assert not (store.directory / "person.mia.key").exists(), "its key is on the other computer only"
-    with pytest.raises(NotJoined, match="used or over"):
+    with pytest.raises(NotJoined, match="used or has expired"):
         join("127.0.0.1", invitation.code, invitation.port)
 
 
@@ -118,7 +118,7 @@ def test_five_wrong_codes_end_it(invitation: Invitation) -> None:
     for _ in range(MAX_GUESSES):
         with pytest.raises(NotJoined, match="wrong"):
             join("127.0.0.1", wrong, invitation.port)
-    with pytest.raises(NotJoined, match="used or over"):
+    with pytest.raises(NotJoined, match="used or has expired"):
         join("127.0.0.1", invitation.code, invitation.port)
     assert str(MAX_GUESSES) in invitation.wait()
     assert invitation.joined_from == ""

@@ -204,7 +204,7 @@ def test_a_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
         (replace(OLD, endpoint="tcp/127.0.0.1:7"), "the endpoint"),
         (replace(OLD, world=Path("w")), "the world"),
         (replace(OLD, recordings=Path("r")), "where recordings go"),
-        (replace(OLD, record=False), "whether it records"),
+        (replace(OLD, record=False), "whether the fleet is recorded"),
         (replace(OLD, cars={**OLD.cars, "two": CarProcessSpec("two", SIMULATED)}), "two (a simulated car)"),
         (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim (a simulated car)"),
         (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", "/dev/sim")}), "sim (a simulated car)"),
