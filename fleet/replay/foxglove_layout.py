@@ -2,8 +2,9 @@
 
 `python -m fleet.replay.foxglove_layout [CAR ...] > LAYOUT.json` writes it.
 
-`deploy/foxglove.json` is the layout for the cars of `make demo`. Foxglove draws only fields of messages. So the layout
-leaves out everything that lenses.py or drawings.py derives. It shows messages raw that Rerun shows as lines of text.
+`deploy/foxglove.json` is the layout for the cars of `make demo`. Foxglove draws only fields of messages, so the layout
+leaves out everything that lenses.py or drawings.py derives. Where Rerun shows lines of text that we compose, it shows
+the raw messages.
 """
 
 import json
@@ -65,7 +66,7 @@ class _FoxgloveLayout:
         return self.add("StateTransitions", name, {"paths": paths, "isSynced": True})
 
     def add_messages(self, name: str, topic: str, car: str = "") -> str:
-        """Add a view of a topic's messages: of a log its lines, of other topics the raw messages."""
+        """Add a view of a topic's messages: the lines of a log, or the raw messages of any other topic."""
         key = self.key(car, topic)
         if TOPICS[topic].message == LOG:
             return self.add("RosOut", name, {"topicToRender": key, "minLogLevel": 1, "searchTerms": []})

@@ -1,7 +1,8 @@
-"""Tables of the views: which field is drawn as a curve, as a state track or as a line of text. Pure; no Rerun here.
+"""Tables of the views: which field is drawn as a curve, as a state track or as a line of text. Pure, and without Rerun.
 
-A curve is a number over time, a track a state over time, a text line an entry of a log. Every message is in the .rrd,
-also without a row here, for Rerun's dataframe view. The entity of a key is the key: `/fleet/red/sensor/range`.
+A curve shows a number over time. A track shows a state over time. A text line is an entry of a log. A topic that has no
+row here is in the .rrd all the same, and Rerun's dataframe view shows it. Rerun calls the place of data an entity. The
+entity of a key is the key itself: `/fleet/red/sensor/range`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,10 +23,11 @@ class Curve:
 
     topic: str
     field: str
-    """Selector inside the message. With ! at the end, values that were not measured are left out, not drawn as zero."""
+    """Path of the field inside the message. If it ends with !, values that were not measured are left out instead of
+    drawn as zero."""
     name: str
     derivation: "Derivation | None" = None
-    """How the part is derived, or None if the viewer reads the field from the message itself."""
+    """How the curve is derived from the field, or None if the viewer draws the field itself."""
 
 
 class Derivation(StrEnum):
@@ -64,7 +66,7 @@ class TextTopic:
     before: Mapping[str, str] = field(default_factory=dict)
     """Prefix of a field that is not empty."""
     calm: frozenset[str] = frozenset()
-    """Normal values of `alarm_field`. With any other value the line is a warning."""
+    """Normal values of `alarm_field`. Any other value makes the line a warning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,7 @@ COMMAND_TOPIC: Final = "event/command"
 ASSIGNMENT: Final = "@coordinator/assignment"
 PLAN_TOPIC: Final = "@coordinator/plan"
 ON_CHANGE_TOPICS: Final = (PLAN_TOPIC, ASSIGNMENT)
-"""Topics that are published only on change. A viewer that starts asks for the last message."""
+"""Topics that are published only on change. So a viewer that starts later must ask for their last message."""
 
 DISTANCE: Final = Curve("sensor/range", "range_m!", f"distance ({_unit('sensor/range', 'range_m')})")
 BATTERY: Final = Curve("sensor/battery", "voltage_v", f"battery ({_unit('sensor/battery', 'voltage_v')})")
@@ -201,7 +203,7 @@ _DRAWN: Final = frozenset[str]().union(*(panel.topics for panel in MAIN_PANELS +
 
 
 def _plain_panel(topic: Topic) -> Panel:
-    """Return the panel of a sensor without a row of its own: a curve per field with a unit, a track per word."""
+    """Return the panel of a sensor that no table above draws: a curve per field with a unit, a track per word."""
     name = topic.name.removeprefix("sensor/").replace("_", " ")
     curves = tuple(Curve(topic.name, field, f"{name} ({field.replace('_', ' ')})") for field in topic.units)
     return Panel(name.capitalize(), curves, _tracks(topic.name, name, *topic.words))

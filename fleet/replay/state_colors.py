@@ -1,4 +1,4 @@
-"""Colors of states and LEDs: one meaning has one color in every view. Pure."""
+"""Colors of states and LEDs, so that the same meaning has the same color in every view. Pure."""
 
 from collections.abc import Iterable, Mapping
 from typing import Final
@@ -36,7 +36,7 @@ STATE_COLORS: Final[Mapping[str, int]] = {
     RecorderState.CLOSED: 0x8A8F98FF, RunState.ENDED: 0x8A8F98FF,
     RecorderState.FULL: 0xD9534FFF, RecorderState.FAILED: 0xD9534FFF,
 }  # fmt: skip
-"""Colors of states, 0xRRGGBBAA. The viewer picks the color of other states."""
+"""Colors of states, 0xRRGGBBAA. For any other state the viewer picks a color."""
 
 _PHASE_COLORS: Final[Mapping[str, int]] = {
     Phase.ASKED: 0x8A8F98FF, Phase.QUEUED: 0xC9B037FF, Phase.SENT: 0x5C7FA3FF, Phase.EFFECT_SEEN: 0x3C9D9BFF,
@@ -51,7 +51,7 @@ MARK_COLORS: Final[Mapping[str, int]] = {
 
 
 def rgb(led: str) -> Rgb:
-    """Return the color of an LED in `sim/truth`: `#rrggbb`; anything else is off."""
+    """Return the color of an LED in `sim/truth`, which is `#rrggbb`. Any other text means that the LED is off."""
     try:
         red, green, blue = bytes.fromhex(led.removeprefix("#"))
     except ValueError:

@@ -1,1 +1,1 @@
-"""Compares a recording with today's code: its frames with the decoder, its readings with the policy."""
+"""Checks a recording with today's code: decodes its raw frames again, and runs the policy on its readings again."""

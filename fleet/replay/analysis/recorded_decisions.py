@@ -1,7 +1,7 @@
 """Extracts the coordinators of a session: when each ran, its plans, its decisions, and the presence of cars.
 
-Liveliness tokens are not recorded. The presence of a car follows from its states, published once a second. The car was
-gone if they pause, or if the next one has another boot_id.
+Liveliness tokens are not recorded, so the presence of a car is inferred from its states, which its gateway publishes
+once a second. If they pause, or if the next state has another boot_id, the gateway was gone in between.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,12 +17,15 @@ from schemas.topics import TOPICS
 DECISION_KEYS: Final = tuple(f"*/{keys.COORDINATOR}/{name}" for name in ("plan", "assignment", "decision", "log"))
 STATE_KEYS: Final = ("*/*/state/*",)
 MAX_STATE_PAUSE_NS: Final = 2_500_000_000
-"""Minimum pause of states that means a gone gateway."""
+"""Maximum time between two states of a gateway that was there all the time. After a longer pause it counts as gone."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedDecision:
-    """A decision of item subject, from `at_ns` (the recorder's clock) until its next."""
+    """One decision about a subject.
+
+    It holds from `at_ns` (the recorder's clock) until the next decision about that subject.
+    """
 
     at_ns: int
     kind: str
@@ -35,7 +38,8 @@ class RecordedDecision:
     @property
     def what(self) -> tuple[str, str, str]:
         """Return the parts to compare."""
-        # Not the reasons: they contain ages. A car left alone loses its role later without a decision.
+        # The reasons are not compared, because they contain ages, which always differ. Nor is the role of a car that is
+        # left alone: the car loses its role later without a decision.
         return self.kind, self.decided, "" if self.kind == DecisionKind.ALONE else self.role
 
     def __str__(self) -> str:
@@ -49,11 +53,11 @@ class RecordedDecision:
 
 
 Timeline = dict[str, list[RecordedDecision]]
-"""Changed decisions in order, by subject."""
+"""Decisions by subject, in order, each different from the one before."""
 
 
 def add(timeline: Timeline, subject: str, decision: RecordedDecision) -> None:
-    """Add a decision if it differs from the last one of its subject."""
+    """Add a decision if it differs from the last one about its subject."""
     before = timeline.setdefault(subject, [])
     if not before or before[-1].what != decision.what:
         before.append(decision)
@@ -87,7 +91,7 @@ class CoordinatorRun:
     """First role of each car."""
     phase: str = ""
     stopped_by: str = ""
-    """Sender who had stopped the plan before it started."""
+    """The sender who had stopped the plan before this coordinator started. Empty if nobody had."""
     requests: list[RecordedRequest] = field(default_factory=list)
     assigned: bool = False
     """True once it has published its roles."""
@@ -102,7 +106,7 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
         if key is None or value is None:
             continue
         at_ns = item.recorded_ns
-        if key.topic == "log":  # events do not name their coordinator: it is the last one that started
+        if key.topic == "log":  # log events do not name their coordinator, so assume the last one that started
             run = next((each for each in reversed(found.values()) if each.fleet == key.fleet), None)
             if run is not None and value.name in _REQUESTS:
                 request, words = _REQUESTS[value.name]
@@ -150,7 +154,7 @@ class PresenceToken:
 def presence(recorded: Iterable[Recorded], end_ns: int) -> list[PresenceToken]:
     """Return when cars appeared and disappeared until `end_ns`, from the messages of STATE_KEYS.
 
-    The times of disappearing are estimates.
+    When a car disappeared is an estimate.
     """
     last: dict[str, tuple[int, str]] = {}
     found = []

@@ -1,6 +1,7 @@
 """Extracts the raw frames of a session in both directions, with their readings and the known mode and platform.
 
-Items are in the order of the gateway's stamps: states overtake readings on the bus. Memory is bounded. Decodes nothing.
+Decodes nothing. The items are in the order of the gateway's stamps, because states may overtake readings on the bus.
+Memory is bounded.
 """
 
 import heapq
@@ -26,7 +27,7 @@ Readings = Mapping[str, Mapping[str, Any]]
 
 @dataclass(slots=True)
 class Rx:
-    """Bytes from a car, and their recorded verdict and readings."""
+    """Bytes from a car, with the verdict and the readings that were recorded for them."""
 
     at_ns: int
     data: bytes
@@ -46,7 +47,7 @@ class Tx:
 
 @dataclass(frozen=True, slots=True)
 class KnownMode:
-    """Known mode of the car from this time on, or None if it is unknown."""
+    """The mode of the car from this time on, or None if it is unknown."""
 
     at_ns: int
     mode: Mode | None
@@ -68,9 +69,9 @@ class SkippedMessages:
     """Counts of messages that could not be used."""
 
     broken: dict[str, int] = field(default_factory=dict)
-    """Messages by key that do not match their type."""
+    """Number of messages that do not match their type, by key."""
     unframed: int = 0
-    """Readings without a raw frame, which was not recorded or over the gateway's rate limit."""
+    """Readings without their raw frame: it was not recorded, or it exceeded the rate limit of the gateway."""
 
 
 def of_session(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterator[tuple[str, Item]]:
@@ -102,7 +103,10 @@ def of_session(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterat
 
 
 def fields_of(message: Any) -> dict[str, Any]:
-    """Return the fields of a message without header and unmeasured values; lists as tuples."""
+    """Return the fields of a message without its header and without values that were not measured.
+
+    Lists become tuples.
+    """
     present = {descriptor.name for descriptor, _ in message.ListFields()}
     found = {}
     for each in message.DESCRIPTOR.fields:
@@ -113,7 +117,10 @@ def fields_of(message: Any) -> dict[str, Any]:
 
 
 def _sort_by_stamp(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterator[tuple[keys.Key, Any, int]]:
-    """Yield messages by stamp. At equal stamps readings come before their frame, else in recorded order."""
+    """Yield messages by stamp. At equal stamps readings come before their frame.
+
+    Other messages stay in recorded order.
+    """
     heap: list[tuple[int, bool, int, keys.Key, Any]] = []
     for number, message in enumerate(recorded):
         key = keys.parse(message.key)

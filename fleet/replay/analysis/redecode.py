@@ -1,8 +1,9 @@
 """Decodes recorded raw frames with today's decoder, and yields every difference to the recorded readings. Pure.
 
-The readings of a frame depend on the platform and the mode of the car: both are taken from the recording. A recording
-leaves two things open: which of two states applied at the moment of a frame, and whether silence or the next frame
-ended a frame without its #. If the recorded result is one of the possible ones, the frame counts as undecided.
+The readings of a frame depend on the platform and the mode of the car. Both come from the recording. But a recording
+leaves two things open: which of two modes or platforms applied at the moment of a frame, and whether silence or the
+next frame ended a frame that has no # at its end. Such a frame may have several possible results. Then it counts as
+undecided, and it is a difference only if none of them is the recorded one.
 """
 
 from collections import deque
@@ -21,13 +22,14 @@ from gateway.drivers.yahboom.protocol.wire_events import Event
 from schemas.words import FrameVerdict, Mode
 
 MAX_MODE_DELAY_NS: Final = 500_000_000
-"""Maximum delay from a mode change to its publication: the loop of a gateway processes input in batches."""
+"""Maximum delay from a mode change to its publication, because the loop of a gateway processes input in batches."""
 MAX_PLATFORM_DELAY_NS: Final = 1_500_000_000
-"""Maximum delay of a platform change: state/health is published once a second."""
+"""Maximum delay from a platform change to its publication: state/health is published once a second."""
 MAX_FRAME_WAIT_NS: Final = 2_500_000_000
-"""Maximum wait of a frame for the next state, published once a second."""
+"""How long a frame is kept until the next state has certainly come: states are published once a second."""
 _MAX_ECHO_LEAD_NS: Final = 300_000_000
-"""Maximum time of an echo before its frame: the frame is published after the write."""
+"""An echo may have an earlier stamp than the frame that it repeats, because a frame is published after it was written.
+This is the maximum difference."""
 
 Outcome = tuple[str, dict[str, dict[str, Any]]]
 """Verdict, and fields of each reading by topic."""
@@ -55,7 +57,8 @@ class Counts:
     undecided: int = 0
     """Frames with several possible results."""
     absent: int = 0
-    """Readings published by their frame's record but missing: lost before the recorder."""
+    """Readings that the record of their frame names as published, but that are missing in the session. They were lost
+    on the way to the recorder."""
 
 
 class NoPlatform(Exception):
@@ -64,7 +67,7 @@ class NoPlatform(Exception):
 
 @dataclass(slots=True)
 class Redecoding:
-    """Compares the items of one car in their order. `platform` replaces the recorded one."""
+    """Compares the items of one car in their order. A `platform` that is not None replaces the recorded platform."""
 
     car: str
     platform: str | None = None
@@ -111,7 +114,7 @@ class Redecoding:
             yield from min(found, key=len)
 
     def _outcomes(self, frame: Rx) -> list[Outcome]:
-        """Return the possible results of a frame: one, if the recording leaves nothing open."""
+        """Return the possible results of a frame. There is exactly one if the recording leaves nothing open."""
         assert self._began_ns is not None
         at = (frame.at_ns - self._began_ns) / 1e9
         profiles = self._profiles(frame.at_ns)
@@ -155,14 +158,20 @@ class Redecoding:
 
 
 def _around(states: deque[Any], at_ns: int, late_ns: int) -> list[Any]:
-    """Return the state before a moment (or the first), and later ones that may already have applied."""
+    """Return the last state before a moment (or the first of all), and later ones that may have applied already.
+
+    The states before these are dropped.
+    """
     while len(states) > 1 and states[1].at_ns < at_ns:
         states.popleft()
     return [state for number, state in enumerate(states) if not number or state.at_ns <= at_ns + late_ns]
 
 
 def _decode(decoder: Decoder, data: bytes, at: float) -> list[tuple[Event, ...]]:
-    """Return the events of a frame. Without its #, return them for each way in which it may have ended."""
+    """Return the events of a frame.
+
+    If it has no # at its end, return the events of each way in which it may have ended.
+    """
     silence = (*decoder.feed(data, at), *decoder.end())
     if data.endswith(b"#") or not data.startswith(b"$"):
         return [silence]

@@ -1,8 +1,8 @@
 """Runs the coordinator's policy with a plan on the readings of a session, on the recorded clock. Uses no bus.
 
-Cars behave as recorded, whatever this plan would have commanded. A recording lacks three things that a coordinator
-knows: its liveliness tokens (see recorded_decisions.py), the exact times of its steps (here after every message, and
-ten times a second), and the order of messages that arrived almost at once.
+Cars behave as recorded, whatever this plan would have commanded. A recording lacks three things that a live coordinator
+knows: the liveliness tokens (see recorded_decisions.py), the exact times of the coordinator's steps (here there is a
+step after every message, and ten times a second), and the order of messages that arrived almost at once.
 """
 
 import contextlib
@@ -38,7 +38,8 @@ STEP_INTERVAL_NS: Final = 100_000_000
 MAX_BATCH_NS: Final = 10_000_000
 """Maximum time between messages that one step processes together."""
 COORDINATOR_HISTORY_NS: Final = 60_000_000_000
-"""Time before the start of a coordinator whose readings stand for its first queries."""
+"""A coordinator starts with queries for the latest readings. Here the readings of this time before its start replace
+their answers."""
 _FINAL_PHASES: Final = frozenset(Phase) - {Phase.ASKED, Phase.QUEUED}
 _SUCCESS_PHASES: Final = frozenset({Phase.SENT, Phase.COMPLETE, Phase.EFFECT_SEEN})
 
@@ -50,7 +51,7 @@ class _NewPlan:
 
 
 def keys_for(fleet: str, plans: Iterable[Plan]) -> list[str]:
-    """Return the key expressions that a coordinator with these plans subscribes to, and those of its outcomes."""
+    """Return the key expressions that a coordinator with these plans subscribes to, and that of command outcomes."""
     topics = {topic_of(name) for plan in plans for name in plan.names}
     return [f"{fleet}/*/{topic}" for topic in ("state/*", "event/command", *sorted(topics)) if topic]
 
@@ -112,7 +113,7 @@ class Replanning:
         return to_persisted(self._plan, self._state, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
 
     def _request(self, item: RecordedRequest) -> None:
-        """Carry out what a person wanted of the recorded plan, if this plan can."""
+        """Carry out a person's request to the recorded plan, unless this plan refuses it."""
         if self._state is not None:
             with contextlib.suppress(RequestRefused):
                 self._state, _ = on_request(item.request, self._plan, self._state, item.by, item.at_ns / 1e9)
@@ -156,7 +157,8 @@ class Replanning:
         known = {car: role for car, role in self.run.roles.items() if role in self._plan.roles}
         snapshot = self._observer.snapshot(())
         if not self.run.whole or any(not snapshot.cars.get(car, UNKNOWN_CAR).mode for car in known):
-            # The coordinator started, or knew its cars, before the recording: its first roles are from then.
+            # The coordinator started before the recording, or already knew its cars then. So its first roles are those
+            # of that time.
             return restore(
                 self._plan,
                 snapshot,
@@ -164,10 +166,10 @@ class Replanning:
                 now,
                 now,
             )
-        # A coordinator that a person ends forgets that its plan was stopped; one that is killed does not.
+        # A coordinator that a person ends forgets that its plan was stopped. A coordinator that is killed remembers it.
         persisted = replace(self.persisted, stopped_by=self.run.stopped_by)
         state = restore(self._plan, snapshot, persisted, now, now)
-        # Roles from before the session: its first decisions name them.
+        # The roles from before the session are named in the first decisions of this coordinator.
         initial = {
             car: HeldRole(known[car], TAKEN_OVER)
             for car, past in self.run.decisions.items()
@@ -190,7 +192,7 @@ class Replanning:
 
 
 def _ordered(recorded: Iterable[Recorded]) -> Iterable[Recorded]:
-    """Yield messages with monotonic times: after a backward step of the clock, use the latest time so far."""
+    """Yield messages with times that never go back. After a backward step of the clock, use the latest time so far."""
     latest_ns = 0
     for message in recorded:
         if message.recorded_ns < latest_ns:

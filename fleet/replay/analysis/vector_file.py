@@ -1,7 +1,7 @@
 """Test vector files: the raw frames of one car for some time, and the readings that a decoder must make of them.
 
-A text file with one JSON object per line. The first line names the source. Each other line is an item with `at_us`,
-microseconds since the beginning. Items from before the beginning have a time below 0:
+Such a file is a text file with one JSON object per line. The first line names the source. Each other line is an item
+with `at_us`, microseconds since the beginning. Items from before the beginning have a negative time:
 
     {"format": 1, "source": "...", "car": "red", "began": "2026-03-14T15:16:17.000Z"}
     {"at_us": -400000, "platform": "arduino"}      the platform of the car from now on
@@ -29,7 +29,7 @@ _ESTIMATED: Final = frozenset({"charge", "charge_error", "level"})
 
 
 class BadVector(Exception):
-    """A file that is not a vector. The message names the file, the line and the fault."""
+    """The file is not a vector. The message names the file, the line and the fault."""
 
 
 def select_range(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
@@ -41,7 +41,7 @@ def select_range(items: Iterable[Item], start_ns: int, end_ns: int | None) -> It
     is_inside = False
     for item in items:
         if end_ns is not None and item.at_ns >= end_ns and isinstance(item, Rx | Tx):
-            continue  # states are published later than the frames that they are about
+            continue  # states are published later than the frames that they describe, so they are still wanted
         if item.at_ns < start_ns:
             if isinstance(item, Tx) and item.at_ns >= start_ns - ECHO_S * 1e9:
                 yield item

@@ -28,10 +28,10 @@ MAX_LATENESS_S: Final = 0.25
 _HUB_POLL_INTERVAL_S: Final = 0.1
 _MAX_LISTED_TOKENS: Final = 4
 _MAX_PLAYER_QUERIES: Final = 256
-"""Maximum queries in the queue."""
+"""Maximum number of queries in the queue."""
 MAX_KEY_BYTES: Final = 65_535
 MAX_ENCODING_BYTES: Final = 255
-"""Limits of the library: it panics beyond."""
+"""Limits of Zenoh's library, which panics beyond them."""
 _NOT_IN_KEYS: Final = frozenset("*$#?")
 _RESERVED_CHARACTERS: Final = frozenset(" /*$#?")
 
@@ -48,31 +48,34 @@ class Player:
     name: str
     refuse: str
     cars_only: bool = False
-    """True if the fleet may have a live coordinator and recorder, because the recorded ones are not replayed."""
+    """True if only cars are replayed. Then the fleet may have a live coordinator and recorder."""
     published: int = 0
     late: int = 0
     """Messages published over MAX_LATENESS_S late: this machine or the bus was too slow for the rate."""
     left_out: LeftOut = field(default_factory=LeftOut)
-    """Messages that were due and not published."""
+    """Messages that were due, but could not be published."""
     _cars: list[str] = field(default_factory=list)
     _polled_s: float = 0.0
     _hub_keeper: HubKeeper = field(init=False)
     _latest: dict[tuple[str, str], tuple[bytes, str]] = field(default_factory=dict)
-    """Latest values by key; decisions by key and subject."""
+    """Latest value of each key. Of decisions, the latest one of each key and subject."""
     _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_MAX_PLAYER_QUERIES))
 
     def __post_init__(self) -> None:
         self._hub_keeper = HubKeeper(self.bus.endpoint)
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
-        """Declare the tokens of these cars, and answer queries. Raises NameTaken if there is such a fleet already."""
-        another = "name this one otherwise with --as"
+        """Declare the tokens of these cars, and answer queries.
+
+        Raises NameTaken if a fleet of this name exists already.
+        """
+        hint = "give this replay another name with --as"
         if playing := self.bus.tokens(keys.replay_token(self.name)):
-            raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {another}")
+            raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {hint}")
         if taken := sorted(token.partition("/")[2] for token in self._alive()):
             listed = ", ".join(taken[:_MAX_LISTED_TOKENS])
             more = f" and {len(taken) - _MAX_LISTED_TOKENS} more" if len(taken) > _MAX_LISTED_TOKENS else ""
-            raise NameTaken(f"fleet {self.name} is alive ({listed}{more}): {another}{self._or_cars_only(taken)}")
+            raise NameTaken(f"fleet {self.name} is alive ({listed}{more}): {hint}{self._or_cars_only(taken)}")
         for expression in ("*/*/*", "*/@cmd/*", "@coordinator/*", "@recorder/*", "@supervisor/*", "@sim/*"):
             self.bus.queryable(f"{self.name}/{expression}", self._on_query)
         title = "".join("_" if each in _RESERVED_CHARACTERS else each for each in session)
@@ -94,7 +97,7 @@ class Player:
         return ", or play only the cars with --cars-only" if tried else ""
 
     def remember(self, recorded: Iterable[Recorded]) -> None:
-        """Store messages from before the start as latest values for queries."""
+        """Keep messages from before the start as the latest values, for answers to queries."""
         for message in recorded:
             key = self._key_of(message)
             if not isinstance(key, LeftOutCause):
@@ -108,7 +111,10 @@ class Player:
         ended: Callable[[], bool],
         progress: Callable[[Recorded], object],
     ) -> None:
-        """Publish each message when it is due, counted from `origin_s` of the monotonic clock, until `ended()`."""
+        """Publish each message when it is due, until `ended()` is True.
+
+        `origin_s` is when the schedule starts (monotonic clock).
+        """
         for message in recorded:
             at_s = origin_s + schedule.due_s(message.recorded_ns)
             self.wait(at_s, ended)
@@ -149,7 +155,7 @@ class Player:
         written = f"{self.name}/{key.car}/{key.topic}"
         if not is_carried(written):
             return LeftOutCause.BAD_KEY
-        # Zenoh's library panics on a longer one.
+        # Zenoh's library panics if an encoding is longer.
         return LeftOutCause.LONG_ENCODING if len(_encoding(message).encode()) > MAX_ENCODING_BYTES else written
 
     def _publish(self, message: Recorded) -> None:
@@ -216,7 +222,10 @@ def _encoding(message: Recorded) -> str:
 
 
 def _subject(topic: Topic, payload: bytes) -> str:
-    """Return the subject of a decision: each has its own latest value. Empty for other messages."""
+    """Return the subject of a decision, because each subject has its own latest value.
+
+    Return an empty text for any other message.
+    """
     if topic.message != "fleet.v1.Decision":
         return ""
     try:
@@ -227,7 +236,7 @@ def _subject(topic: Topic, payload: bytes) -> str:
 
 
 def _identity(verb: str, query: zenoh.Query, encoding: str) -> str:
-    """Return the id that the sender gave a command, or an empty text if unreadable."""
+    """Return the id that the sender gave a command, or an empty text if the command cannot be read."""
     if verb not in COMMANDS or query.payload is None:
         return ""
     try:

@@ -1,6 +1,6 @@
 """Computes when each message of a replayed recording is due. Pure; all times are arguments.
 
-All times count from one origin, in whole nanoseconds of the recording: one late message delays no other.
+All times count from one origin, in whole nanoseconds of the recording. So a message that is late does not delay others.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ class Schedule:
 
     rate: float = 1.0
     longest_gap_ns: int | None = None
-    """Maximum pause, to which longer ones are shortened. None means no limit."""
+    """Maximum pause. Longer pauses are shortened to it. None means no limit."""
     played_ns: int = 0
     """Length of the recording played so far, with shortened pauses."""
     shortened: int = 0
@@ -31,6 +31,6 @@ class Schedule:
         return self.played_ns / 1e9 / self.rate
 
     def again(self, pause_ns: int) -> None:
-        """Restart the recording after a pause."""
+        """Let the recording begin again after a pause."""
         self.played_ns += pause_ns
         self._last_ns = None

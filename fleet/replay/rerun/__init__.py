@@ -1,1 +1,4 @@
-"""Exports sessions to Rerun and shows a running fleet there. Read `export` first; `live` does the same on the bus."""
+"""Exports sessions to Rerun and shows a running fleet there. Read `rrd_export` first.
+
+`live` does the same with a bus.
+"""

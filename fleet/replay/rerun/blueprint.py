@@ -39,9 +39,10 @@ _Overrides = dict[Any, list[Any]]
 
 
 def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.Blueprint:
-    """Return the layout for the contents of a drawing. `tab` is the car whose tab is in front (empty: the fleet's).
+    """Return the layout for the contents of a drawing. tab: the car whose tab is in front.
 
-    `last_s` is the time span in view before the cursor. None means the whole time.
+    Empty means the tab of the fleet. last_s: the time span before the cursor that is in view. None means the whole
+    time.
     """
     session = drawing.contents()
     builder = _RerunLayout(drawing, _axis(drawing.span_ns, last_s))
@@ -111,7 +112,7 @@ class _RerunLayout:
         return _two_pages(car, rrb.Horizontal(*columns, name="Car"), more, "More")
 
     def _column(self, car: str, *, tracks: bool) -> rrb.Vertical | None:
-        """Return one column of a car's first page: panels with tracks, as high as their number, or the other panels."""
+        """Return one column of a car's first page: the panels with tracks, or the panels without."""
         chosen = [panel for panel in panels.MAIN_PANELS if bool(panel.tracks) == tracks]
         views = [(view, 1 + self._track_count(car, panel)) for panel in chosen if (view := self._panel(car, panel))]
         return rrb.Vertical(*(view for view, _ in views), row_shares=[share for _, share in views]) if views else None
@@ -149,7 +150,7 @@ class _RerunLayout:
         return self._tracks(name, overrides) if overrides else None
 
     def _panel(self, car: str, panel: Panel) -> rrb.View | None:
-        """Return the view of a car's panel, or None without data. An empty `car` means a service."""
+        """Return the view of a car's panel, or None if there is no data for it. An empty `car` means a service."""
         if panel.texts:
             texts = [self._entity(car, topic) for topic in panel.texts if self._has(car, topic)]
             return _text(panel.name, texts) if texts else None
@@ -211,7 +212,10 @@ class _RerunLayout:
 
 
 def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis:
-    """Return the time axis. It is not linked with other views: linked axes ignore the range and show a minute."""
+    """Return the time axis.
+
+    It is not linked with other views, because linked axes ignore the range and show one minute.
+    """
     at = rr.TimeRangeBoundary
     if last_s is not None:
         return rrb.TimeAxis(view_range=rr.TimeRange(at.cursor_relative(seconds=-last_s), at.cursor_relative()))

@@ -1,7 +1,7 @@
 """Draws what needs several messages or fields at once: paths, LEDs, the world, marks of commands, roles.
 
-Chunks pass through unchanged. After chunks of a few topics, `Drawing` inserts derived chunks. It also collects the
-contents of the session for the layout.
+A chunk is a batch of Rerun data. All chunks pass through unchanged. After chunks of a few topics, `Drawing` inserts
+chunks derived from them. It also collects what the session contains, for the layout.
 """
 
 from collections import Counter
@@ -35,22 +35,22 @@ _CARRIED_OUT: Final = frozenset({Phase.SENT, Phase.COMPLETE})
 _LED: Final = "led"
 LED_MESSAGE: Final = COMMANDS[Verb.LED].message
 _THING_M: Final = 0.2
-"""Drawn height of things: the world is flat."""
+"""Height with which things are drawn. They have no height of their own, because the simulated world is flat."""
 _LAMP_COLOR: Final = (255, 225, 90)
 _THING_COLOR: Final = (170, 140, 110)
 _WALL_COLOR: Final = (150, 155, 165)
 _TAPE_COLOR: Final = (220, 220, 220)
 MAX_NS: Final = 2**63
-"""Times of Rerun are below."""
+"""Times in Rerun are smaller than this."""
 _Times = dict[str, Any]
 _MAX_LEDS: Final = 256
-"""Maximum LED colors that get their own color in tracks, and LED commands awaiting their outcome."""
+"""Maximum number of LED colors that tracks show in their own color, and of LED commands that await their outcome."""
 
 
 class Drawing:
-    """Derived chunks and contents of a session. `limit` is the maximum of points per path. None means no limit.
+    """Derived chunks and contents of a session. `limit` is the maximum number of points per path. None means no limit.
 
-    `car_colors` are those in the fleet file, by car.
+    `car_colors` are the colors of the cars in the fleet file.
     """
 
     def __init__(self, limit: int | None = None, car_colors: Mapping[str, Rgb] | None = None) -> None:
@@ -115,12 +115,15 @@ class Drawing:
         return panels.contents(frozenset(self.counts))
 
     def ends(self) -> Iterator[Any]:
-        """Yield the ends of stale tracks known by now, each once."""
+        """Yield the ends of the tracks that are stale by now. Each end is yielded once."""
         if self.span_ns is not None:
             yield from self._ends.chunks(self.span_ns[1])
 
     def static(self) -> Iterator[Any]:
-        """Yield the path, color and name of each car that has a place as static data, visible at any time."""
+        """Yield the path, color and name of each car whose place is known.
+
+        They are static data, so they are visible at any time.
+        """
         contents = self.contents()
         for (index, car), topic in product(enumerate(contents.cars), (panels.TRUTH, panels.POSE)):
             key = keys.topic_key(contents.fleet, car, topic)
@@ -139,13 +142,13 @@ class Drawing:
     def added_marks(
         self, marks: Iterable[Mapping[str, Any]], start_ns: int | None, end_ns: int | None
     ) -> Iterator[Any]:
-        """Yield the marks of session.json that no message has: they were added after the recording.
+        """Yield the marks of session.json that no message has, because they were added after the recording.
 
-        start_ns, end_ns (excluded): the times that are shown, ns since the epoch; None for all.
+        start_ns, end_ns (excluded): the time span that is shown, in ns since the epoch. None means no limit.
         """
         found: list[tuple[int, str]] = []
         for mark in marks:
-            with suppress(ValueError, OverflowError):  # somebody wrote this time by hand
+            with suppress(ValueError, OverflowError):  # the time may have been written by hand, and wrong
                 at_ns = round(datetime.fromisoformat(str(mark.get("time"))).timestamp() * 1000) * 1_000_000
                 if "added" in mark and (start_ns or 0) <= at_ns < (end_ns or MAX_NS):
                     found.append((at_ns, str(mark.get("text"))))
@@ -160,7 +163,7 @@ class Drawing:
     def ground(self, topic: str) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Return the lowest and highest x and y of the paths of a topic in meters, or None if it has none.
 
-        Those of the truth include the walls: a measured pose counts from an origin of its own.
+        For the truth they include the walls. A measured pose has another origin, so there the walls would mislead.
         """
         of_topic = [key for key in self._parts if panels.topic_of(key) == topic]
         paths = [points for key in of_topic if (points := self._car_path(key)) is not None]
@@ -254,7 +257,10 @@ class Drawing:
             yield self._track(path, panels.LED_REQUESTED.name, {name: at[places] for name, at in times.items()}, leds)
 
     def _led(self, event: dict[str, Any]) -> str:
-        """Return the color if this event reports an LED command as sent; the color itself is in its first event."""
+        """Return the color if this event reports an LED command as sent.
+
+        The color itself is in the first event of the command.
+        """
         if event["phase"] == Phase.ASKED:
             if len(self._requested) < _MAX_LEDS:
                 self._requested[event["id"]] = _led_color(event)
@@ -277,7 +283,10 @@ class Drawing:
 
 
 def _tints(colors: Iterable[Rgb]) -> Any:
-    """Return colors as 0xRRGGBBAA. Rerun would take four RGB triples for three RGBA colors."""
+    """Return colors as 0xRRGGBBAA.
+
+    As bytes they would be ambiguous: Rerun would read four RGB colors as three RGBA colors.
+    """
     return np.array([int.from_bytes((*each, 255), "big") for each in colors], dtype=np.uint32)
 
 
@@ -286,7 +295,7 @@ def _indexes(times: _Times) -> list[Any]:
 
 
 def _with_ends(times: _Times, marks: list[str]) -> tuple[_Times, list[str | None]]:
-    """End each mark after MAX_MARK_S, unless another begins before."""
+    """End each mark after MAX_MARK_S, unless another mark begins earlier."""
     length = np.timedelta64(int(MAX_MARK_S * 1e9), "ns")
     clock = times[TIMELINES[0]]
     ends = [place for place in range(len(marks)) if place + 1 == len(marks) or clock[place + 1] - clock[place] > length]

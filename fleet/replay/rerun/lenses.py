@@ -1,6 +1,7 @@
 """Rerun lenses that derive tracks, lines of text, curves and arrows from messages.
 
-They process whole batches, and single messages only for rare texts.
+A lens is a function that Rerun applies to each batch of messages. Ours process the whole batch at once, except for a
+few rare texts.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,7 +24,7 @@ MESSAGE_SUFFIX: Final = ":message"
 TEXT: Final = "TextLog:text"
 """Component to which Rerun's reader converts a foxglove.Log."""
 RAW: Final = "McapMessage:data"
-"""Component of a message that Rerun's reader cannot decode: its bytes."""
+"""Component with the bytes of a message that Rerun's reader cannot decode."""
 
 _ARROW_M: Final = 0.25
 """Length of the arrow of a car."""
@@ -36,9 +37,9 @@ def component(topic: str) -> str:
 
 
 def is_drawn(topic: str, names: Iterable[str]) -> bool:
-    """Return True if a chunk with these components has messages of the own type of its topic.
+    """Return True if a chunk with these components has messages of the type that its topic must have.
 
-    For a topic that is not ours, any type that Rerun decodes counts.
+    For a topic that is not ours, any type that Rerun decodes will do.
     """
     if topic not in TOPICS:
         return RAW not in names
@@ -46,7 +47,7 @@ def is_drawn(topic: str, names: Iterable[str]) -> bool:
 
 
 def lenses() -> list[Any]:
-    """Return one lens per message type with derived parts. Curves of plain fields need no lens."""
+    """Return one lens for each topic from which something is derived. Curves of plain fields need no lens."""
     derived: dict[str, Any] = {}
 
     def lens(topic: str) -> Any:

@@ -1,8 +1,8 @@
 """Shows a running fleet in Rerun, as one more subscriber of the bus.
 
-Twice a second the new messages become a small MCAP, and pass Rerun's reader, the lenses and the drawings as a recording
-does. A thread drains the subscriptions. If the viewer stalls, further messages are counted and dropped, so that memory
-stays bounded.
+Twice a second the new messages are written to a small MCAP file, which then passes Rerun's reader, the lenses and the
+drawings as a recording does. A thread drains the subscriptions. If the viewer stalls, further messages are counted and
+dropped, so that memory stays bounded.
 """
 
 import tempfile
@@ -32,16 +32,16 @@ from schemas.bus import Bus, Sample, sample_of
 VIEW_INTERVAL_S: Final = 0.5
 VIEW_READ_INTERVAL_S: Final = 0.02
 VIEW_QUEUE_SIZE: Final = 16_384
-"""Maximum messages in the queue of one subscription."""
+"""Maximum number of messages in the queue of one subscription."""
 MAX_WAITING_MESSAGES: Final = 50_000
-"""Maximum messages in the queue to the viewer."""
+"""Maximum number of messages in the queue to the viewer."""
 MAX_PATH_POINTS: Final = 3_000
-"""Maximum points of the path of each simulated car: five minutes."""
+"""Maximum number of points of the path of each simulated car: five minutes."""
 DEFAULT_VIEW_S: Final = 120.0
 """Time span in view. The view can also show all."""
 VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
 COORDINATOR_TIMEOUT_S: Final = 3.0
-"""Timeout for the coordinator's answer; skipped if there is no coordinator."""
+"""Timeout for the coordinator's answer. If there is no coordinator, nobody waits."""
 
 
 class Live:
@@ -115,7 +115,7 @@ class Live:
         return tuple(self._drawing.contents().cars)
 
     def close(self, *, send: bool = True) -> None:
-        """End, and first send the queued messages if `send`."""
+        """End the connection to the viewer. If `send`, send the queued messages first."""
         self._closing.set()
         if self._reader.is_alive():
             self._reader.join()
@@ -123,13 +123,13 @@ class Live:
             subscriber.undeclare()
         if send:
             if self._last_s is None:
-                self._layout_contents = frozenset()  # the layout needs the whole time span, known only now
+                self._layout_contents = frozenset()  # the layout needs the whole time span, which is known only now
             self.step()
         self._recording.disconnect()
         self._scratch.cleanup()
 
     def _update_layout(self) -> None:
-        """Send a new layout, but only if there is new content: it replaces the layout of the user."""
+        """Send a new layout, but only if there is new content, because it replaces what the user has arranged."""
         contents = frozenset(self._drawing.counts) | self._drawing.tracks
         if contents == self._layout_contents:
             return
@@ -166,7 +166,7 @@ class Live:
 
 
 def _write(path: Path, batch: list[Sample], left_out: LeftOut) -> None:
-    """Write the messages of a batch that Rerun shows to an MCAP, and count the others."""
+    """Write those messages of a batch that Rerun can show to an MCAP file, and count the rest."""
     now = time.time_ns()
     schemas: dict[str, int] = {}
     channels: dict[str, tuple[str, int]] = {}

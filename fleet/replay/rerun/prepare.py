@@ -1,8 +1,9 @@
-"""Prepares the files of a session for Rerun's MCAP reader, which shows only a part of some of them.
+"""Prepares the files of a session for Rerun's MCAP reader, which shows only a part of some files.
 
-Its reader picks one schema for each key at random, skips chunks without message indexes, refuses files without chunks,
+The reader picks one schema for each key at random, skips chunks without message indexes, refuses files without chunks,
 shows chunks that fail their checksum, and aborts the process on an enum number without a name. If a session has any of
-these, its messages are copied first: into one file for the first schema of each key, another for the second, and so on.
+these, its messages are copied first: those of the first schema of each key into one file, those of the second into
+another, and so on.
 """
 
 from collections import Counter
@@ -22,23 +23,23 @@ from fleet.recording.selection import Selection
 
 Wanted = Callable[[str], bool]
 MAX_VARIANTS: Final = 16
-"""Maximum copies. More schemas on one key than this share the last."""
+"""Maximum number of copies. If a key has more schemas than this, the remaining ones share the last copy."""
 
 
 @dataclass(slots=True)
 class Prepared:
-    """Files to give to Rerun, and what was recorded."""
+    """The files to give to Rerun, and the number of messages that were recorded."""
 
     files: list[Path]
     recorded: Counter[str] = field(default_factory=Counter)
-    """Messages by key, including those of `left_out`, which are not in the files."""
+    """Number of messages by key. It includes the messages of `left_out`, which are not in the files."""
     left_out: LeftOut = field(default_factory=LeftOut)
 
 
 def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole: bool) -> Prepared | None:
-    """Return the session's own files if Rerun can read them as they are, else None.
+    """Return the session's own files if Rerun can read them as they are, else None. wanted: see `copied`.
 
-    wanted: as for `copied`. `whole` is True if all of the session is selected.
+    whole: True if the selection is the whole session.
     """
     indexes = list(session.indexes().values())
     if session.damage or len(indexes) != len(session.segments):
@@ -69,9 +70,10 @@ def as_recorded(session: Session, selection: Selection, wanted: Wanted, *, whole
 def copied(
     session: Session, selection: Selection, wanted: Wanted, scratch: Path, refused: Collection[str] = ()
 ) -> Prepared:
-    """Copy the messages into files that Rerun reads whole. Raises OSError if they cannot be written.
+    """Copy the messages into files that Rerun reads completely. Raises OSError if they cannot be written.
 
-    wanted: whether to copy a key. scratch: an existing directory. refused: names of schemas that Rerun refuses.
+    wanted: returns True for a key to copy. scratch: an existing directory. refused: names of schemas that Rerun
+    refuses.
     """
     prepared = Prepared([])
     decoder = MessageDecoder()
@@ -108,7 +110,7 @@ def copied(
 
 
 def unreadable(session: Session, selection: Selection, wanted: Wanted) -> Counter[str]:
-    """Return the messages of the wanted keys that do not match their schema, by key."""
+    """Return the number of messages that do not match their schema, for each of the wanted keys."""
     decoder = MessageDecoder()
     found: Counter[str] = Counter()
     for row in session.rows(selection):
@@ -131,13 +133,16 @@ def _is_plain(index: Index) -> bool:
 
 
 def _schema_of(info: ChannelInfo) -> tuple[str, str, bytes]:
-    """Return what decides how Rerun reads a channel."""
+    """Return the properties of a channel by which Rerun decides how to read it."""
     schema = info.schema
     return (info.channel.message_encoding, "", b"") if schema is None else (schema.encoding, schema.name, schema.data)
 
 
 def _refusal(decoder: MessageDecoder, info: ChannelInfo, refused: Collection[str] = ()) -> LeftOutCause | None:
-    """Return why a channel must not reach Rerun. One bad schema would fail its reader for all keys."""
+    """Return why a channel must not reach Rerun, or None.
+
+    One bad schema would make Rerun's reader fail for all keys.
+    """
     if info.schema is not None and info.schema.encoding == "protobuf":
         if info.channel.message_encoding != "protobuf":
             return LeftOutCause.NOT_PROTOBUF

@@ -1,6 +1,7 @@
-"""Exports a session to an .rrd with its layout, using Rerun's MCAP reader and lenses, and counts the messages of one.
+"""Exports a session to an .rrd file with its layout, using Rerun's MCAP reader and lenses.
 
-The .rrd contains every message unchanged. lenses.py and drawings.py add what the viewer draws.
+Also counts the messages of an .rrd. The .rrd contains every message unchanged. lenses.py and drawings.py add what the
+viewer draws.
 """
 
 import re
@@ -33,7 +34,8 @@ from schemas.topics import TOPICS
 
 APPLICATION: Final = "zenoh-car-fleet"
 _BAD_SCHEMA: Final = re.compile(r"Invalid schema ([\w.]+)")
-"""In Rerun's error for a file with a damaged schema that we can read. It reads nothing of such a file."""
+"""Found in Rerun's error for a file that has a damaged schema. We can read such a file, but Rerun reads nothing of
+it."""
 _INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
 _TOPIC: Final = "McapChannel:topic"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
@@ -45,7 +47,7 @@ class ExportFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Part of a session to show: cars (the fleet's services are always included) and a time span."""
+    """The part of a session to show: cars and a time span. The fleet's services are always included."""
 
     cars: tuple[str, ...] = ()
     """Empty means all cars."""
@@ -79,7 +81,7 @@ class Part:
 
     @property
     def words(self) -> str:
-        """Return the end of the message "holds no message of a fleet"."""
+        """Return the end of the messages of NoSession, which say that there is nothing to show."""
         return "" if self == WHOLE_SESSION else " of these cars in this time"
 
 
@@ -96,10 +98,10 @@ class _SchemaRefused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """The recorded messages by result: recorded = shown + left out."""
+    """What became of the recorded messages. Each is either shown or left out."""
 
     shown: Counter[str]
-    """Messages by key."""
+    """Number of messages by key."""
     left_out: LeftOut
 
 
@@ -111,9 +113,10 @@ def export(
     tab: str = "",
     seen: Callable[[int], None] = lambda _: None,
 ) -> Replayed:
-    """Write `out`, and return its messages. Raises OSError, ExportFailed, and NoSession without a message of a fleet.
+    """Write `out`, and return which messages it shows.
 
-    `tab` names the car whose tab is in front. `seen` is called with the number of messages read since its last call.
+    Raises OSError, ExportFailed, and NoSession if there is no message of a fleet. tab: the car whose tab is in front.
+    seen: called with the number of messages read since the last call.
     """
     whole = part == WHOLE_SESSION
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
@@ -128,7 +131,8 @@ def export(
             except _SchemaRefused as error:
                 refused.add(error.name)
         while replayed is None:
-            # Rerun reads less than there is. A copy costs time and disk space, so it is not made for each session.
+            # Rerun cannot read all messages of the files, so copy them. A copy costs time and disk space, so it is made
+            # only now.
             place = Path(scratch) / str(len(refused))
             place.mkdir()
             copies = copied(session, part.selection, part.has_key, place, refused)
@@ -165,14 +169,15 @@ def _write(
     stream = rrc.LazyChunkStream.from_iter(drawing.follow(tally.follow(stream, seen))).lenses(
         lenses(), output_mode="forward_all"
     )
-    # Only the file of a recording stream carries a layout. The layout comes last: it depends on all messages.
+    # Only a file that a recording stream writes has a layout. The layout is sent last, because it depends on all
+    # messages.
     recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
     recording.save(rrd)
     try:
         recording.send_chunks(stream)
     except RuntimeError as error:
         words = " ".join(str(error).split())
-        if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun passes on only the text
+        if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun turns the exception into text
             raise KeyboardInterrupt from None
         if refused := _BAD_SCHEMA.search(words):
             recording.disconnect()
@@ -193,7 +198,7 @@ def _write(
     recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
     recording.disconnect()
     try:
-        # Rerun's writer does not report a full disk. So read the file back: a truncated one has no index.
+        # Rerun's writer does not report a full disk. So read the file back: if it is truncated, it has no index.
         with warnings.catch_warnings(action="ignore"):
             rrc.RrdReader(rrd).store()
     except (RuntimeError, ValueError):
@@ -205,7 +210,7 @@ def _write(
 
 
 def _name_missed(session: Session, part: Part, missed: Counter[str], left_out: LeftOut) -> None:
-    """Add the messages that Rerun did not read. It skips those that do not match their schema."""
+    """Add the messages that Rerun did not read to `left_out`. It skips messages that do not match their schema."""
     bad = unreadable(session, part.selection, missed.__contains__) if missed else Counter[str]()
     for key, count in missed.items():
         known = min(count, bad[key])
@@ -220,7 +225,7 @@ class _Tally:
         self._shown: Counter[str] = Counter()
         self._others: Counter[tuple[str, LeftOutCause]] = Counter()
         self._keys: dict[str, set[str]] = {}
-        """Keys by entity. Rerun gives one entity to some that differ only in odd characters."""
+        """Keys by entity. Keys that differ only in unusual characters may have the same entity in Rerun."""
 
     def follow(self, chunks: Iterable[rrc.Chunk], seen: Callable[[int], None]) -> Iterator[rrc.Chunk]:
         """Pass on chunks and count their messages."""
@@ -240,7 +245,7 @@ class _Tally:
                 seen(chunk.num_rows)
 
     def compare(self, prepared: Prepared) -> tuple[Replayed, Counter[str]]:
-        """Return what became of the recorded messages, and those that Rerun did not yield, by key."""
+        """Return what became of the recorded messages, and how many Rerun did not yield, by key."""
         replayed = Replayed(Counter(), LeftOut(Counter(prepared.left_out.counts)))
         left = Counter(prepared.recorded)
         left.subtract(prepared.left_out.by_key())
@@ -253,7 +258,7 @@ class _Tally:
         return replayed, +left
 
     def _spread(self, entity: str, count: int, left: Counter[str]) -> Iterator[tuple[str, int]]:
-        """Take the messages of an entity from those of its keys."""
+        """Divide the messages of an entity among its keys. Subtract each share from `left`, and yield it."""
         for key in sorted(self._keys.get(entity, ())):
             part = min(count, left[key])
             if part > 0:
@@ -263,12 +268,12 @@ class _Tally:
 
 
 def count_of(session: Session) -> int:
-    """Return the number of messages of a session from the indexes of its files; 0 if unknown."""
+    """Return the number of messages of a session from the indexes of its files, or 0 if it is unknown."""
     return total(session) or 0
 
 
 def rows(path: Path) -> Counter[str]:
-    """Return the drawn messages of an .rrd by key, counted with Rerun's reader."""
+    """Return the number of drawn messages of an .rrd by key, counted with Rerun's reader."""
     counted: Counter[str] = Counter()
     for chunk in rrc.RrdReader(path).store().stream():
         if chunk.is_static:

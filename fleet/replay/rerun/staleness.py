@@ -1,6 +1,6 @@
 """Ends state tracks whose topic became stale, so that the viewer does not extend the last state forever.
 
-A topic is stale after the time in schemas/topics.py. Each longer gap between its messages becomes an end of its tracks.
+A topic is stale if no message came for the time in schemas/topics.py. At each gap that is longer, its tracks end.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,13 +32,13 @@ class _Run(NamedTuple):
 
 
 class StaleStates:
-    """Message times of every entity with state tracks."""
+    """The message times of each entity that has state tracks."""
 
     def __init__(self) -> None:
         self._runs: dict[str, list[_Run]] = {}
         self._topics: dict[str, str] = {}
         self._ended_ns: dict[str, int] = {}
-        """Time of the last message before the latest end drawn, by entity."""
+        """By entity, the time of the last message before the latest end that was drawn."""
 
     def add(self, path: str, topic: str, batch: Any) -> None:
         """Add the times of messages of an entity, in any order."""
@@ -56,7 +56,7 @@ class StaleStates:
         )
 
     def chunks(self, now_ns: int) -> Iterator[Any]:
-        """Yield the ends that were not drawn yet. `now_ns` is the publish time of the newest message of all."""
+        """Yield the ends that were not drawn yet. `now_ns` is the publish time of the newest message of the session."""
         for path, runs in self._runs.items():
             topic = self._topics[path]
             stale_ns = _stale_ns(topic)
@@ -98,7 +98,7 @@ def _stale_ns(topic: str) -> int:
 
 
 def _tracks() -> dict[str, dict[str, Any]]:
-    """Return the tracks and types of their states, by topic that can be stale."""
+    """Return the tracks and the types of their states, for each topic that can be stale."""
     found: dict[str, dict[str, Any]] = {}
     for part in panels.parts():
         if isinstance(part, StateTrack) and not part.drawn and TOPICS[part.topic].stale_after_s is not None:

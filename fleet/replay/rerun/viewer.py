@@ -27,7 +27,7 @@ def environment() -> dict[str, str]:
 
 
 def program() -> Path:
-    """Return the path of Rerun's program. The `rerun` on PATH is a wrapper: ending it leaves the viewer running."""
+    """Return the path of Rerun's program. The `rerun` on PATH is only a wrapper: if one ends it, the viewer runs on."""
     import rerun_cli  # type: ignore[import-untyped]  # only a wrapper around the program
 
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
@@ -46,7 +46,7 @@ class NoViewer(Exception):
 
 
 class Viewer:
-    """Rerun's program, bound to loopback: a context manager. It ends with `close`, or with our process."""
+    """Rerun's program, bound to loopback. A context manager. The program ends with `close`, or with our process."""
 
     def __init__(self, *arguments: str, extra: Mapping[str, str] = MappingProxyType({})) -> None:
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
@@ -59,7 +59,8 @@ class Viewer:
             VIEWER_HOST,
             *arguments,
         ]
-        # In its own process group: Ctrl-C at the terminal reaches only us, and we end it after pending work.
+        # The viewer is in its own process group. So Ctrl-C at the terminal reaches only us, and we end it after pending
+        # work.
         self._guard = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -80,11 +81,14 @@ class Viewer:
 
     @property
     def ended(self) -> int | None:
-        """Return its exit code, or None while it runs."""
+        """Return the exit code of the viewer, or None while it runs."""
         return self._guard.poll()
 
     def wait(self, seconds: float | None = None) -> int | None:
-        """Wait until its window is closed. Return the exit code, or None after `seconds`."""
+        """Wait until the viewer's window is closed.
+
+        Return the exit code, or None if it is still open after `seconds`.
+        """
         try:
             return self._guard.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -103,13 +107,13 @@ class Viewer:
 
     @property
     def last_error(self) -> str:
-        """Return its last line on stderr."""
+        """Return the viewer's last line on stderr."""
         self._stderr.seek(0)
         lines = self._stderr.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it printed nothing"
 
     def close(self) -> None:
-        """End it if it still runs."""
+        """End the viewer if it still runs."""
         for stream in (self._guard.stdin, self._guard.stdout):
             if stream is not None:
                 stream.close()
