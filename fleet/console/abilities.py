@@ -1,4 +1,4 @@
-"""The abilities of a car, with the reasons of those that it lacks, from the states of its gateway. Pure."""
+"""The abilities of a car, and the reason for each that it lacks, computed from the states of its gateway. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

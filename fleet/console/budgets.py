@@ -1,8 +1,8 @@
 """How much one page, one device and one person may ask of the console. Pure: time is an argument (s, monotonic).
 
-The console stops the cars for everybody, on one loop. A page that sends without a pause must cost nobody but itself.
-So each has a budget, far above what our own page can send, and a page that exceeds it is closed. STOP is merged and
-never dropped: it has no budget here, and a page that was closed still stops all cars by POST.
+The console stops the cars for everybody, on one loop. So a page that sends without a pause must not slow down the
+others. Each has a budget far above what our own page can send, and a page that exceeds its budget is closed. STOP has
+no budget here: repeated STOPs are merged and never dropped, and a page that was closed still stops all cars by POST.
 """
 
 from collections import Counter
@@ -19,26 +19,28 @@ PAGE_RATE: Final = 160.0
 """Messages of one page: at once, and per second."""
 DEVICE_BURST: Final = 10_000.0
 DEVICE_RATE: Final = 320.0
-"""The same for all pages of one device."""
+"""Messages of all pages of one device: at once, and per second."""
 REQUEST_BURST: Final = 1000.0
 REQUEST_RATE: Final = 50.0
 """HTTP requests of one device other than STOP: a page loads some 25 files."""
 CHECK_BURST: Final = 20.0
 CHECK_RATE: Final = 1.0
-"""Checks of plans of one person: a person who writes one asks for one in ten seconds."""
+"""Checks of plans by one person. A person who writes a plan asks for one check in ten seconds."""
 MAX_OPEN_CHECKS: Final = 2
-"""Maximum number of checks of one person that wait. Others wait for those of each person before them."""
+"""Maximum number of checks of one person that wait. The checks of all persons before them delay the checks of the
+others."""
 COOLDOWN_S: Final = 15.0
-"""Time for which a device whose page was closed opens no other one."""
-# A person clicks some two times a second: 60 commands at once after 30 s of slow Wi-Fi. The rate is ten times that, and
-# the burst three times: each command costs every gateway that is asked.
+"""Time for which a device whose page was closed cannot open another page."""
+# A person clicks about twice a second. After 30 s of slow Wi-Fi 60 commands arrive at once. The rate is ten times that
+# of a person, but the burst only three times the 60, because each command costs time in every gateway that it asks.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
 """Commands of a device that ask gateways, at once and per second. A press counts once, even if it turns."""
 MAX_OPEN_COMMANDS: Final = 16
-"""Maximum commands of one device without an outcome. One command may be for many cars."""
+"""Maximum number of commands of one device that have no outcome yet. One command may be for many cars."""
 MAX_BUDGETS: Final = 1024
-"""Maximum number of remembered persons, devices and strangers. The one that was idle the longest is forgotten."""
+"""Maximum number of remembered persons, devices and strangers. Beyond it, the one that was idle the longest is
+forgotten."""
 MERGE_S: Final = 0.1
 """Time for which further STOPs of one person are merged into one that follows."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
@@ -69,7 +71,10 @@ class Budgets:
     """The number of commands without an outcome, of each device that has any."""
 
     def may_send(self, device: Hashable, page: TokenBucket, now: float) -> bool:
-        """Count a message. Return False if the page has to be closed: it, or its device, has sent too many."""
+        """Count a message.
+
+        Return False if the page has to be closed because the page or its device has sent too many.
+        """
         one = self._of(device)
         if page.take_one(now) and one.messages.take_one(now):
             return True
@@ -123,7 +128,7 @@ class Budgets:
 
 @dataclass(slots=True)
 class StopMerge:
-    """Merges the STOPs of one person: the first goes at once, all others of the next moment become one more."""
+    """Merges the STOPs of one person. The first is sent at once. All others within MERGE_S become one more STOP."""
 
     _open_at: float = float("-inf")
 

@@ -14,7 +14,10 @@ log = logging.getLogger("fleet")
 
 
 def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, Any] | None:
-    """Return the key and the message. None if it is not the message of its key, which is logged at this level."""
+    """Return the key and the message.
+
+    Return None, and log it at this level, if the message is not of the type of its key.
+    """
     topic, key = topics.of_key(sample.key), keys.parse(sample.key)
     if topic is None or key is None:
         return None
@@ -33,12 +36,18 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
 
 
 def is_shown(name: str) -> bool:
-    """Return True for the name of a service, and for one that a car may have. Others could look like that of a car."""
+    """Return True for the name of a service, and for a name that a car may have.
+
+    Any other name could look like a car's.
+    """
     return name.startswith("@") or keys.is_name(name)
 
 
 def is_finite(message: Any) -> bool:
-    """Return True if all numbers of a message are finite. Others are not JSON, and no page could read its state."""
+    """Return True if all numbers of a message are finite.
+
+    JSON has no other numbers, so a page could not read its state.
+    """
     return all(_is_finite(value) for _, value in message.ListFields())
 
 

@@ -20,7 +20,7 @@ from schemas.rights import Authority, People, binding_pause
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0
-"""Time over which the trend of a battery is measured."""
+"""The trend of a battery is measured over this time."""
 TREND_SAMPLE_INTERVAL_S: Final = 5.0
 _MIN_TREND_S: Final = 30.0
 """Minimum time of readings for a trend."""
@@ -29,7 +29,8 @@ TREND_STEADY_V: Final = 0.03
 MAX_LEDGER_ENTRIES: Final = 60
 """Maximum commands and log records of a car that a page can show."""
 SILENT_AFTER_S: Final = topics.TOPICS["state/safety"].stale_after_s or 0.0
-"""Time without any message of a car, after which its card says how old it is: its gateway repeats this state."""
+"""After this time without any message of a car, its card says how old its state is. A live gateway repeats the
+state."""
 MAX_LISTED_CARS: Final = MAX_CARS
 """Maximum number of cars of the running fleet: as many as one message of a page may name."""
 # Without `fleet up` nobody lists the cars. Fifty gateways are the most that were measured on one bus. A place costs a
@@ -47,7 +48,7 @@ class BatteryTrend:
     _samples: deque[tuple[float, float]] = field(default_factory=deque)
 
     def add(self, voltage_v: float, now: float) -> None:
-        """Add a voltage. Skip most of them: a trend needs few."""
+        """Add a voltage. Skip most voltages, because a trend needs only a few."""
         if self._samples and now - self._samples[-1][0] < TREND_SAMPLE_INTERVAL_S:
             return
         self._samples.append((now, voltage_v))
@@ -120,7 +121,7 @@ class CarView:
                     self.authority, self.names_people = Authority.of(value), True
 
     def on_presence(self, now: float, *, present: bool) -> None:
-        """Handle that the car's gateway is on the bus, or not."""
+        """Handle that the car's gateway has joined or left the bus."""
         if self._changed_at is None:
             self.state.present = present
         elif present is self.state.present:
@@ -134,7 +135,7 @@ class CarView:
         return None if self.state.present else self._changed_at
 
     def describe_gateway(self) -> list[tuple[str, str]]:
-        """Return what the car's gateway knows, as names and texts. A gateway that is gone knows nothing any more."""
+        """Return what the car's gateway knows, as names and texts. It is empty if the gateway is gone."""
         if self._gone_at is not None:
             return []
         return describe_gateway(*(self.state.of(f"state/{name}") for name in ("link", "health", "safety", "mode")))
@@ -145,13 +146,16 @@ class CarView:
         evidence = CarEvidence(
             state, now, [(now - at, event) for at, event in self._events], clock_off_s=self._clock.off_s
         )
-        # Recorder and plan have pages of their own.
+        # The recorder and the plan have their own pages.
         doubts = doubtful(evidence)
         facts = [(name, words, name in doubts) for name, words in describe(evidence) if name != "services"]
         return {"findings": [str(finding) for finding in diagnose(evidence)], "facts": facts}
 
     def as_dict(self, now: float) -> dict[str, Any]:
-        """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""
+        """Return what a page shows of the car, as JSON values.
+
+        Numbers are rounded, so that most are the same the next time.
+        """
         shown: dict[str, Any] = {"name": self.name, "color": self.color}
         shown["gateway"] = self.state.present and self._changed_at is not None
         if self._gone_at is not None:
@@ -168,7 +172,7 @@ class CarView:
         claim = self.state.claims(now).link
         if claim.is_stale or (claim.age_s is None and claim.past is None):
             return {"link": {"state": UNKNOWN, "reason": "", "since_s": 0}}
-        # A growing number that nobody needs would draw the card each second.
+        # A growing number that nobody needs would make the page draw the card again each second.
         is_calm = claim.past is not None or claim.what == LinkState.ONLINE
         since_s = 0 if is_calm else int(claim.since_s or 0)
         return {"link": {"state": claim.what, "reason": claim.why, "since_s": since_s}}
@@ -283,14 +287,17 @@ class FleetView:
         self._cars: dict[str, CarView] = {}
         self._listed: frozenset[str] = frozenset()
         self.left_out = ""
-        """The first car without a place, or the car that gave its place up. Empty if there is no such car."""
+        """The first car for which there was no place, or the car that lost its place. Empty if there is no such car."""
 
     def list_cars(self, names: Iterable[str]) -> None:
-        """Set the cars that the running fleet lists. Those over the maximum are as any other."""
+        """Set the cars that the running fleet lists.
+
+        Cars beyond the maximum are treated as cars that it does not list.
+        """
         self._listed = frozenset(islice(filter(keys.is_name, names), MAX_LISTED_CARS))
 
     def on_message(self, name: str, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
-        """Handle a message of a car, as `CarView` does. Without a place for the car, nothing is kept."""
+        """Handle a message of a car, as `CarView` does. If there is no place for the car, the message is ignored."""
         if (car := self._placed(name, now)) is not None:
             car.on_message(topic, value, now, wall_ns)
 

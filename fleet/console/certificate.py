@@ -25,7 +25,7 @@ MAX_NAMES: Final = 24
 
 
 class BadKeyFile(OSError):
-    """The key file is not a key."""
+    """The key file does not contain a key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,15 @@ class Certificate:
     """SHA-256, as browsers show it."""
 
     def load_into(self, context: ssl.SSLContext) -> None:
-        """Use it for new connections."""
+        """Use this certificate for new connections."""
         context.load_cert_chain(self.path, self.key_path)
 
 
 def names_to_certify(current: Iterable[str], certified: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of a new certificate: the current ones, and earlier ones, so that a move back needs none."""
+    """Return the names of a new certificate: the current names, and earlier ones.
+
+    So a computer that returns to an earlier network needs no new certificate.
+    """
     return tuple(dict.fromkeys((*current, *certified)))[:MAX_NAMES]
 
 
@@ -56,7 +59,10 @@ def needs_renewal(current: Iterable[str], certified: Iterable[str], expires: dat
 
 
 def ensure_certificate(names: Iterable[str], now: datetime | None = None, directory: Path | None = None) -> Certificate:
-    """Return the certificate. Make the key, once, and a new certificate if it is needed. Raises OSError."""
+    """Return the certificate. Make the key if there is none yet, and a new certificate if one is needed.
+
+    Raises OSError.
+    """
     now = datetime.now(UTC) if now is None else now
     directory = default_directory() / "console" if directory is None else directory
     directory.mkdir(parents=True, exist_ok=True)
@@ -90,7 +96,7 @@ def _ensure_key(path: Path) -> Any:
 
 
 def _read(path: Path, key_path: Path, key: Any) -> Certificate | None:
-    """Return the stored certificate. None if there is none of this key."""
+    """Return the stored certificate, or None if there is no certificate of this key."""
     try:
         found = x509.load_pem_x509_certificate(path.read_bytes())
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value

@@ -1,4 +1,7 @@
-"""The commands of one car: who requested what, what its gateway decided, what went on the wire, what shows it. Pure."""
+"""The commands of one car: who requested what, what its gateway decided, what was sent, and which readings show it.
+
+Pure.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,7 +18,7 @@ MAX_WIRE_FRAMES: Final = 6
 
 @dataclass(slots=True)
 class LedgerCommand:
-    """One command, from its first event on."""
+    """One command since its first event."""
 
     at_ms: int
     requested: str
@@ -31,7 +34,8 @@ class CommandLedger:
     def __init__(self) -> None:
         self._commands: dict[str, LedgerCommand] = {}
         self._early: dict[str, list[str]] = {}
-        """Frames by command, of commands without an event so far: the two come over two subscriptions, in any order."""
+        """Frames of commands that have no event yet, by command. Frames and events come over two subscriptions, in any
+        order."""
 
     def on_event(self, event: Any) -> None:
         """Handle a command event."""
@@ -77,6 +81,6 @@ class CommandLedger:
 
 
 def _limit(by_id: dict[str, Any]) -> None:
-    """Keep the newest only."""
+    """Drop all but the newest."""
     while len(by_id) > MAX_COMMANDS:
         del by_id[next(iter(by_id))]

@@ -1,8 +1,7 @@
 """How many connections from the network the console keeps. Pure: time is an argument (s, monotonic).
 
-`waiting_room` decides when a connection begins TLS, and is counted here.
-
-Strangers must not use up the file descriptors and the time of the process that stops the cars.
+A connection is counted here from the moment when it begins TLS, which `waiting_room` decides. Strangers must not use up
+the file descriptors and the time of the process that stops the cars.
 """
 
 from collections.abc import Hashable
@@ -10,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_CONNECTIONS: Final = 640
-"""Maximum number of connections from the network: forty devices that take all they may."""
+"""Maximum number of connections from the network: forty devices, each with as many as it may have."""
 MAX_PER_DEVICE: Final = 16
 """Maximum number of connections of one paired device: a browser opens six for requests, and one for each tab."""
 MAX_STRANGERS_PER_ADDRESS: Final = 24
@@ -33,7 +32,10 @@ class ConnectionLimit:
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
-        """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
+        """Decide on a new connection.
+
+        Return whether it stays, and the key of another connection that must end for it.
+        """
         strangers = [other for other, each in self._open.items() if not each.device]
         neighbors = [other for other in strangers if self._open[other].address == address]
         ended: Hashable | None = None
@@ -49,7 +51,7 @@ class ConnectionLimit:
         return True, ended
 
     def on_paired(self, key: Hashable, device: str) -> bool:
-        """Keep a connection: it has shown the cookie of a paired device. Return False if the device has too many."""
+        """Keep a connection that has shown the cookie of a paired device. Return False if the device has too many."""
         found = self._open.get(key)
         if found is None or found.device == device:
             return True
@@ -76,14 +78,17 @@ class ConnectionLimit:
 
 @dataclass(slots=True)
 class LogLimit:
-    """Lets one message pass for each interval, and counts the others."""
+    """Lets one message pass in each interval, and counts the messages that it holds back."""
 
     interval_s: float = 10.0
     _last: float | None = None
     _left_out: int = 0
 
     def words(self, words: str, now: float) -> str | None:
-        """Return what to log: the words, with the number of messages left out before. None means nothing."""
+        """Return what to log: the words, with the number of messages left out before.
+
+        None means that nothing is to be logged.
+        """
         if self._last is not None and now - self._last < self.interval_s:
             self._left_out += 1
             return None

@@ -54,22 +54,23 @@ MAX_PAGES: Final = 96
 MAX_PAGES_OF_DEVICE: Final = 8
 """Maximum number of connected pages of one device on the network."""
 MAX_PAGES_OF_GUEST: Final = 2
-"""The same of one guest. All guests together have one for each of them, so that some places are left for persons."""
+"""Maximum number of connected pages of one guest. All guests together may have MAX_GUESTS pages, so that some
+places are left for persons."""
 KEPT_FOR_LEADS: Final = 8
 KEPT_FOR_THIS_COMPUTER: Final = 8
-"""Pages that are kept for leads, and for this computer."""
+"""Number of pages that are reserved for leads and for this computer."""
 STOP_ANSWER_TIMEOUT_S: Final = 1.0
-"""Timeout for the first answer to a STOP by POST. Of fifty gateways on two busy cores, the last takes 0.11 s."""
+"""Timeout for the first answer to a STOP by POST. With fifty gateways on two busy cores, the last takes 0.11 s."""
 _MAX_EVENTS: Final = 4096
 _MAX_MERGES: Final = 256
-"""Number of remembered merges of stops, by person and cars."""
+"""Maximum number of remembered merges of stops, by person and cars."""
 _MAX_STOP_IDS: Final = 256
-"""Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
+"""Number of remembered STOP presses. Each press arrives twice: over the socket and by fetch."""
 
 GUEST_MESSAGES: Final = frozenset(
     {"echo", "ping", Verb.STOP, "plot", "lanes", "lanes_end", "map", "map_end", "inspect", "inspect_end"}
 )
-"""Messages that a page of a guest may send, beside stops of some cars: it watches."""
+"""Messages that a page of a guest may send, besides stops of some cars. A guest only watches."""
 
 OnOutcomes = Callable[[list[dict[str, Any]]], object]
 _BUS_LOST: Final = "The console has lost the bus. Press again when it is back."
@@ -93,11 +94,11 @@ class Console:
         self._presses = PressBook()
         self._view = FleetView(self._color_of)
         self._colors: Mapping[str, Rgb] = {}
-        """The colors of the cars, as the running fleet says. `fleet reload` changes them."""
+        """The colors of the cars in the running fleet. `fleet reload` may change them."""
         self.groups: Mapping[str, Sequence[str]] = {}
-        """The cars of each group, as the running fleet says."""
+        """The cars of each group in the running fleet."""
         self._unrecorded = ""
-        """Why not everything is recorded, as the running fleet says."""
+        """Why not everything is recorded, in the words of the running fleet."""
         self._replays: set[str] = set()
         """The tokens of replays in this fleet."""
         self._said_left_out = False
@@ -108,7 +109,8 @@ class Console:
         self.budgets = Budgets()
         self._merges: dict[tuple[str, ...], StopMerge] = {}
         self._waiting_stops: dict[tuple[str, str], list[tuple[tuple[str, ...], OnOutcomes]]] = {}
-        """The cars of stops of some cars that are merged, by sender and verb, with what answers each stop."""
+        """Stops of some cars that wait to be merged, by sender and verb: the cars of each, and the function that gets
+        its answer."""
         self._bad_messages = LogLimit()
         self._stop_ids: dict[str, None] = {}
         self._stops = 0
@@ -149,7 +151,7 @@ class Console:
     async def run(self) -> None:
         """Serve the pages until the task is cancelled."""
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
-        # Before any message comes: a car keeps the color that it has first.
+        # Do this before any message comes, because a car keeps its first color.
         for status in await self._fleet.call(ask_cars, bus, name):
             self._take_fleet(status)
         for family in ("sensor", "state"):
@@ -183,7 +185,7 @@ class Console:
         self._take_fleet(found[1])
 
     def _take_fleet(self, status: Any) -> None:
-        """Take the cars with their colors, and the groups, of a fleet.v1.Supervision."""
+        """Note the cars with their colors, and the groups, that a fleet.v1.Supervision lists."""
         self.groups = groups_of(status)
         if colors := colors_of(status):
             self._colors = colors
@@ -232,13 +234,13 @@ class Console:
             await asyncio.sleep(next_at - loop.time())
 
     def _end_presses_of_sleep(self) -> None:
-        """End every press after a sleep of this computer: its clock stood still, so no echo looks late."""
+        """End every press if this computer slept. Its clock stood still meanwhile, so no echo looks late."""
         if self._sleep.take() > 0:
             for press in self._presses.on_sleep():
                 self._end(press, "The computer of the console slept.")
 
     def _show_rights(self) -> None:
-        """Show each page what its person may not do, if that has changed. End presses that are refused by now."""
+        """Show each page what its person may not do, if that has changed. End presses that are no longer allowed."""
         authority = self._view.authority
         rights = {
             sender: rights_of(sender, authority) for sender in {page.operator.sender for page in self._pages.values()}
@@ -259,7 +261,7 @@ class Console:
             page.show(kind, text)
 
     def _take_readings(self, now: float) -> None:
-        wall_ns = None if self._replays else time.time_ns()  # a replay says nothing of a clock
+        wall_ns = None if self._replays else time.time_ns()  # a replay does not show whether a clock is right
         for sample in self._readings.take().values():
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
@@ -349,11 +351,14 @@ class Console:
         return self._view.people
 
     def management_refusal(self, person: PagePerson | None) -> str:
-        """Return why this person may not start and stop the recorder and plans. None stands for this computer."""
+        """Return why this person may not start and stop the recorder and plans.
+
+        A `person` of None means this computer.
+        """
         return management_refusal(self._view.authority, (person or self.person).name)
 
     def _check_room(self, person: PagePerson | None, device: str) -> None:
-        """Raise TooManyPages if no other page of this device may connect."""
+        """Raise TooManyPages if this device may not connect another page."""
         most = MAX_PAGES
         if person is not None:
             most -= KEPT_FOR_THIS_COMPUTER + (0 if person.rank == Rank.LEAD else KEPT_FOR_LEADS)
@@ -377,13 +382,13 @@ class Console:
         whose = person or self.person
         operator = await self._operators.join(whose.acts_as)
         try:
-            self._check_room(person, device)  # others may have come meanwhile
+            self._check_room(person, device)  # other pages may have connected meanwhile
         except TooManyPages:
             self._operators.leave(whose.acts_as)
             raise
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
-        # All guests share a sender: the stop of another guest is not one of this page.
+        # All guests share one sender, so a stop with this sender may be of another guest.
         names = {"sender": None if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
@@ -404,7 +409,7 @@ class Console:
         self._operators.leave(page.person.acts_as)
 
     def on_text(self, page: PageLink, text: str) -> None:
-        """Handle one message of a page. A bad one is answered, and changes nothing."""
+        """Handle one message of a page. A bad message is answered, and changes nothing."""
         try:
             self._on_message(page, PageMessage.of(text))
         except BadPageMessage as error:
@@ -433,7 +438,7 @@ class Console:
         self._merged(who, partial(self._stop_all, operator, request))
 
     def _merged(self, who: tuple[str, ...], stop: Callable[[], object]) -> None:
-        """Stop at once. Of further stops of the same kind in the next moment, one is sent at its end for all."""
+        """Stop at once. Further stops of the same kind within MERGE_S are sent as one stop at the end of that time."""
         if len(self._merges) >= _MAX_MERGES:
             del self._merges[next(iter(self._merges))]
         delay_s = self._merges.setdefault(who, StopMerge()).delay_s(time.monotonic())
@@ -466,9 +471,12 @@ class Console:
         return False
 
     def _stop_cars(self, operator: ConsoleOperator, request: CommandRequest, who: tuple[str, str]) -> None:
-        """Send one stop for all cars whose stops wait, and answer each with the outcomes of its own cars."""
+        """Send one stop for all cars whose stops wait.
+
+        Answer each of the waiting stops with the outcomes of its own cars.
+        """
         if not (waiting := self._waiting_stops.pop(who, [])):
-            return  # the merge was forgotten, and an earlier call has sent these
+            return  # the merge was forgotten, and an earlier call has sent these stops
 
         def answer_all(outcomes: list[dict[str, Any]]) -> None:
             for cars, answer in waiting:
@@ -537,8 +545,8 @@ class Console:
         self._count(page, page.operator.command(request, cars, answer))
 
     def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
-        """Count a command to these cars. Return why it is not sent, empty if it is."""
-        # A query for a car that nobody knows would wait for an answer in a thread.
+        """Count a command to these cars. Return why it must not be sent, or an empty text if it may be."""
+        # A query for an unknown car would block a thread until its timeout.
         if unknown := set(cars).difference(self._view.names, self._present):
             return f"There is no car {min(unknown)}."
         if not self.budgets.may_open_command(page.device or None):
@@ -578,10 +586,10 @@ class Console:
         except PressRefused as error:
             page.answer(t="over", press=press_id, words=str(error))
             return
-        for other in taken:  # its stop would be refused for the cars that the lead drives from now on
+        for other in taken:  # the other page's stop would be refused for the cars that the lead drives from now on
             words = f"{person} drives {' and '.join(car for car in other.cars if car in cars)} now."
             self._end(other, words, [car for car in other.cars if car not in cars])
-        if before is not None:  # another direction: a stop in between only for cars that are no longer driven
+        if before is not None:  # another direction, so stop only the cars that are no longer driven
             page.operator.end_press(before, [car for car in before.cars if car not in cars])
         driving = page.operator.begin_press(
             press, lambda outcome: page.answer(t="refused", press=press_id, outcome=asdict(outcome))

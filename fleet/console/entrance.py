@@ -1,4 +1,7 @@
-"""Accepts the connections of the network and hands them to TLS at a bounded rate. `waiting_room` decides."""
+"""Accepts the connections of the network and hands them to TLS at a bounded rate.
+
+`waiting_room` decides which one is next.
+"""
 
 import asyncio
 import gc
@@ -16,22 +19,24 @@ if TYPE_CHECKING:  # only `--lan` needs its packages
 
 Address = tuple[str, int]
 ACCEPTS_AT_ONCE: Final = 20
-"""Connections that are accepted in one turn of the loop. Each takes some 0.05 ms."""
+"""Maximum number of connections that are accepted in one turn of the loop. Each takes some 0.05 ms."""
 ACCEPT_PAUSE_S: Final = 0.01
-"""Pause after a full turn: 2000 connections a second at most, which take a tenth of a core. The kernel keeps others."""
+"""Pause after a full turn. So at most 2000 connections a second are accepted, which take a tenth of a core. The others
+wait in the kernel."""
 SERVE_INTERVAL_S: Final = 0.02
-"""Interval at which a line that has used up its rate is looked at: less than that of one address."""
+"""Interval at which a line that has used up its rate is looked at. It is shorter than that between two handshakes of
+one address."""
 EXPIRY_INTERVAL_S: Final = 0.25
 """Interval at which silent connections are ended."""
 HANDSHAKE_TIMEOUT_S: Final = 3.0
-"""Timeout of a handshake: two round trips of a bad Wi-Fi (0.5 s), one of them sent again after a second."""
+"""Timeout of a handshake: two round trips over a bad Wi-Fi (0.5 s), one of them sent again after a second."""
 # asyncio's own is 30 s. A page that was closed in a flood never ends TLS: its places, and its buffers, stay taken.
 SHUTDOWN_TIMEOUT_S: Final = 2.0
-"""Timeout for the client's end of TLS: as for the end of its WebSocket before (`fair_socket`)."""
+"""Timeout for the client's end of TLS. It is the same as for the end of the WebSocket before (`fair_socket`)."""
 # The objects of a connection refer to each other, with some 90 kB of buffers. The collector looks at old objects after
 # some 80,000 new ones, which may take an hour: 64 MB of a flood stayed. A collection takes 1 to 3 ms.
 COLLECT_AFTER: Final = 100
-"""Number of handshakes after which their remains are collected: 9 MB at most."""
+"""After this number of handshakes their garbage is collected: 9 MB at most."""
 _READ_BYTES: Final = 4096
 _TLS_HELLO: Final = b"\x16"
 """The first byte of a TLS client: a handshake record (RFC 8446, 5.1)."""
@@ -61,7 +66,7 @@ class Entrance:
         self._expire()
 
     def close(self) -> None:
-        """Accept nobody any more, and close what waits. Close the listener afterwards."""
+        """Accept no more connections, and close those that wait. The caller closes the listener afterwards."""
         for timer in self._timers.values():
             timer.cancel()
         self._loop.remove_reader(self._listener.fileno())
@@ -71,7 +76,7 @@ class Entrance:
             self._drop(key)
 
     def _after(self, delay_s: float, call: Callable[[], None]) -> None:
-        """Call once after a delay. A call that waits already stands for it."""
+        """Call once after a delay. If such a call waits already, do nothing."""
         if call not in self._timers:
 
             def run() -> None:
@@ -86,7 +91,7 @@ class Entrance:
                 connection, address = self._listener.accept()
             except (BlockingIOError, ConnectionAbortedError):
                 return
-            except OSError:  # too many open files: some end in a moment
+            except OSError:  # too many open files: some will be closed in a moment
                 break
             connection.settimeout(0.0)
             self._waiting[address] = connection
@@ -108,9 +113,9 @@ class Entrance:
             return
         except OSError:
             start = b""
-        if start != _TLS_HELLO:  # it has gone, or speaks no TLS
+        if start != _TLS_HELLO:  # the client has gone, or does not speak TLS
             if start:
-                connection.recv(_READ_BYTES)  # to close what is unread would reset the connection
+                connection.recv(_READ_BYTES)  # closing a connection with unread bytes would reset it
             self._drop(key)
             return
         self._loop.remove_reader(connection.fileno())
@@ -118,7 +123,10 @@ class Entrance:
         self._after(0.0, self._serve_next)
 
     def _serve_next(self) -> None:
-        """Begin one handshake. The next one begins in another turn: between two, a STOP is carried out."""
+        """Begin one handshake.
+
+        The next one begins in another turn of the loop, so that a STOP can be carried out in between.
+        """
         key = self._room.take(time.monotonic())
         if isinstance(key, tuple):
             task = asyncio.ensure_future(self._begin(self._waiting.pop(key), key))

@@ -1,6 +1,7 @@
-"""A WebSocket that hands over a few messages at a time, so that a page which floods takes no long turn of the loop.
+"""A WebSocket that hands over a few messages at a time, so that a page which floods cannot block the loop.
 
-uvicorn parses all that one read has brought, up to 256 KiB: thousands of small messages, for a fifth of a second.
+uvicorn itself parses all bytes of one read, up to 256 KiB. Those may be thousands of small messages, which block the
+loop for a fifth of a second.
 """
 
 import asyncio
@@ -16,41 +17,47 @@ from fleet.console.page_link import SEND_TIMEOUT_S
 PIECE_BYTES: Final = 1024
 """Bytes that are parsed at a time: some thirty of the smallest messages."""
 CLOSED_INTERVAL_S: Final = 0.01
-"""Interval of the pieces that come after the page was closed. Only its answer to the closing is of use."""
+"""Interval at which pieces are parsed after the page was closed. Only the page's answer to the closing still
+matters."""
 CLOSE_TIMEOUT_S: Final = 2.0
-"""Timeout of that answer. A page that floods does not read it."""
+"""Timeout of the answer to the closing. A page that floods may never read that it was closed."""
 WRITE_BUFFER_BYTES: Final = 64 * 1024
-"""Bytes that wait for a page that does not read. The next message has to wait. asyncio's is 512 KiB for TLS."""
+"""Maximum number of bytes that wait for a page that does not read. Further messages have to wait. asyncio's limit for
+TLS is 512 KiB."""
 
 
 class FairWebSocket(WebSocketsSansIOProtocol):
-    """Parses the received bytes piece by piece: the next piece when the messages of the last one were taken."""
+    """Parses the received bytes piece by piece.
+
+    The next piece is parsed when the console has taken the messages of the last.
+    """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # uvicorn's own
-        """Begin with no bytes."""
+        """Begin a connection, without any received bytes."""
         self._rest = bytearray()
         self._waits = False
         self._full: asyncio.TimerHandle | None = None
         super().connection_made(transport)
         transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
-        # The kernel's own grows to some megabytes: a page that reads nothing would be noticed after minutes.
+        # The kernel's own buffer grows to some megabytes, so a page that reads nothing would be noticed only after
+        # minutes.
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
         self.close_timeout = CLOSE_TIMEOUT_S
 
     def data_received(self, data: bytes) -> None:
-        """Keep the bytes, and parse the first piece."""
+        """Store the bytes, and parse the first piece."""
         self._rest += data
         if not self._waits:
             self._parse()
 
     def pause_writing(self) -> None:
-        """Keep what is sent waiting. End the connection if the page does not read for too long."""
+        """Let the senders wait. End the connection if the page does not read for too long."""
         super().pause_writing()
-        # A message that closes it would wait behind the others.
+        # A message that closes the connection would wait behind the others, so abort the connection.
         self._full = self.loop.call_later(SEND_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Send on."""
+        """Let the senders continue."""
         super().resume_writing()
         self._read_again()
 
@@ -60,14 +67,14 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         super().connection_lost(exc)
 
     async def send(self, message: ASGISendEvent) -> None:
-        """Send. A connection that is closed ends for sure."""
+        """Send a message. If it closes the WebSocket, make sure that the connection ends."""
         await super().send(message)
-        # asyncio's TLS forgets a connection whose peer has gone while reading is paused: its place would stay taken.
+        # asyncio's TLS forgets a connection whose peer goes while reading is paused. Its place would never become free.
         if message["type"] == "websocket.close":
             self._end_later()
 
     def handle_close(self, event: Frame) -> None:
-        """Answer the closing of the page. The connection ends for sure."""
+        """Answer when the page closes the WebSocket, and make sure that the connection ends."""
         super().handle_close(event)
         self._end_later()
 
@@ -80,20 +87,23 @@ class FairWebSocket(WebSocketsSansIOProtocol):
             self._full = None
 
     def handle_ping(self) -> None:
-        """Answer a ping, unless the page reads nothing: answers would pile up. Count it as a message."""
+        """Answer a ping, and count it as a message.
+
+        Do not answer if the page reads nothing, because answers would pile up.
+        """
         answer = b"".join(self.conn.data_to_send())
         if self.writable.is_set():
             self.transport.write(answer)
         self._count()
 
     def handle_pong(self, event: Frame) -> None:
-        """Take the answer to our ping. Count any other one as a message."""
+        """Handle the answer to our ping. Count an answer that we did not ask for as a message."""
         if bytes(event.data) != self.pending_ping_payload:
             self._count()
         super().handle_pong(event)
 
     def handle_cont(self, event: Frame) -> None:
-        """Take a part of a message. Count it as a message, too: an empty one takes memory."""
+        """Handle a part of a message. Count it as a message, because even an empty part takes memory."""
         super().handle_cont(event)
         if not event.fin:
             self._count()
@@ -112,7 +122,9 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         if self._rest and not self.read_paused:
             self.read_paused = True
             self.transport.pause_reading()
-        if self._rest and self.queue.empty() and not self.transport.is_closing():  # pings, or a part of a message
+        if (
+            self._rest and self.queue.empty() and not self.transport.is_closing()
+        ):  # the piece had only pings, or a part of a message
             self._waits = True
             self.loop.call_later(CLOSED_INTERVAL_S if self.close_sent else 0.0, self._parse)
         elif not self._rest and self.queue.empty() and self.read_paused:
@@ -120,7 +132,7 @@ class FairWebSocket(WebSocketsSansIOProtocol):
             self.transport.resume_reading()
 
     async def receive(self) -> ASGIReceiveEvent:
-        """Return the next message. Read on when all are taken."""
+        """Return the next message. Read more bytes when all messages are taken."""
         message = await self.queue.get()
         if self.queue.empty() and not self._waits:
             self._parse()

@@ -1,4 +1,7 @@
-"""The raw frames of one car beside what they became, and what its gateway knows. Pure."""
+"""The raw frames of one car, each with the readings or the command that belongs to it, and what its gateway knows.
+
+Pure.
+"""
 
 from collections import deque
 from typing import Any, Final
@@ -40,7 +43,10 @@ class FrameLog:
 
 
 def describe_gateway(link: Any, health: Any, safety: Any, mode: Any) -> list[tuple[str, str]]:
-    """Return what a gateway knows of its car and link, as names and texts. None stands for no message."""
+    """Return what a gateway knows of its car and link, as names and texts.
+
+    An argument of None means that there is no message.
+    """
     rows: list[tuple[str, str]] = []
     if link is not None:
         rows += [(name, str(getattr(link, name))) for name in _COUNTS]

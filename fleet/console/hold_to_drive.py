@@ -11,26 +11,27 @@ from schemas.limits import STREAM_PAUSE_S
 
 TICK_INTERVAL_S: Final = 0.1
 """Interval of ticks."""
-# A frozen browser still answers pings. A thawed page or a healed link delivers old messages in a burst. Therefore only
-# an echo of a new tick counts, by the server's own clock. Measured: no false trip on a phone throttled by 6.
+# A frozen browser still answers pings. A page that thaws, or a link that recovers, delivers old messages in a burst.
+# Therefore an echo counts only if its tick is new by the server's own clock. Measured: on a phone slowed down 6 times,
+# no press ended by mistake.
 MAX_TICK_AGE_S: Final = 0.3
 """Maximum age of a tick when its echo arrives."""
 MAX_ECHO_GAP_S: Final = 0.3
-"""Maximum time without an echo. After it, the press is over."""
-# A gateway rejects the stream of a sender that has not paused since a stop. 0.1 s is one tick.
+"""Maximum time without an echo. When it has passed, the press is over."""
+# After a stop, a gateway rejects a stream of drives until its sender has paused. The added 0.1 s is one tick.
 AFTER_STOP_S: Final = STREAM_PAUSE_S + 0.1
 """Minimum time from a STOP to the next press."""
 _MAX_TICKS: Final = 16
-"""Number of remembered ticks: more than fit into the maximum age."""
+"""Number of remembered ticks. It is larger than the number of ticks within the maximum age."""
 
 
 class PressRefused(Exception):
-    """A press that may not begin. The text is for a person."""
+    """The press may not begin. The text is for a person."""
 
 
 @dataclass(slots=True)
 class HeldPress:
-    """A page holds a motion of some cars."""
+    """A motion of some cars that the person at a page holds down."""
 
     client: int
     id: int
@@ -76,10 +77,9 @@ class PressBook:
     ) -> tuple[HeldPress, list[HeldPress]]:
         """Begin a press. It replaces the page's earlier press. Raises PressRefused.
 
-        Return it with the presses of other pages that it ends: a lead takes cars from persons who are not leads.
-        An id counts once: a press that is over, or a late message of it, never begins again.
-
-        person: of the page. `leads` are the persons who are leads, for all of these cars.
+        Return the press, and the presses of other pages that it ends, because a lead takes cars from persons who are
+        not leads. An id counts once: a press that is over never begins again, not even by a late message. person: the
+        person at the page. leads: the persons who are leads for all of these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -99,7 +99,7 @@ class PressBook:
         return press, taken
 
     def echo(self, client: int, press_id: int, tick: int, now: float) -> HeldPress | None:
-        """Handle the echo of a tick. Return the press, None if the press is over or the tick is old."""
+        """Handle the echo of a tick. Return the press, or None if the press is over or the tick is old."""
         press = self._presses.get(client)
         if press is None or press.id != press_id or not self._is_new(tick, now):
             return None
@@ -109,7 +109,7 @@ class PressBook:
         return press
 
     def release(self, client: int, press_id: int) -> HeldPress | None:
-        """End a press: the finger was lifted. Return the press, None if it was over."""
+        """End a press, because the finger was lifted. Return the press, or None if it was over already."""
         self._newest_ids[client] = max(press_id, self._newest_ids.get(client, -1))
         press = self._presses.get(client)
         if press is None or press.id > press_id:
@@ -126,27 +126,30 @@ class PressBook:
         return self._end(lambda press: press.client == client)
 
     def on_stop(self, now: float) -> list[HeldPress]:
-        """End every press: all cars were stopped."""
+        """End every press, because all cars were stopped."""
         self._stopped_at = now
         return self._end(lambda _: True)
 
     def on_sleep(self) -> list[HeldPress]:
-        """End every press: the computer slept. No tick from before counts, as its age does not show the sleep."""
+        """End every press, because the computer slept.
+
+        Forget all ticks, because their ages do not include the sleep.
+        """
         self._ticks.clear()
         return self._end(lambda _: True)
 
     def on_bus_lost(self) -> list[HeldPress]:
-        """End every press: no command reaches a car."""
+        """End every press, because no command can reach a car."""
         return self._end(lambda _: True)
 
     def drop_cars(self, cars: set[str]) -> list[HeldPress]:
-        """End every press of these cars: they were stopped."""
+        """End every press of these cars, because they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))
 
     def drop_cars_of(self, cars: set[str], person: str, leads: Collection[str] = ()) -> list[HeldPress]:
-        """End the presses of these cars that a person may end by anything but a stop.
+        """End the presses of these cars that a person may end by other commands than a stop.
 
-        Those are the person's own, and for a lead of the cars those of persons who are not leads.
+        These are the person's own presses. A lead of the cars also ends the presses of persons who are not leads.
         """
         return self._end(
             lambda press: bool(cars & set(press.cars)) and (press.person == person or _outranks(person, press, leads))

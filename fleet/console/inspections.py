@@ -1,4 +1,4 @@
-"""The cars that pages inspect: their raw frames are subscribed to only as long as a page shows them."""
+"""The cars that pages inspect. Their raw frames are subscribed to only while a page shows them."""
 
 import asyncio
 import json
@@ -31,11 +31,11 @@ class Inspections(PageFeed):
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """Begin and end to inspect a car."""
+        """The messages that begin and end the inspection of a car."""
         return {"inspect": self._begin, "inspect_end": lambda page, _: self.end(page.number)}
 
     def _begin(self, page: PageLink, message: PageMessage) -> None:
-        """Show a car to a page, instead of the car before."""
+        """Show this car on a page, instead of the car that it showed before."""
         car = self._cars[page.number] = message.cars()[0]
         if car not in self._logs:
             self._logs[car] = FrameLog()
@@ -45,12 +45,12 @@ class Inspections(PageFeed):
         self._forget()
 
     def end(self, page: int) -> None:
-        """Show a page no car."""
+        """Stop showing a car on this page."""
         if self._cars.pop(page, None) is not None:
             self._forget()
 
     def tick(self, pages: Mapping[int, PageLink]) -> None:
-        """Show each page its car."""
+        """Show on each page the car that it inspects."""
         by_car = {car: self._text(car) for car in self._logs}
         for page, car in self._cars.items():
             pages[page].show("inspection", by_car[car])

@@ -1,4 +1,4 @@
-"""Feeds the time line, and the bands of the plots, with what the cars did since the console started."""
+"""Feeds the time line, and the bands of the plots, with what the cars have done since the console started."""
 
 import json
 import time
@@ -12,9 +12,9 @@ from fleet.recording.tools.lanes import HELD_NS, LANE_TOPICS, Lanes
 from schemas.keys import Key
 
 LIVE_LANES_NS: Final = 900 * 1_000_000_000
-"""How far back the live lanes go: a plot shows ten minutes, and half as many again stay for a pause."""
+"""How far back the live lanes go. A plot shows ten minutes. Five more are kept for a plot that is paused."""
 TICKS_BETWEEN_LANES: Final = 10
-"""The lanes are sent once a second: they are to be looked at, not to drive by."""
+"""The lanes are sent once a second. That is enough to look at, and nobody drives by them."""
 
 
 class LaneFeed(PageFeed):
@@ -27,16 +27,16 @@ class LaneFeed(PageFeed):
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """Show the lanes, or do not."""
+        """The messages that show the lanes on a page, and hide them."""
         return {"lanes": self._begin, "lanes_end": lambda page, _: self._pages.discard(page.number)}
 
     def on_message(self, key: Key, message: Any) -> None:
-        """Take in a message of a car."""
+        """Handle a message of a car."""
         if key.topic in LANE_TOPICS:
             self._lanes.add(key.car, key.topic, message, time.time_ns())
 
     def keep(self, cars: Container[str]) -> None:
-        """Forget all cars but these: anybody on the bus may invent some."""
+        """Forget all cars but these, because anybody on the bus may invent cars."""
         self._lanes.keep(cars)
 
     def _begin(self, page: PageLink, _: PageMessage) -> None:
@@ -44,12 +44,16 @@ class LaneFeed(PageFeed):
         self._show(page, LIVE_LANES_NS)
 
     def tick(self, pages: Mapping[int, PageLink]) -> None:
-        """Show what has changed since the last time. A page that did not read it gets it with the next."""
+        """Show what has changed since the last time.
+
+        If a page has not read the last message, the next one repeats it.
+        """
         self._ticks += 1
         if self._ticks % TICKS_BETWEEN_LANES:
             return
         for number in self._pages & set(pages):
-            # What was sent last may have been replaced before it was read: so each message reaches back some more.
+            # The last message may have been replaced before the page read it, so each message also covers the time
+            # before.
             self._show(pages[number], 2 * HELD_NS)
 
     def end(self, page: int) -> None:
@@ -59,6 +63,6 @@ class LaneFeed(PageFeed):
     def _show(self, page: PageLink, back_ns: int) -> None:
         now = time.time_ns()
         if page.has_unsent("lanes"):
-            back_ns = LIVE_LANES_NS  # a whole one may be what waits
+            back_ns = LIVE_LANES_NS  # the message that waits may be the first one, which covers everything
         spans = [span.as_list() for span in (*self._lanes.since(now - back_ns), *self._lanes.silences(now))]
         page.show("lanes", json.dumps({"t": "lanes", "spans": spans}, separators=(",", ":")))

@@ -1,4 +1,4 @@
-"""Limits the lines of the log by their cause: whoever floods the console must not fill a disk. Pure."""
+"""Limits the lines of the log by their cause, so that a flood of requests cannot fill the disk. Pure."""
 
 import logging
 from typing import Final
@@ -6,13 +6,17 @@ from typing import Final
 from schemas.token_bucket import TokenBucket
 
 LOG_BURST: Final = 50.0
-"""Lines of one cause at once: more than a person reads, and a class that joins is still seen whole."""
+"""Lines of one cause at once. That is more than a person reads, and enough to log every device of a class that
+joins."""
 LOG_RATE: Final = 0.1
-"""Lines of one cause per second after that: one in 10 s, as of the other limits of the log."""
+"""Lines of one cause per second after that: one in 10 s, as with the other limits of the log."""
 
 
 class LogRate(logging.Filter):
-    """Lets so many lines of each cause pass, and counts the others. The cause is the line of code that logs."""
+    """Lets a limited number of lines of each cause pass, and counts the rest.
+
+    The cause is the line of code that logs.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -20,7 +24,7 @@ class LogRate(logging.Filter):
         self._left_out: dict[tuple[str, int], int] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if the line is logged. It says how many lines were left out before."""
+        """Return True if the line is logged. If lines were left out before, add their number to it."""
         cause, now = (record.pathname, record.lineno), record.created
         if not self._allowances.setdefault(cause, TokenBucket(LOG_RATE, LOG_BURST)).take_one(now):
             self._left_out[cause] = self._left_out.get(cause, 0) + 1

@@ -1,4 +1,7 @@
-"""Feeds the map with the places of the cars, five times a second. While nobody looks, it keeps the trails only."""
+"""Feeds the map with the places of the cars, five times a second.
+
+While no page shows the map, only the trails are kept.
+"""
 
 import json
 import time
@@ -14,7 +17,7 @@ from schemas.bus import Latest, Sample
 from schemas.keys import SIMULATOR, Key
 
 TICKS_BETWEEN_MAPS: Final = 2
-"""A map is to be looked at: five times a second is motion for an eye."""
+"""Five maps a second look like motion to the eye, and a map is only looked at."""
 _MAX_MAP_KEYS: Final = 1024
 
 
@@ -26,13 +29,13 @@ class MapFeed(PageFeed):
         self._has_place = has_place
         self._samples: Latest[Sample] = Latest(_MAX_MAP_KEYS)
         self._pages: dict[int, float] = {}
-        """By page: up to when it has the trails."""
+        """Up to which time each page has the trails, by page."""
         self._world = ""
         self._ticks = 0
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """Show the map, or do not."""
+        """The messages that show the map on a page, and hide it."""
         return {"map": self._begin, "map_end": lambda page, _: self.end(page.number)}
 
     def on_sample(self, sample: Sample) -> None:
@@ -40,7 +43,7 @@ class MapFeed(PageFeed):
         self._samples(sample.key, sample)
 
     def on_message(self, key: Key, message: Any) -> None:
-        """Take in a reading of a car."""
+        """Handle a reading of a car."""
         if key.topic in PLACE_TOPICS:
             self._view.on_message(key.car, key.topic, message, time.time())
 
@@ -55,7 +58,7 @@ class MapFeed(PageFeed):
         self._show(page, time.time())
 
     def tick(self, pages: Mapping[int, PageLink]) -> None:
-        """Take in what came, and show it to the pages with a map."""
+        """Handle the messages that have come, and show them on the pages with a map."""
         self._ticks += 1
         if self._ticks % TICKS_BETWEEN_MAPS:
             return
@@ -82,7 +85,8 @@ class MapFeed(PageFeed):
         self._pages.pop(page, None)
 
     def _show(self, page: PageLink, now: float) -> None:
-        # A message that was not read yet is replaced by this one, with the points of its trails: so all are sent again.
+        # This message replaces one that the page has not read yet. The points in that one would be lost, so send all
+        # points again.
         since = 0.0 if page.has_unsent("map") else self._pages[page.number]
         trails = self._view.trails(now, since)
         self._pages[page.number] = now

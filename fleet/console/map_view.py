@@ -1,8 +1,8 @@
 """Where the cars are, and the floor under them, as a map shows it. Pure.
 
-The place of a simulated car is its truth, and that of a real one is what somebody has measured (`sensor/pose`). A car
-of which neither is known has no place: nothing is made up from its commands. Times: s of one clock, which the caller
-chooses.
+The place of a simulated car is the truth from its simulator. The place of a real car is what somebody has measured
+(`sensor/pose`). A car without either has no place, because commands do not tell where a car is. Times: s of one clock,
+which the caller chooses.
 """
 
 import math
@@ -18,13 +18,13 @@ POSE: Final = TOPICS["sensor/pose"]
 WORLD: Final = TOPICS["@sim/world"]
 PLACE_TOPICS: Final = (TRUTH.name, POSE.name)
 TRAIL_S: Final = 30.0
-"""Length of a trail. A moment of a recording knows as much."""
+"""Length of a trail, live and at a moment of a recording."""
 TRAIL_STEP_S: Final = 0.25
 """Minimum time between two points of a trail."""
 TRAIL_STEP_M: Final = 0.01
-"""Minimum distance of two points of a trail: a car that stands adds none."""
+"""Minimum distance between two points of a trail, so that a car that stands still adds none."""
 SHOWN_S: Final = 30.0
-"""Time for which the last place of a car is shown, with its age."""
+"""For this time the last place of a car is shown, with its age."""
 MAX_CORNERS: Final = 2000
 """Maximum number of walls, corners of the line, and things of a floor. A world file may have a tenth of each."""
 _MAX_MAP_NAME_LENGTH: Final = 64
@@ -44,11 +44,11 @@ class Place:
 
     @property
     def is_true(self) -> bool:
-        """True if a simulator knows it. False: somebody measured it."""
+        """True if the place comes from a simulator, False if somebody measured it."""
         return not self.frame
 
     def is_stale(self, now: float) -> bool:
-        """Return True if a newer one should have come."""
+        """Return True if a newer place should have come by now."""
         return now - self.at > ((TRUTH if self.is_true else POSE).stale_after_s or math.inf)
 
 
@@ -62,14 +62,14 @@ class MapView:
     _world_at: float = -math.inf
 
     def on_message(self, car: str, topic: str, message: Any, at: float) -> None:
-        """Take in a message of PLACE_TOPICS, or the world. Others change nothing."""
+        """Handle a message of PLACE_TOPICS, or the world. Other messages change nothing."""
         match topic:
             case TRUTH.name:
                 self._put(car, Place(message.x_m, message.y_m, message.heading_rad, "", at))
             case POSE.name:
                 before = self._places.get(car)
                 if before is not None and before.is_true and not before.is_stale(at):
-                    return  # what a simulator knows is not a measurement, and better than any
+                    return  # the truth from a simulator is better than any measurement
                 std = message.xy_std_m if message.HasField("xy_std_m") else None
                 frame = message.frame[:_MAX_MAP_NAME_LENGTH] or "map"
                 self._put(car, Place(message.x_m, message.y_m, message.heading_rad, frame, at, std))
@@ -82,7 +82,7 @@ class MapView:
         before = self._places.get(car)
         self._places[car] = place
         if before is not None and before.frame != place.frame:
-            self._trails.pop(car, None)  # it counts from another origin
+            self._trails.pop(car, None)  # the new place has another origin
         trail = self._trails.setdefault(car, deque())
         while trail and abs(place.at - trail[0][0]) > TRAIL_S:  # or the clock was set back
             trail.popleft()
@@ -99,7 +99,7 @@ class MapView:
                 del found[car]
 
     def places(self, now: float) -> dict[str, list[Any]]:
-        """Return by car: x and y, m; heading, rad; the frame; its error, m; its age if it is stale, s. JSON values."""
+        """Return for each car, as JSON values: x, y (m), heading (rad), frame, error of x, y (m), age if stale (s)."""
         return {
             car: [
                 round(place.x_m, 3),
@@ -114,7 +114,7 @@ class MapView:
         }
 
     def trails(self, now: float, since: float = -math.inf) -> dict[str, _Points]:
-        """Return by car the points of its trail after a time: its time, ms, and x and y, m."""
+        """Return for each car the points of its trail after a time. A point is its time (ms), x and y (m)."""
         begin = max(since, now - TRAIL_S)
         found = {
             car: [(round(at * 1e3), round(x_m, 3), round(y_m, 3)) for at, x_m, y_m in trail if at > begin]
@@ -144,5 +144,5 @@ class MapView:
 
 
 def _shape(thing: Any) -> Iterable[float]:
-    """Return x and y, heading, radius, width and depth of a thing. Radius 0: a box."""
+    """Return x, y, heading, radius, width and depth of a thing. If the radius is 0, the thing is a box."""
     return thing.x_m, thing.y_m, thing.heading_rad, thing.radius_m, thing.width_m, thing.depth_m

@@ -38,9 +38,10 @@ from schemas.rights import NO_PEOPLE, People
 REVOCATION_INTERVAL_S: Final = 0.25
 """Interval at which the people file is read for revoked devices."""
 TLS_BUFFER_BYTES: Final = 16 * 1024
-"""Size of the buffer of a TLS connection, and of one read: a record. asyncio's own are 256 KiB, 160 MB for 640."""
+"""Size of the buffer of a TLS connection, and of one read: one TLS record. asyncio's own buffers have 256 KiB, which is
+160 MB for 640 connections."""
 BACKLOG: Final = 1024
-"""Connections that the kernel keeps until they are accepted: those of half a second at the highest rate."""
+"""Maximum number of connections that wait in the kernel to be accepted: half a second at the highest rate."""
 ADDRESS_INTERVAL_S: Final = 60.0
 """Interval at which this computer's addresses are read."""
 
@@ -68,7 +69,10 @@ class LimitedListener(socket.socket):
         return made
 
     def admit(self, connection: socket.socket, address: tuple[str, int]) -> bool:
-        """Keep a connection that begins TLS, perhaps in place of another one. Return False if it is one too many."""
+        """Keep a connection that begins TLS, perhaps in place of another one.
+
+        Return False if there are too many connections.
+        """
         self._forget_closed()
         admitted, ended = self.limit.admit(address, address[0], time.monotonic())
         if ended is not None:
@@ -94,22 +98,25 @@ class LimitedListener(socket.socket):
             self.limit.on_closed(key)
 
     def _end(self, key: Hashable) -> None:
-        """End a connection whose transport is asyncio's: the transport reads the end and closes it."""
+        """End a connection that belongs to a transport of asyncio.
+
+        The transport notices the end and closes the connection.
+        """
         connection = self._accepted.pop(key, None)
         if connection is not None:
             try:
                 connection.shutdown(socket.SHUT_RDWR)
-            except OSError:  # it has just closed
+            except OSError:  # the connection has just closed
                 return
 
 
 class Lan:
-    """The shared part of all pages on the network. Making it raises OSError if there can be no certificate."""
+    """The part that all pages on the network share. The constructor raises OSError if no certificate can be made."""
 
-    # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
+    # The people file is changed in threads, because waiting for its lock on the loop would delay a STOP.
 
     def __init__(self, listener: LimitedListener, people: PeopleFile, listed: People = NO_PEOPLE) -> None:
-        """Begin. `listed` has the people of the fleet until its gateways say who they are."""
+        """Begin. `listed` are the people of the fleet as far as known. Later its gateways say who they are."""
         self.listener = listener
         self.people = people
         self.port: int = listener.getsockname()[1]
@@ -118,7 +125,7 @@ class Lan:
         self.addresses = own_addresses()
         self.names = frozenset(own_names())
         self.certificate: Certificate = ensure_certificate((*self.addresses, *own_names()))
-        # asyncio has no parameter for it. Each TLS connection of this process has such a buffer.
+        # asyncio has no parameter for the size of the buffer, which each TLS connection of this process has.
         sslproto.SSLProtocol.max_size = TLS_BUFFER_BYTES
         self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -127,7 +134,8 @@ class Lan:
         self._failures = LogLimit()
         self._shared_cookies = LogLimit()
         self._connected: dict[int, tuple[str, str, Callable[[], object], Callable[[], object]]] = {}
-        """Device, address, and the functions that close it for good and for a moment, by number of the socket."""
+        """By number of the socket: its device, its address, and the functions that close it for good and for a
+        moment."""
         self._last_socket = 0
         self.people.serve()
         self._write(listed)
@@ -173,9 +181,9 @@ class Lan:
     async def pair(
         self, code: str, client: tuple[str, int], device: str, cookie_before: str = ""
     ) -> tuple[str | None, float, PagePerson | None]:
-        """Pair a device. Return its cookie, else None and the time to wait before the next try, s. Raises ClassFull.
+        """Pair a device. Return its cookie, or None and the time to wait before the next try (s). Raises ClassFull.
 
-        cookie_before: of a device that is paired already. It stays who it is, if this is the code of a class.
+        cookie_before: the cookie of a device that is paired already. With the code of a class it keeps its person.
         """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
@@ -206,7 +214,8 @@ class Lan:
 
     def set_cookie(self, cookie: str) -> str:
         """Return the header that gives a browser its cookie."""
-        # The browser keeps it for longer than it opens the console: an expired cookie still stops the cars.
+        # The browser keeps the cookie for longer than the cookie opens the console, because an expired one still stops
+        # the cars.
         age = int(COOKIE_LIFETIME_S + COOKIE_MEMORY_S)
         return f"{self.cookie}={cookie}; Path=/; Max-Age={age}; Secure; HttpOnly; SameSite=Strict"
 
@@ -220,7 +229,7 @@ class Lan:
         return self.people.read().open_devices(now)
 
     def on_device(self, client: tuple[str, int], device: PairedDevice) -> None:
-        """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
+        """Keep a connection that has shown a cookie. Warn if two computers use the same cookie."""
         self.listener.on_paired(client, device.id)
         others = {address for id_, address, *_ in self._connected.values() if id_ == device.id} - {client[0]}
         if others and (words := self._shared_cookies.words("", time.monotonic())) is not None:
@@ -231,7 +240,7 @@ class Lan:
             )  # fmt: skip
 
     def on_refusal(self, words: str) -> None:
-        """Log a refused request, of a flood of them only some."""
+        """Log a refused request. Of a flood of refused requests, log only some."""
         if (shown := self._refusals.words(words, time.monotonic())) is not None:
             log.warning("%s", shown)
 

@@ -21,7 +21,7 @@ from schemas.words import Motion, Phase, Reason
 
 # The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
 DRIVE_TTL_S: Final = 0.5
-"""Duration of each drive of a press. Without another one the gateway stops the car."""
+"""Duration of each drive of a press. If no further drive follows, the gateway stops the car."""
 STREAM_INTERVAL_S: Final = 0.15
 """Minimum interval of the drives of one press."""
 STREAM_MAX_AGE_S: Final = 0.3
@@ -30,7 +30,7 @@ log = logging.getLogger("fleet")
 
 
 class ConsoleOperator:
-    """One person's side of the bus: the client under whose name the pages of this person act."""
+    """The client of the bus under whose name the pages of one person act."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -38,9 +38,9 @@ class ConsoleOperator:
         self._streams: dict[tuple[int, int], tuple[float, int, tuple[str, ...]]] = {}
         """Time of the last drive, number of drives, and cars, by press."""
         self._leases: dict[str, int] = {}
-        """The cars that a page has taken, and the page."""
+        """The page that has taken each car over, by car."""
         self._stops: dict[tuple[str, str], PendingCommand] = {}
-        """The newest stop of all cars without an outcome, by sender and verb."""
+        """The newest stop of all cars that has no outcome yet, by sender and verb."""
         self._renewals: set[str] = set()
         """Cars whose lease is being renewed."""
 
@@ -61,18 +61,21 @@ class ConsoleOperator:
         return self.spawn(self._ask_first_drive(press, on_refusal))
 
     def renew_press(self, press: HeldPress, now: float) -> None:
-        """Send the next drive of a press, unless the last one is recent."""
+        """Send the next drive of a press, unless the last drive is recent."""
         sent_at, count, _ = self._streams.get((press.client, press.id), (float("-inf"), 0, ()))
         if now - sent_at < STREAM_INTERVAL_S:
             return
         self._streams[(press.client, press.id)] = now, count + 1, press.cars
         request = drive_request(press.motion, DRIVE_TTL_S)
-        # Only the first one starts a car. If the bus stands still for longer than a drive lasts, the press is over.
+        # Only the first drive may start a car. So if the bus hangs for longer than a drive lasts, the press is over.
         request.message.continues = count > 0
         self._stream(press.cars, request, STREAM_MAX_AGE_S, count + 1)
 
     def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
-        """Stop the cars of a press, or some of them: at once in the stream, and by a query whose outcome is known."""
+        """Stop the cars of a press, or some of them.
+
+        Do so at once in the stream, and again by a query, which has an outcome.
+        """
         stopped = tuple(press.cars if cars is None else cars)
         _, count, _ = self._streams.pop((press.client, press.id), (0.0, 0, ()))
         if stopped:
@@ -93,13 +96,18 @@ class ConsoleOperator:
             bus.put_command(key, payload, encoding, sequence)
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
-        # A stream is rejected without words from the second time on, a query never.
+        # A gateway rejects a stream silently from the second time on. It always answers a query.
         outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
         for outcome in outcomes:
             if not outcome.ok and outcome.reason != Reason.SUPERSEDED:
                 on_refusal(outcome)
-        if (press.client, press.id) not in self._streams:  # this query may have overtaken the end of the press
-            driven = {car for _, _, cars in self._streams.values() for car in cars}  # by a press that has replaced it
+        if (
+            press.client,
+            press.id,
+        ) not in self._streams:  # this query may have overtaken the end of the press in the stream
+            driven = {
+                car for _, _, cars in self._streams.values() for car in cars
+            }  # driven by a press that has replaced this one
             await self._ask_to_end([car for car in press.cars if car not in driven])
 
     async def _ask_to_end(self, cars: Sequence[str]) -> None:
@@ -118,8 +126,8 @@ class ConsoleOperator:
     async def _report_stop(
         self, request: CommandRequest, command: PendingCommand, report: StopReport, is_shown: Callable[[str], bool]
     ) -> None:
-        # A person who stops again asks for the outcome of the newest stop, which concerns the same cars. A wait takes a
-        # thread, for as long as the slowest car needs to stand: ten stops a second would take 60 of them.
+        # A person who stops again gets the outcome of the newest stop, which concerns the same cars. Each wait blocks a
+        # thread until the slowest car stands: ten stops a second would need 60 threads.
         who = (report.sender, request.verb)
         if (earlier := self._stops.get(who)) is not None:
             earlier.abandon()
@@ -149,7 +157,7 @@ class ConsoleOperator:
     def take_lease(
         self, client: int, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> "asyncio.Task[None]":
-        """Take cars over for a page, and keep them until it gives them back or has gone.
+        """Take cars over for a page, and renew their leases until the page gives them back or has gone.
 
         Return the task that waits for the outcomes.
         """
@@ -177,13 +185,13 @@ class ConsoleOperator:
         return self.command(lease_request(release=True), released, on_outcomes) if released else None
 
     def renew_leases(self) -> None:
-        """Renew the leases of the pages. A lease that another sender has taken is lost."""
+        """Renew the leases of the pages. If another sender has taken a car over, its lease is lost."""
         for car in self._leases.keys() - self._renewals:
             self._renewals.add(car)
             self.spawn(self._renew_lease(car))
 
     async def _renew_lease(self, car: str) -> None:
-        """Renew one lease. A gateway that hangs must not cost a page its other leases."""
+        """Renew one lease. A gateway that hangs must not delay the other leases of a page, which would expire."""
         try:
             (outcome,) = await self._fleet.ask(lease_request(), [car])
             if not outcome.ok:
@@ -202,14 +210,14 @@ class ConsoleOperator:
         return not isinstance(answer, Failure) and answer.status == Phase.SENT, answer.words
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
-        """Run a coroutine. Its errors go to the log, never to the socket that began it."""
+        """Run a coroutine. Its errors are logged, and never reach the socket that began it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._on_done)
         return task
 
     async def close(self) -> None:
-        """Wait for the commands that still run."""
+        """Wait for the commands that have no outcome yet."""
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=3.0)
 

@@ -12,19 +12,19 @@ from schemas.keys import person_of
 from schemas.words import Rank
 
 IDLE_CLIENT_S: Final = 5.0
-"""Time for which the client of a person without a page stays open: a page that is loaded again needs it."""
+"""Time for which the client of a person without a page stays open, because a page may only be loading again."""
 
 
 @dataclass(slots=True)
 class _Member:
-    """The operator of one person, and the number of their pages."""
+    """The operator of one person, and the number of this person's pages."""
 
     opening: "asyncio.Task[tuple[Fleet, ConsoleOperator]]"
     pages: int = 0
 
 
 class Operators:
-    """One operator for each person. The person of this computer has the console's own client."""
+    """One operator for each person. The person at this computer has the console's own client."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -44,7 +44,7 @@ class Operators:
                 yield member.opening.result()[1]
 
     def of(self, person: str) -> ConsoleOperator:
-        """Return the operator of a person with an open page, else the console's own."""
+        """Return the operator of a person with an open page. For anybody else return the console's own operator."""
         return next((each for each in self if person_of(each.sender) == person), self.own)
 
     async def join(self, person: str) -> ConsoleOperator:
@@ -62,7 +62,7 @@ class Operators:
             raise
 
     def leave(self, person: str) -> None:
-        """Let go of the operator: a page of this person has gone."""
+        """Release the operator, because a page of this person has gone."""
         member = self._members.get(person)
         if member is not None:
             member.pages -= 1
@@ -70,7 +70,7 @@ class Operators:
                 self.own.spawn(self._close_idle(person, member))
 
     async def close(self) -> None:
-        """Wait for the commands that still run, and close the clients."""
+        """Wait for the commands that have no outcome yet, and close the clients."""
         members = list(self._members.values())
         self._members.clear()
         await asyncio.gather(self.own.close(), *(_close(member) for member in members))

@@ -1,4 +1,7 @@
-"""Feeds of a console page beside the state of the cars. A feed registers the messages of its page, and answers them."""
+"""What a console page may show besides the state of the cars.
+
+Each feed registers the messages of its page, and answers them.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -7,7 +10,7 @@ from fleet.console.page_link import PageLink
 from fleet.console.page_requests import PageMessage
 
 Handler = Callable[[PageLink, PageMessage], None]
-"""Handles one message of a page. Raises BadPageMessage if the message is wrong, and then has changed nothing."""
+"""Handles one message of a page. If the message is wrong, it raises BadPageMessage and changes nothing."""
 
 
 class PageFeed(ABC):

@@ -1,6 +1,6 @@
-"""The messages to one page: a bounded queue for answers, and only the newest tick and the newest state.
+"""The messages to one page. Answers wait in a bounded queue. Of ticks and of states only the newest waits.
 
-A page that does not read holds up no other page.
+A page that does not read does not delay any other page.
 """
 
 import asyncio
@@ -13,9 +13,9 @@ from fleet.console.operator import ConsoleOperator
 from fleet.console.pairing import PagePerson
 
 SEND_TIMEOUT_S: Final = 5.0
-"""Timeout of one message. A page that reads nothing for this long is disconnected."""
+"""Timeout of one message. A page that does not read for this time is disconnected."""
 _MAX_PAGE_ANSWERS: Final = 256
-"""Maximum number of queued answers. More are dropped, the oldest first."""
+"""Maximum number of queued answers. Beyond it, the oldest are dropped."""
 
 
 class PageLink:
@@ -57,7 +57,7 @@ class PageLink:
             self.show(kind, json.dumps({"t": kind, **value}, separators=(",", ":")))
 
     def has_unsent(self, kind: str) -> bool:
-        """Return True if the newest message of a kind still waits."""
+        """Return True if the newest message of a kind was not sent yet."""
         return kind in self._newest
 
     async def run(self) -> None:
@@ -67,7 +67,8 @@ class PageLink:
             await self._not_empty.wait()
             self._not_empty.clear()
             while self._newest or self._answers:
-                # The tick first: its echo keeps a car driving. Only the greeting, the first answer, precedes it.
+                # Send the tick first, because its echo keeps a car driving. Only the greeting, which is the first
+                # answer, precedes it.
                 kind = "tick" if "tick" in self._newest else next(iter(self._newest), "")
                 answers = bool(self._answers) and (kind != "tick" or not greeted)
                 text = self._answers.popleft() if answers else self._newest.pop(kind)

@@ -1,6 +1,6 @@
 """The messages of a page, checked and turned into command requests. Pure.
 
-A page is not trusted: each value is checked here, and the gateway decides.
+A page is not trusted. So each value is checked here, and whether the command is carried out is decided by the gateway.
 """
 
 import json
@@ -21,7 +21,7 @@ MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Mot
 
 
 class BadPageMessage(ValueError):
-    """A message of a page that is not allowed."""
+    """The message of a page is not allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class PageMessage:
 
     @property
     def is_command(self) -> bool:
-        """True if the message asks gateways and has a budget. Stops have none; a press is answered in its own way."""
+        """True if the message is a command to gateways that counts against a budget. Stops and presses do not count."""
         is_done = self.kind == "do" and self.fields.get("verb") not in STOPS
         return is_done or self.kind in ("take", "give_back", Verb.UNPAUSE)
 

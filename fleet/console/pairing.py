@@ -1,8 +1,7 @@
-"""Pairing codes, paired devices and their people: they open the console from the network. Pure.
+"""Pairing codes, paired devices and their people, which open the console from the network. Pure.
 
-The code of a class is one of them, which pairs any number of devices for ten minutes, as guests.
-
-Times are seconds since the epoch, since the book outlives the process. A code or a cookie is stored as its hash.
+A normal code pairs one device. The code of a class pairs any number of devices as guests, for ten minutes. Times are
+seconds since the epoch, because the book outlives the process. Codes and cookies are stored only as hashes.
 """
 
 import hashlib
@@ -21,7 +20,7 @@ from schemas.suggestion import did_you_mean
 from schemas.words import Rank
 
 CODE_LENGTH: Final = 8
-"""40 random bits. At 1,000 guesses per second a code is found in its two minutes once in nine million times."""
+"""40 random bits. At 1,000 guesses per second, a code is guessed within its two minutes once in nine million times."""
 CODE_LIFETIME_S: Final = 120.0
 COOKIE_LIFETIME_S: Final = 30 * 86_400.0
 COOKIE_MEMORY_S: Final = 90 * 86_400.0
@@ -39,11 +38,13 @@ MAX_GUESSERS: Final = 1024
 """Maximum number of remembered addresses. More are forgotten, the oldest first."""
 MAX_DEVICE_NAME_LENGTH: Final = 60
 CLASS_LIFETIME_S: Final = 600.0
-"""Time for which the code of a class pairs devices. A guess at 1,000 a second finds it once in 1.8 million times."""
+"""Time for which the code of a class pairs devices. At 1,000 guesses per second it is guessed once in 1.8 million
+times."""
 GUEST: Final = "guest"
-"""The rank of a device that came by the code of a class, until a lead assigns it to a person. It watches and stops."""
+"""The rank of a device paired by the code of a class, until a lead assigns it to a person. It may only watch and
+stop."""
 MAX_GUESTS: Final = 48
-"""Maximum number of guests: a class. The code pairs no more, whoever has photographed it."""
+"""Maximum number of guests: a class. When it is reached, the code pairs no further device."""
 GUEST_LIFETIME_S: Final = 12 * 3600.0
 """Time after which a guest is forgotten."""
 RANKS: Final = (str(Rank.PERSON), str(Rank.LEAD))  # text: click takes an enum by the names of its members
@@ -56,11 +57,11 @@ class UnknownPerson(ValueError):
 
 
 class ClassFull(Exception):
-    """There is no place for another guest. The text says what to do."""
+    """There is no place for another guest. The message says what to do."""
 
 
 class NoGuest(ValueError):
-    """There is no guest with this id. The text says so."""
+    """There is no guest with this id. The message says so."""
 
 
 class BadBook(ValueError):
@@ -69,7 +70,7 @@ class BadBook(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class PagePerson:
-    """The person at a page. Pages of this computer have the console's own name."""
+    """The person at a page. The person at this computer has the console's own name."""
 
     name: str
     rank: str = Rank.PERSON
@@ -77,12 +78,12 @@ class PagePerson:
 
     @property
     def is_guest(self) -> bool:
-        """True for whoever came with a class and is not assigned yet."""
+        """True for a device that came with a class and is not assigned to a person yet."""
         return self.rank == GUEST
 
     @property
     def acts_as(self) -> str:
-        """The person of its client on the bus. All guests share one: they only stop."""
+        """The person of its client on the bus. All guests share one client, because they only stop."""
         return GUEST if self.is_guest else self.name
 
 
@@ -92,14 +93,17 @@ _ANY: Final = PagePerson(GUEST, GUEST)
 
 @dataclass(frozen=True, slots=True)
 class PairingCode:
-    """A code that pairs one device, once. That of a class (its person is a guest) pairs one after the other."""
+    """A code that pairs one device, once. The code of a class (its person is a guest) pairs any number of devices."""
 
     digest: str
     person: PagePerson
     issued_s: float
 
     def is_open(self, now: float) -> bool:
-        """Return True in the minutes after it was made. A clock that was set back ends it."""
+        """Return True until the lifetime of the code has passed.
+
+        A clock that was set back to before its beginning ends it, too.
+        """
         return 0 <= now - self.issued_s < (CLASS_LIFETIME_S if self.person.is_guest else CODE_LIFETIME_S)
 
 
@@ -135,21 +139,25 @@ class PeopleBook:
     codes: tuple[PairingCode, ...] = ()
     devices: tuple[PairedDevice, ...] = ()
     address: str = ""
-    """Where the console last served the network."""
+    """The address at which the console last served the network."""
     people: tuple[str, ...] | None = None
-    """The people of the fleet, as the console knows them. None if the fleet lists nobody: then everybody may come."""
+    """The people of the fleet, as the console knows them. None if the fleet lists nobody. Then a code may be for
+    anybody."""
     leads: tuple[str, ...] | None = None
     """The leads among them, or None if the fleet lists nobody. Then a code may make anybody a lead."""
 
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
-        """Add a code for a person. Raises UnknownPerson, and ValueError for what is not a name or no rank."""
+        """Add a code for a person. Raises UnknownPerson, and ValueError if the name or the rank is invalid."""
         self._check(person)
         open_codes = [each for each in self.codes if each.is_open(now)]
         codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
         return replace(self, codes=codes[-MAX_CODES:])
 
     def open_class(self, code: str, now: float) -> Self:
-        """Add the code of a class, instead of an earlier one. Raises ValueError if somebody has the name of guests."""
+        """Add the code of a class, in place of an earlier one.
+
+        Raises ValueError if somebody has the name that guests have.
+        """
         if GUEST in (self.people or ()):
             raise ValueError(f"`people:` in the fleet file has a {GUEST}. Give that person another name first.")
         book = self.close_class()
@@ -165,7 +173,10 @@ class PeopleBook:
         return any(each.person.is_guest for each in self._matching(code, now))
 
     def assign(self, device_id: str, person: PagePerson, now: float) -> Self:
-        """Make a guest a person: its device is paired from now on. Raises NoGuest, and ValueError as `issue`."""
+        """Turn a guest into a person. The device is then paired as any other.
+
+        Raises NoGuest, and ValueError as `issue` does.
+        """
         self._check(person)
         guest = next((each for each in self.guests(now) if each.id == device_id), None)
         if guest is None:
@@ -178,7 +189,7 @@ class PeopleBook:
         return [each for each in self.devices if each.person.is_guest and each.state(now) == "valid"]
 
     def _check(self, person: PagePerson) -> None:
-        """Raise UnknownPerson, or ValueError for what is not a name or no rank."""
+        """Raise UnknownPerson, or ValueError if the name or the rank is invalid."""
         keys.check_name(person.name, "a person's name")
         if self.people is not None and person.name not in self.people:
             hint = did_you_mean(person.name, self.people) or f"There are: {', '.join(self.people)}."
@@ -192,11 +203,11 @@ class PeopleBook:
 
     def _matching(self, code: str, now: float) -> list[PairingCode]:
         wanted = digest(normal_code(code))
-        # Each is compared, in constant time.
+        # Compare with every code, in constant time.
         return [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
 
     def redeem(self, code: str, cookie: str, device_id: str, device: str, now: float) -> Self | None:
-        """Pair a device: end the code, unless it is that of a class, and add the device.
+        """Pair a device: add it, and end the code, unless it is the code of a class.
 
         None if the code is wrong, used or too old. Raises ClassFull.
         """
@@ -207,7 +218,7 @@ class PeopleBook:
         devices = [each for each in self.devices if each.state(now) != "unknown"]
         person = used.person
         if person.is_guest:
-            # A guest takes the place of nobody: the code is on a wall, and anyone may have come.
+            # A guest never replaces a device. The code of a class hangs on a wall, so anyone may have used it.
             if len(self.guests(now)) >= MAX_GUESTS or len(devices) >= MAX_DEVICES:
                 raise ClassFull("The class is full. A lead assigns some devices, or revokes them.")
             person = PagePerson(self._guest_name(), GUEST)
@@ -217,15 +228,15 @@ class PeopleBook:
         return replace(self, codes=codes, devices=(*devices, added)[-MAX_DEVICES:])
 
     def _guest_name(self) -> str:
-        """Return a name that is easy to find on a projector, and that nobody has."""
+        """Return a name that is easy to find on a projector, and that is not in use."""
         taken = {each.person.name for each in self.devices} | set(self.people or ())
         return next(name for number in count(1) if (name := f"{GUEST}-{number}") not in taken)
 
     def revoke(self, names: Iterable[str]) -> tuple[Self, list[PairedDevice]]:
-        """Remove the devices with these ids or of these people. Return the removed ones, too."""
+        """Remove the devices with these ids or of these people. Return the new book and the removed devices."""
         chosen = set(names)
         gone = [each for each in self.devices if chosen & {each.id, each.person.name}]
-        # An open code of a person would pair the device again.
+        # Remove the open codes of a person, too: with such a code the device could be paired again.
         codes = tuple(each for each in self.codes if each.person.name not in chosen)
         return replace(self, codes=codes, devices=tuple(each for each in self.devices if each not in gone)), gone
 
@@ -248,7 +259,10 @@ class PeopleBook:
         return replace(device, person=self._ranked(device.person))
 
     def _ranked(self, person: PagePerson) -> PagePerson:
-        """Return a person whose code said lead as a mere person if the fleet does not list them as one."""
+        """Return the person.
+
+        If their code said lead, but the fleet does not list them as a lead, their rank is person.
+        """
         is_lead = self.leads is None or person.name in self.leads
         return person if is_lead or person.rank != Rank.LEAD else replace(person, rank=Rank.PERSON)
 
@@ -266,7 +280,7 @@ class PeopleBook:
             hashes = [each.digest for each in codes] + [each.digest for each in devices]
             if not all(isinstance(each, str) for each in hashes):
                 raise BadBook("a hash is not a text")
-            # A console of an earlier version wrote no people, or no leads.
+            # The console of an earlier version did not write people, or leads.
             people, leads = (_names(fields.get(name)) for name in ("people", "leads"))
             return cls(codes, devices, str(fields["address"]), people, leads)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
@@ -275,22 +289,22 @@ class PeopleBook:
 
 @dataclass(slots=True)
 class GuessLimit:
-    """Counts wrong codes and slows down the addresses that they come from. Times are monotonic."""
+    """Counts wrong codes, and makes the addresses that they come from wait. Times are monotonic."""
 
     wrong: int = 0
-    """All wrong codes."""
+    """Number of all wrong codes."""
     _guessers: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Number of wrong codes and time of the last one, by address."""
 
     def wait_s(self, address: str, now: float) -> float:
-        """Return how long this address must still wait before another try. 0 if it may try."""
+        """Return how long this address must still wait before another try (s), or 0 if it may try now."""
         count, last = self._guessers.get(address, (0, now))
         if count < FREE_GUESSES or now - last >= GUESS_MEMORY_S:
             return 0.0
         return max(0.0, last + backoff_s(count - FREE_GUESSES + 1, 1.0, MAX_GUESS_DELAY_S) - now)
 
     def on_wrong(self, address: str, now: float) -> int:
-        """Count a wrong code. Return the number of those of this address."""
+        """Count a wrong code. Return the number of wrong codes of this address."""
         count, last = self._guessers.pop(address, (0, now))
         count = 1 if now - last >= GUESS_MEMORY_S else count + 1
         self._guessers[address] = count, now
@@ -310,7 +324,7 @@ def new_code(choose: Callable[[str], str]) -> str:
 
 
 def code_words(code: str) -> str:
-    """Return a code as a person reads it: K7QF-3MXP."""
+    """Return a code in the form in which a person reads it: K7QF-3MXP."""
     return f"{code[: CODE_LENGTH // 2]}-{code[CODE_LENGTH // 2 :]}"
 
 

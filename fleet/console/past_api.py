@@ -1,7 +1,7 @@
-"""Requests of the pages for the past: the lanes of a recording, and what was so at one of its moments.
+"""Requests of the pages for the past: the lanes of a recording, and the state of everything at a moment of a recording.
 
-Anyone who may see the page may look back. Two processes read the recordings (past_worker.py): the lanes of an hour take
-seconds, and nobody's jump waits for them.
+Anyone who may see the page may look back. Two processes read the recordings (past_worker.py), one for lanes and one for
+moments. The lanes of an hour take seconds, and a jump to a moment must not wait for them.
 """
 
 import asyncio
@@ -24,16 +24,17 @@ from fleet.console.worker import TooManyQuestions, Worker
 from schemas.keys import is_name
 
 LANES_TIMEOUT_S: Final = 120.0
-"""Timeout of the lanes of a recording: an hour of twenty cars takes 3 s, at the lowest share of a processor ten times
-that, and a day of three cars as long."""
+"""Timeout of the lanes of a recording. An hour of twenty cars takes 3 s, and so does a day of three cars. With the
+lowest share of a processor they take ten times as long."""
 MOMENT_TIMEOUT_S: Final = 20.0
-"""Timeout of a moment: 0.2 s with twenty cars, at the lowest share ten times that, and 10 s to start the process."""
+"""Timeout of a moment. It takes 0.2 s with twenty cars, and ten times as long with the lowest share of a processor. The
+start of the process takes up to 10 s."""
 IDLE_READER_S: Final = 300.0
-"""Time after the last question for which the processes stay: a person looks at what a jump shows."""
+"""The processes end this time after the last question. Before, a person may be looking at what a jump shows."""
 MAX_OPEN_LOOKS: Final = 2
-"""Maximum number of questions of one person that wait: a page asks for one moment at a time."""
+"""Maximum number of questions of one person that wait. A page asks for only one moment at a time."""
 _MAX_MS: Final = 2**53
-"""Maximum of a time of JavaScript that is exact."""
+"""Maximum of a number that JavaScript represents exactly."""
 _TOO_MANY: Final = "Other looks of this person at recordings have no answer yet. Try again in a few seconds."
 
 

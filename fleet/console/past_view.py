@@ -1,6 +1,6 @@
-"""What the pages show of a moment of a recording: the same views as live, fed with what was known then.
+"""What the pages show of a moment of a recording: the same views as live, from the messages that were known then.
 
-The clock is that of the recorder: `now` is the moment, and each message counts from when it was recorded.
+The clock is that of the recorder: `now` is the moment, and the age of a message is the time since it was recorded.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,12 +19,13 @@ from schemas.keys import COORDINATOR
 from schemas.topics import CAR_TOPICS
 
 DETAIL_BEFORE_NS: Final = 60_000_000_000
-"""Time before the moment whose commands and frames are shown of one car: a command ends within seconds, and a page
+"""Commands and frames of one car are shown from this time before the moment. A command ends within seconds. A page
 shows 60 frames, which a car that reports once a second sends in a minute."""
 DECISIONS_BEFORE_NS: Final = 600_000_000_000
-"""Time before the moment whose decisions are shown, the newest about each car. They are published on change only."""
+"""Decisions are shown from this time before the moment, the newest about each car. They are published only on
+change."""
 PLOT_SLOTS: Final = 600
-"""Values of one series: a page draws no more (static/plots-page.js)."""
+"""Maximum number of values of one series. A page draws no more (static/plots-page.js)."""
 _TOPICS: Final = frozenset(topic.name for topic in CAR_TOPICS)
 _MS: Final = 1_000_000
 _S: Final = 1e9
@@ -37,7 +38,9 @@ def cars_at(known: Iterable[Known], at_ns: int, colors: Mapping[str, str]) -> li
     view.list_cars(sorted({each.key.car for each in of_cars}))
     spoke = {each.key.car: each.log_ns for each in of_cars if each.key.topic.startswith("state/")}
     begun = min((each.log_ns for each in of_cars), default=at_ns)
-    view.on_presence(spoke, begun / _S)  # nothing records presence: a gateway that speaks each second is there
+    view.on_presence(
+        spoke, begun / _S
+    )  # presence is not recorded, so infer it: the gateway of a car publishes each second
     for each in of_cars:
         view.on_message(each.key.car, each.key.topic, each.message, each.log_ns / _S)
     for end_ns in sorted({ns + HELD_NS for ns in spoke.values() if ns + HELD_NS < at_ns}):
@@ -46,7 +49,7 @@ def cars_at(known: Iterable[Known], at_ns: int, colors: Mapping[str, str]) -> li
 
 
 def is_told(each: Known) -> bool:
-    """Return True for a message that a page may be told: of a car, with numbers that JSON has."""
+    """Return True for a message that a page may get: it is of a car, and JSON can represent all its numbers."""
     return (
         each.key.topic in _TOPICS
         and not each.key.car.startswith("@")
@@ -59,7 +62,7 @@ def map_at(known: Iterable[Known], trail: Iterable[Known], at_ns: int) -> dict[s
     """Return what a map shows of a moment. `trail` has the messages of PLACE_TOPICS before it."""
     view, now = MapView(), at_ns / _S
     placed = [each for each in known if each.key.topic in PLACE_TOPICS]
-    # The newest by the time of publishing comes last, as in the tables: a backfilled one was recorded late.
+    # Sort by the time of publishing, as in the tables, because a backfilled message was recorded late.
     for each in (*sorted(trail, key=lambda each: each.publish_ns), *placed):
         if is_told(each):
             view.on_message(each.key.car, each.key.topic, each.message, each.log_ns / _S)
@@ -75,7 +78,9 @@ def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, 
     Nothing records whether the coordinator still ran.
     """
     view = PlanView()
-    newest = sorted(in_force, key=lambda each: each.key.topic != "plan")  # another plan would forget decisions
+    newest = sorted(
+        in_force, key=lambda each: each.key.topic != "plan"
+    )  # the plan first, because a new plan discards decisions
     for each in (*newest, *sorted(decisions, key=lambda each: each.publish_ns)):
         if each.key.car == COORDINATOR and is_finite(each.message):
             view.on_message(f"{each.key.car}/{each.key.topic}", each.message)
@@ -83,7 +88,7 @@ def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, 
 
 
 def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns: int) -> dict[str, Any]:
-    """Return frames, commands, events and states of one car before a moment, as the inspect page shows them.
+    """Return the frames, commands, events and states of one car before a moment, as the inspect page shows them.
 
     `messages` are its frames and events. `known` is the newest of everything else.
     """
@@ -112,7 +117,7 @@ def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns
 def samples_of(
     series: Sequence[Series], messages: Iterable[Known], from_ns: int, to_ns: int
 ) -> dict[int, list[tuple[int, float]]]:
-    """Return the values of each series by its number: of each slot of a plot the last one."""
+    """Return the values of each series by its number: for each slot of a plot the last value in it."""
     buffer = PlotBuffer(series)
     for each in messages:
         if is_told(each):

@@ -1,7 +1,7 @@
 """Reads sessions for the time line, in a process of its own (worker.py). The process runs this module.
 
-It keeps nothing: what a jump needs is read again, from the chunks around the moment. So memory is flat however long a
-session is, and one that grows or that the quota takes is read as it is.
+It caches nothing: each jump reads the chunks around the moment again. So memory stays the same however long a session
+is, and a session that grows, or that loses files to the quota, is read as it is now.
 """
 
 from pathlib import Path
@@ -32,14 +32,17 @@ _MS: Final = 1_000_000
 
 
 def answer(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the lanes of a session, or with `at_ms` what was so then. `ok` is False if it cannot be read."""
+    """Return the lanes of a session, or, with `at_ms`, the state at that moment.
+
+    `ok` is False if the session cannot be read.
+    """
     try:
         session = Session(Path(question["path"]))
     except NoSession as error:
         return {"ok": False, "words": str(error)}
     at_ms = question.get("at_ms")
     found = _lanes(session) if at_ms is None else _moment(session, at_ms * _MS, question)
-    # One that is still being written is always cut.
+    # A session that is still being written always ends in the middle of a file.
     damage = "; ".join(words for path, words in sorted(session.damage.items()) if path not in session.unended)
     return {"ok": True, "words": damage} | found
 

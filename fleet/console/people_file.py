@@ -1,4 +1,7 @@
-"""The file of the paired devices. The console and `fleet console people` share it, so each change holds a lock."""
+"""The file of the paired devices.
+
+The console and `fleet console people` share it, so each change is made under a lock.
+"""
 
 import fcntl
 import logging
@@ -18,12 +21,12 @@ log = logging.getLogger("fleet")
 
 
 def people_path(endpoint: str, fleet: str) -> Path:
-    """Return the file of one fleet."""
+    """Return the people file of one fleet."""
     return directory_of(endpoint) / f"{fleet}.@console.json"
 
 
 class PeopleFile:
-    """A book of people on disk, for the user alone (0600)."""
+    """A book of people on disk, which only the user can read (0600)."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -32,14 +35,17 @@ class PeopleFile:
         self._served = FileLock(path.with_suffix(".served"))
 
     def read(self) -> PeopleBook:
-        """Return the book as it is now. If it is damaged or missing, it is empty, and everybody pairs again."""
+        """Return the book as it is now.
+
+        If the file is damaged or missing, the book is empty, and everybody must pair again.
+        """
         version = self._stat()
         if version != self._version:
             self._book, self._version = self._load(), version
         return self._book
 
     def change(self, function: Callable[[PeopleBook], tuple[PeopleBook, T]]) -> T:
-        """Replace the book by what the function returns, and return its second value. Raises OSError."""
+        """Replace the book by the first value that the function returns, and return the second. Raises OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.with_name(f"{self.path.name}.lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

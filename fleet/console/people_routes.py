@@ -50,7 +50,7 @@ def pair_routes(lan: "Lan") -> list[Route]:
 
 
 def people_routes(lan: "Lan | None") -> list[Route]:
-    """Return the routes for those who may pair and revoke: pages of this computer, and leads."""
+    """Return the routes for those who may pair and revoke devices: pages on this computer, and leads."""
 
     async def people(request: Request) -> Response:
         may_pair = _may_pair(request.scope)

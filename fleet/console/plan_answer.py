@@ -1,6 +1,6 @@
-"""What a page is told of a plan that it has written: its faults, its roles, what it changes, and a dry run. Pure.
+"""The answer to a page about a plan written there: its faults, its roles, what it changes, and a dry run. Pure.
 
-The dry run is the first decision of the coordinator's own code, for the cars as the console knows them.
+The dry run is the first decision that the coordinator's own code would make, for the cars as the console knows them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,9 +18,9 @@ from fleet.policy.trial import PlanInForce, Trial, try_plan
 from schemas.bus import Sample
 
 MAX_TOLD: Final = 100
-"""Maximum number of changes, of cars and of roles without a car that a page is told: it shows no more."""
+"""Maximum number of changes, of cars, and of roles without a car in an answer. A page shows no more."""
 MAX_TOLD_CHARACTERS: Final = 500
-"""Maximum length of one text: a plan with 300 roles gives a reason of 30,000 characters for one idle car."""
+"""Maximum length of one text. A plan with 300 roles gives a reason of 30,000 characters for one idle car."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class PlanQuestion:
     before: str = ""
     """The plan in force. Empty if none runs."""
     roles: Mapping[str, str] = field(default_factory=dict)
-    """The role of each car under it."""
+    """The role of each car under the plan in force."""
     phase: str = ""
 
 
@@ -63,7 +63,7 @@ def answer_to(question: PlanQuestion, listed: Mapping[str, CarSnapshot]) -> dict
 def _parsed(text: str) -> Plan | None:
     try:
         return parse(text) if text else None
-    except BadPlan:  # of a coordinator of another version
+    except BadPlan:  # a plan of a coordinator of another version
         return None
 
 
@@ -81,7 +81,10 @@ def _lines(faults: Iterable[PlanFault]) -> str:
 
 
 def _roles(entry: PlanEntry) -> list[list[Any]]:
-    """Return the name and the written fields of each role: a form shows some of them, and keeps the others."""
+    """Return the name and the written fields of each role.
+
+    A form shows some of the fields, and leaves the rest as they are.
+    """
     return [
         [name, each.model_dump(mode="json", by_alias=True, exclude_unset=True)] for name, each in entry.roles.items()
     ]

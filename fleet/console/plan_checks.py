@@ -1,7 +1,8 @@
 """Checks the texts of plans in a process of its own, one at a time. The process runs this module.
 
-A plan of 60 kB takes 0.14 s of Python code, and with 200 rules 2 s. In a thread of the console, that code would hold
-the interpreter while a STOP waits for it: three pupils that had plans checked kept it for 94 % of the time.
+To check a plan of 60 kB takes 0.14 s of Python code, and with 200 rules 2 s. In a thread of the console, that code
+would hold the interpreter lock while a STOP waits for it. Measured: three pupils who had plans checked held it for 94 %
+of the time.
 """
 
 from base64 import b64decode, b64encode
@@ -19,10 +20,10 @@ from schemas.bus import Sample
 from schemas.yaml_document.document import BadFile
 
 PLAN_CHECK_TIMEOUT_S: Final = 30.0
-"""Timeout of a check. The worst plan of 60 kB takes 2 s, at the lowest share of a busy processor ten times that, and
-the start of the process as long as that of a coordinator: 1 s, on a busy machine 10 s."""
+"""Timeout of a check. The worst plan of 60 kB takes 2 s, and ten times as long with the lowest share of a busy
+processor. The process starts as fast as a coordinator: in 1 s, on a busy machine in 10 s."""
 IDLE_CHECKER_S: Final = 60.0
-"""Time after the last check for which the process stays: a person who writes a plan checks it once in a while."""
+"""The process ends this time after the last check. A person who writes a plan checks it from time to time."""
 
 
 class PlanChecks:
@@ -37,7 +38,7 @@ class PlanChecks:
         self.close = self._worker.close
 
     async def check(self, question: PlanQuestion, person: Hashable) -> dict[str, Any]:
-        """Return what a page is told of a plan (plan_answer.answer_to). Raises TooManyQuestions."""
+        """Return the answer to a page about a plan (plan_answer.answer_to). Raises TooManyQuestions."""
         samples = [
             (age_s, each.key, b64encode(each.payload).decode(), each.encoding) for age_s, each in question.samples
         ]

@@ -28,10 +28,10 @@ _MAX_MESSAGES: Final = 4096
 
 
 class PlanFeed(PageFeed):
-    """The plan in force, and who may change it.
+    """The plan in force, and who may change it. file: the fleet file. operator: the console's own operator.
 
-    file: the fleet file. operator: the console's own. sender_of, refusal: the name under which a person acts, and why
-    they may not manage plans. newest: the newest messages of the cars, each with its age, s.
+    sender_of: returns the name under which a person acts. refusal: returns why a person may not manage plans. newest:
+    the newest messages of the cars, each with its age (s).
     """
 
     def __init__(
@@ -96,14 +96,14 @@ class PlanFeed(PageFeed):
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     async def check(self, text: str, person: PagePerson | None) -> dict[str, Any]:
-        """Return what a person is told of a plan (plan_answer.answer_to). Raises TooManyQuestions."""
+        """Return the answer to a person about a plan (plan_answer.answer_to). Raises TooManyQuestions."""
         present = tuple(name for name in self._fleet.sync.cars() if is_shown(name))
         before, roles, phase = self._view.in_force
         question = PlanQuestion(text, present, tuple(self._newest()), before, roles, phase)
         return await self.checks.check(question, person and person.name)
 
     async def set_plan(self, text: str, person: PagePerson | None) -> dict[str, Any]:
-        """Put a plan in force for this person. Return whether it is, and words, or the faults, one per line.
+        """Put a plan in force for this person. Return whether this succeeded, and words, or the faults, one per line.
 
         If no plan runs, the console starts a coordinator. Raises TooManyQuestions.
         """

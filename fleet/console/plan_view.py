@@ -9,7 +9,7 @@ from schemas import keys, messages
 from schemas.words import Level
 
 MAX_PLAN_NAME_LENGTH: Final = 80
-"""Maximum length of the name of a plan, so that it is one line of a large screen."""
+"""Maximum length of the name of a plan, so that it fits on one line of a large screen."""
 
 
 class PlanView:
@@ -17,7 +17,7 @@ class PlanView:
 
     def __init__(self) -> None:
         self.changed = True
-        """True if there is something that the pages do not show yet."""
+        """True if something has changed that the pages do not show yet."""
         self._running = False
         self._plan: Any = None
         self._assignment: Any = None
@@ -29,7 +29,7 @@ class PlanView:
         match topic:
             case "@coordinator/plan":
                 if self._plan is not None and value.boot_id != self._plan.boot_id:
-                    self._decisions.clear()  # of the coordinator before
+                    self._decisions.clear()  # they are of an earlier coordinator
                 self._plan = value
             case "@coordinator/assignment":
                 self._assignment = value
@@ -59,7 +59,7 @@ class PlanView:
         self._running = running
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the content of the page as JSON values."""
         plan, assignment = self._plan, self._assignment
         shown: dict[str, Any] = {"running": self._running, "plan": None, "log": self._log}
         if plan is None:
@@ -84,7 +84,7 @@ class PlanView:
 
 
 def plan_name(text: str, roles: Iterable[str]) -> str:
-    """Return what a person calls a plan: the comment that it begins with, else its roles. Never its hash."""
+    """Return a name of the plan for persons: the comment at its beginning, or else its roles. It is never the hash."""
     for line in text.splitlines():
         words = line.strip()
         if words and not words.startswith("#"):
@@ -95,7 +95,7 @@ def plan_name(text: str, roles: Iterable[str]) -> str:
 
 
 def named(words: str, text: str) -> str:
-    """Return words of a coordinator about the plan of this text, with its name in place of its hash."""
+    """Return words of a coordinator about the plan of this text, with the name of the plan in place of its hash."""
     return words.replace(f"plan {version_of(text)}", f"plan “{plan_name(text, ())}”")
 
 

@@ -1,4 +1,4 @@
-"""The values that one page plots, until they are sent. Pure."""
+"""The values that one page plots, kept until they are sent. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from schemas import messages, topics
 MAX_SERIES: Final = 80
 """Maximum number of series of a page: four plots of twenty cars."""
 MAX_BUFFERED_VALUES: Final = 200_000
-"""Maximum number of values that wait for one page. A page that reads nothing gets no more."""
+"""Maximum number of values that wait for one page. While a page reads nothing, further values are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Series:
 
 @cache
 def plottable() -> tuple[tuple[str, str, str], ...]:
-    """Return topic, field and unit of everything that is a number, or a lamp that is on or off."""
+    """Return topic, field and unit of every field that is a number, or a bool that can be plotted."""
     return tuple(
         (topic.name, name, topic.units.get(name, ""))
         for topic in topics.CAR_TOPICS
@@ -37,7 +37,7 @@ def plottable() -> tuple[tuple[str, str, str], ...]:
 
 
 class PlotBuffer:
-    """The series of one page with the values that it does not have yet."""
+    """The series of one page, with the values that the page does not have yet."""
 
     def __init__(self, series: Sequence[Series]) -> None:
         self._numbers: dict[tuple[str, str], list[tuple[int, str]]] = {}
@@ -52,7 +52,7 @@ class PlotBuffer:
         return list(self._numbers)
 
     def add(self, car: str, topic: str, message: Any, at_ms: int | None = None) -> None:
-        """Add the values of a message, at its stamp if `at_ms` is None. A field that was not measured has no value."""
+        """Add the values of a message, at its stamp if `at_ms` is None. A field that was not measured adds no value."""
         for number, field in self._numbers.get((car, topic), ()):
             value = value_in(message)(field)
             if isinstance(value, int | float) and self._count < MAX_BUFFERED_VALUES:
@@ -61,7 +61,7 @@ class PlotBuffer:
                 self._count += 1
 
     def take(self) -> dict[int, list[tuple[int, float]]]:
-        """Return the values by the number of their series, and forget them."""
+        """Return the values by the number of their series, and remove them here."""
         values, self._values, self._count = self._values, {}, 0
         return values
 

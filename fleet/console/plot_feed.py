@@ -19,7 +19,7 @@ from schemas.bus import BusError, Sample
 _MAX_PLOT_SAMPLES: Final = 16_384
 # A gateway answers `busy` to whoever asks when some questions wait there. Pages must not take all these places.
 MAX_HISTORY_QUESTIONS: Final = 2
-"""Maximum number of questions for history at a time, of all pages. One page has one."""
+"""Maximum number of queries for history at a time, of all pages. Each page has at most one."""
 MAX_PLOT_S: Final = 600
 """Maximum time that a plot shows, s."""
 
@@ -27,7 +27,7 @@ log = logging.getLogger("fleet")
 
 
 class PlotFeed(PageFeed):
-    """Which page plots what."""
+    """The plots of all pages."""
 
     def __init__(self, fleet: Fleet, spawn: Callable[[Coroutine[Any, Any, None]], object]) -> None:
         self._fleet = fleet
@@ -40,7 +40,7 @@ class PlotFeed(PageFeed):
         self._questions = asyncio.Semaphore(MAX_HISTORY_QUESTIONS)
         self._plotted: frozenset[str] = frozenset()
         """The keys of the bus that pages plot."""
-        # Twenty cars send 500 samples a second. To wake the loop for each would cost more than to decode it.
+        # Twenty cars send 500 samples a second. Waking the loop for each sample would cost more than decoding it.
         self._samples: deque[Sample] = deque(maxlen=_MAX_PLOT_SAMPLES)
 
     @property
@@ -49,7 +49,7 @@ class PlotFeed(PageFeed):
         return {"plot": self._begin}
 
     def _begin(self, page: PageLink, message: PageMessage) -> None:
-        """Plot these series on a page instead of those before, and read the gateways' history."""
+        """Plot these series on a page instead of the series before, and read their history from the gateways."""
         since_s = float(min(message.number("since_s"), MAX_PLOT_S))
         buffer = self._buffers[page.number] = PlotBuffer(series_of(message))
         self._note_plotted()
@@ -57,7 +57,10 @@ class PlotFeed(PageFeed):
         self._spawn(self._read_histories(page.number))
 
     async def _read_histories(self, page: int) -> None:
-        """Read the history for the newest plot of a page, unless that is being done: then it follows."""
+        """Read the history for the newest plot of a page.
+
+        If a history is being read for this page, do so afterwards.
+        """
         if page in self._reading:
             return
         self._reading.add(page)
@@ -72,7 +75,7 @@ class PlotFeed(PageFeed):
             if topics.TOPICS[topic].history_size <= 1:
                 continue
             async with self._questions:
-                if self._buffers.get(page) is not buffer:  # it has gone, or plots something else
+                if self._buffers.get(page) is not buffer:  # the page has gone, or plots something else now
                     return
                 try:
                     past = await self._fleet.history(f"{car}/{topic}", since_s=since_s)
@@ -83,7 +86,7 @@ class PlotFeed(PageFeed):
                 buffer.add(car, topic, reading.value)
 
     def end(self, page: int) -> None:
-        """Plot nothing on a page."""
+        """Stop plotting on a page."""
         self._wanted.pop(page, None)
         if self._buffers.pop(page, None) is not None:
             self._note_plotted()

@@ -7,12 +7,12 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 
 BODY_TIMEOUT_S: Final = 10.0
-"""Timeout of a body, from its first wait on."""
+"""Timeout of a body, counted from when we first wait for it."""
 
 
 async def read_start(request: Request, size: int) -> bytes:
-    """Return the first `size` bytes of the body. The rest is not read. Raises HTTPException if it does not come."""
-    # Half a request that ends is not an error of the console. uvicorn would log each with a traceback.
+    """Return the first `size` bytes of the body. The rest is not read. Raises HTTPException if they do not come."""
+    # A client that breaks off is no error of the console. Without this, uvicorn would log each case with a traceback.
     body = b""
     try:
         async with asyncio.timeout(BODY_TIMEOUT_S):

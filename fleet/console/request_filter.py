@@ -31,7 +31,7 @@ _HEADERS: Final = (
 COOKIE_PATHS: Final = ("/", "/hello")
 """Where a page gets its cookie. `/hello` renews it after a restart of the console."""
 STOP_PATH: Final = "/stop"
-"""The only POST without a cookie: a stop must not fail because a cookie is old. Host and Origin are checked."""
+"""The only POST that needs no cookie, because a stop must not fail for an old cookie. Host and Origin are checked."""
 
 PERSON: Final = "fleet.person"
 """Where the scope of a request from the network has its `PagePerson`."""
@@ -39,7 +39,7 @@ DEVICE: Final = "fleet.device"
 """Where the scope of a request from the network has the id of its `PairedDevice`."""
 PAIR_PATH: Final = "/pair"
 PUBLIC_PATHS: Final = frozenset({PAIR_PATH, "/static/pair.js", "/static/style.css"})
-"""All that a device can read that is not paired."""
+"""Everything that a device which is not paired can read."""
 _HTTPS_PORT: Final = 443
 
 
@@ -105,7 +105,7 @@ class Guard:
 
 
 class NetworkGuard(Guard):
-    """The same for the network: only paired devices pass. All others can read the page that pairs, and nothing else.
+    """The filter for the network: only paired devices pass. Any other device can read only the page on which it pairs.
 
     `names` returns the host names of this computer. `device_of` returns the device of a cookie, and what the cookie
     may do. `on_device` is called with the address of each connection that has shown a cookie.
@@ -128,7 +128,7 @@ class NetworkGuard(Guard):
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> str:
         host = headers.get("host", "").lower()
-        # The address at which the connection arrived is always one of ours: no foreign name stands for it.
+        # The address at which the connection arrived is always one of ours, and no other name can stand for an address.
         address, port = scope["server"]
         ours = {f"{name}:{port}" for name in (*self._names(), address)}
         if port == _HTTPS_PORT:
@@ -163,11 +163,11 @@ class NetworkGuard(Guard):
         await send({"type": "http.response.body", "body": b""})
 
     def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:  # noqa: ARG002 - Guard's
-        return []  # only a pairing code earns one
+        return []  # only a pairing code leads to a cookie
 
 
 def _may_guest_ask(scope: Scope, method: str) -> bool:
-    """Return True for what a device that nobody has assigned yet may read: the live page, and no recording."""
+    """Return True for paths that a device which nobody has assigned yet may read: the live page, but no recording."""
     if scope["type"] == "websocket":
         return True
     path = scope["path"]
@@ -175,7 +175,7 @@ def _may_guest_ask(scope: Scope, method: str) -> bool:
 
 
 def cookie_value(headers: dict[str, str], name: str) -> str | None:
-    """Return the value of a cookie. None if there is none."""
+    """Return the value of a cookie, or None if there is none."""
     try:
         morsel = SimpleCookie(headers.get("cookie", "")).get(name)
     except CookieError:
@@ -184,7 +184,7 @@ def cookie_value(headers: dict[str, str], name: str) -> str | None:
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """Return the headers by name. All values of a repeated header, which no browser sends, must be allowed."""
+    """Return the headers by name. No browser repeats a header. If one is repeated, all its values must be allowed."""
     found: dict[str, str] = {}
     for name, value in scope["headers"]:
         key = name.decode("latin-1")

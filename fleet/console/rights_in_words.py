@@ -13,7 +13,10 @@ GUEST_REFUSAL: Final = "You watch, and you can STOP. A lead assigns this device 
 
 
 def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
-    """Return what is refused to this sender, a person, each with the words. A stop is always allowed."""
+    """Return the rights that this sender, a person, does not have, each with the reason in words.
+
+    A stop is always allowed.
+    """
     people = authority.people
     ranked = people.ranked(Sender(sender, Rank.PERSON))
     denials = {right: authority.may(ranked, right) for right in Right}
@@ -21,9 +24,10 @@ def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
 
 
 def management_refusal(cars: Mapping[str, Authority], sender: str) -> str:
-    """Return why this person may not start and stop the recorder and plans. Empty if allowed.
+    """Return why this person may not start and stop the recorder and plans. Empty if they may.
 
-    Both are of the whole fleet. The coordinator and the recorder decide by the same rule; a page shows it beforehand.
+    Both concern the whole fleet. The coordinator and the recorder decide by the same rule, so a page can show the
+    refusal beforehand.
     """
     return fleet_refusal(People.merged(each.people for each in cars.values()), person_of(sender))
 
@@ -42,7 +46,10 @@ def rights_of(sender: str, cars: Mapping[str, Authority]) -> dict[str, Any]:
 
 
 def guest_rights(cars: Iterable[str]) -> dict[str, Any]:
-    """Return the rights of a device of a class that nobody has assigned yet: as `rights_of`, and it may only stop."""
+    """Return the rights of a device of a class that nobody has assigned yet, in the form of `rights_of`.
+
+    It may only stop.
+    """
     refused = dict.fromkeys(map(str, Right), GUEST_REFUSAL)
     fleet = dict.fromkeys((str(Right.PAUSE), str(Right.UNPAUSE), "manage"), GUEST_REFUSAL)
     return {"cars": dict.fromkeys(cars, refused), **fleet, "lead": False, "mine": []}
@@ -58,6 +65,6 @@ def _common(by_car: Mapping[str, Mapping[Right, str]], right: Right) -> Iterator
         yield next(iter(by_car.values()))[right]
 
 
-@lru_cache(maxsize=4096)  # ten times a second, for each page and car
+@lru_cache(maxsize=4096)  # called ten times a second, for each page and car
 def _cached(car: str, authority: Authority, sender: str) -> Mapping[Right, str]:
     return refusals(car, authority, sender)

@@ -47,33 +47,35 @@ STATIC: Final = Path(__file__).parent / "static"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
 HELLO: Final = "fleet console"
-"""What `/hello` answers. A second console finds the first one by it."""
+"""The answer to `/hello`. A second console recognizes the first one by it."""
 STOP_NOT_TAKEN: Final = "NOT STOPPED yet: the fleet's bus does not answer. If a car moves, go to the car."
 """Answer to a STOP that no gateway has answered yet."""
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
-"""Room for what a message contains beside the text of a plan, bytes."""
+"""Bytes that a message may have besides the text of a plan."""
 _LAST_READ_MESSAGES: Final = 10_000
-"""Messages of a page over its budget that may still stop cars: one read, 256 KiB, has 8,000 of the smallest."""
+"""When a page has exceeded its budget, up to this number of its messages are searched for stops. One read, 256 KiB, has
+8,000 of the smallest messages."""
 _LAST_READ_S: Final = 2.0
-"""Timeout of these messages. Alone they take 0.4 s, beside other pages that flood some times that."""
+"""Timeout of this search. It takes 0.4 s, or several times as long if other pages flood the console, too."""
 NORMAL: Final = 1000
 TRY_AGAIN_LATER: Final = 1013
 NOT_PAIRED: Final = 4001
-"""Close code of a page whose device was revoked or whose pairing has expired. The page says so at once."""
+"""Close code of a page whose device was revoked or whose pairing has expired. The page shows this at once."""
 SENT_TOO_MUCH: Final = 4008
 """Close code of a page that exceeded its budget. The page shows the reason, and waits before it connects again."""
 _CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout for open connections when the console ends."""
 
 _LOGGERS: Final = ("fleet", "asyncio", "uvicorn.error")
-"""The loggers whose lines a flood causes: asyncio has one for each write to a TLS connection that has gone."""
+"""The loggers that a flood of connections causes to write: asyncio logs each write to a TLS connection that has
+gone."""
 
 log = logging.getLogger("fleet")
 
 
 class ConsoleServer(uvicorn.Server):
-    """Uvicorn without its signal handlers, which would cancel the stops at the end."""
+    """Uvicorn without its signal handlers, because they would cancel the stops at the end."""
 
     def end(self) -> None:
         """Close all pages and return from `serve`."""
@@ -86,7 +88,7 @@ class ConsoleServer(uvicorn.Server):
 
 
 class NetworkServer(ConsoleServer):
-    """The server for the network: its connections come from an entrance, which lets no flood in."""
+    """The server for the network. Its connections come from an entrance, which lets them in at a bounded rate."""
 
     def __init__(self, config: uvicorn.Config, lan: "Lan") -> None:
         super().__init__(config)
@@ -94,7 +96,7 @@ class NetworkServer(ConsoleServer):
         self._entrance: Entrance | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:  # noqa: ARG002 - uvicorn's own
-        """Begin to accept. uvicorn itself would begin TLS with all that wait at once."""
+        """Begin to accept. uvicorn itself would begin TLS with all waiting connections at once."""
         await super().startup(sockets=[])
 
         def make_protocol() -> asyncio.Protocol:
@@ -108,7 +110,7 @@ class NetworkServer(ConsoleServer):
         self._entrance.open()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Accept nobody any more, and end what runs."""
+        """Accept no more connections, and end those that are open."""
         if self._entrance is not None:
             self._entrance.close()
         await super().shutdown(sockets)
@@ -116,7 +118,7 @@ class NetworkServer(ConsoleServer):
 
 def listen(port: int) -> socket.socket:
     """Return a listening socket on loopback. Raises OSError if the port is in use."""
-    # asyncio sets TCP_NODELAY only if the socket names its protocol. Without it, a message may wait 40 ms.
+    # asyncio sets TCP_NODELAY only if the socket names its protocol. Without TCP_NODELAY, a message may wait 40 ms.
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -134,7 +136,7 @@ def guarded_app(console: Console, port: int, lan: "Lan | None" = None) -> App:
     return Guard(
         _app(console, lan),
         hosts=hosts,
-        cookie=f"fleet_console_{port}",  # a browser sends cookies to all ports of a host
+        cookie=f"fleet_console_{port}",  # the name has the port, because a browser sends cookies to all ports of a host
         token=secrets.token_urlsafe(32),
         on_refusal=log.warning,
     )
@@ -200,7 +202,8 @@ async def serve(
         each.add_done_callback(end)
     try:
         on_ready()
-        # Imported objects stay alive. Without them a collection of what connections leave is short (see `entrance`).
+        # Imported objects live as long as the process. Freeze them, so that the collections of `entrance` do not visit
+        # them.
         gc.collect()
         gc.freeze()
         await asyncio.gather(*(server.serve(sockets=[listens]) for server, listens in servers))
@@ -222,10 +225,11 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
     async def stop(request: Request) -> Response:
         stop_id = request.query_params.get("id", "")[:_MAX_STOP_ID_LENGTH]
         person = request.scope.get(PERSON)
-        # A lead's name on the stop of a person without an open page would keep the cars from this person.
+        # If the stop of a person without an open page had the name of a lead, this person could not drive the cars
+        # afterwards.
         named = replace(stop_request(), sender=console.sender_of(person))
         console.stop_all(stop_id, console.operator_of(person), named)
-        if not await console.is_stop_taken():  # the console sends it again for as long as it counts
+        if not await console.is_stop_taken():  # the page sends it again for as long as it counts
             return JSONResponse({"ok": False, "words": STOP_NOT_TAKEN}, 503)
         return Response(status_code=204)
 
@@ -244,7 +248,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
         person = socket_.scope.get(PERSON)
-        # By device: another tablet of the same person does not pay for this one.
+        # The budget is per device, so that another tablet of the same person is not slowed down.
         name, budget = person and person.name, page_budget()
         device = socket_.scope.get(DEVICE)
         if not console.budgets.may_open(device, time.monotonic()):
@@ -259,7 +263,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
                         await _carry_out_stops(socket_, text, on_text)
                         await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
                         return
-                    if text:  # else it is a ping, which only counts
+                    if text:  # an empty text is a ping, which only counts
                         on_text(text)
                     await asyncio.sleep(0)  # a page that floods must not keep the others waiting
         except TooManyPages as error:
@@ -283,14 +287,16 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
             *people_routes(lan),
             *more,
             WebSocketRoute("/ws", connect),
-            # Only what is the same for everyone: what is secret must not be compressed beside what a stranger chooses.
+            # Compress only what is the same for everyone. A secret must not be compressed together with text that a
+            # stranger chooses.
             Mount("/static", GZipMiddleware(StaticFiles(directory=STATIC))),
         ]
     )
 
     async def limited(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and scope["path"] != STOP_PATH:
-            # By device: another tablet of the same person does not pay for it, and this computer for no stranger.
+            # The budget is per device, so another tablet of the same person is not slowed down, and no stranger slows
+            # down this computer.
             stranger = ("stranger", scope["client"][0]) if more else None
             if not console.budgets.may_ask(scope.get(DEVICE, stranger), time.monotonic()):
                 await _too_much("This device asks for far more than a page does. Wait a few seconds.")(
@@ -303,12 +309,12 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
 
 
 def _too_much(words: str) -> Response:
-    """Answer a request over its budget. The rest of it is not read."""
+    """Answer a request over its budget, without reading the rest of it."""
     return JSONResponse({"ok": False, "words": words}, 429, {"connection": "close"})
 
 
 def example_plans() -> list[dict[str, str]]:
-    """Return name and text of the plans that come with the package."""
+    """Return the names and texts of the plans that come with the package."""
     texts = (path.read_text("utf-8") for path in sorted((EXAMPLES / "plans").glob("*.yaml")))
     return [{"name": plan_name(text, ()), "text": text} for text in texts]
 
@@ -326,14 +332,14 @@ async def _answer_plan(
         return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
     try:
         answer = await ask(text, person)
-    except TooManyQuestions:  # others of this person came while the body did
+    except TooManyQuestions:  # other checks of this person came while the body was read
         return _too_much(TOO_MANY_PLANS)
     return JSONResponse(answer)
 
 
 @asynccontextmanager
 async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> AsyncIterator[Callable[[str], None]]:
-    """Join a page to the console. Yield the function that takes its messages."""
+    """Join a page to the console. Yield the function that handles its messages."""
     page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON), socket_.scope.get(DEVICE, ""))
     sending = asyncio.ensure_future(page.run())
 
@@ -342,7 +348,7 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
         console.operator.spawn(_close(socket_, code))
 
     def on_sent(task: "asyncio.Task[None]") -> None:
-        if not task.cancelled() and task.exception() is not None:  # the page does not read, or has gone
+        if not task.cancelled() and task.exception() is not None:  # the page has gone, or does not read
             end()
 
     def on_text(text: str) -> None:
@@ -367,7 +373,7 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
 
 
 async def _carry_out_stops(socket_: WebSocket, text: str, on_text: Callable[[str], None]) -> None:
-    """Carry out the stops among the messages that came with the one that was too much. All others are dropped."""
+    """Carry out the stops among the messages that came after the one that exceeded the budget. Drop the rest."""
     with suppress(TimeoutError):
         async with asyncio.timeout(_LAST_READ_S):
             for _ in range(_LAST_READ_MESSAGES):

@@ -35,7 +35,10 @@ def files_of(path: Path) -> list[Path]:
 
 
 class _Pipe:
-    """A buffer of written bytes for a stream. It cannot seek, so an archive is never in memory as a whole."""
+    """A buffer of written bytes for a stream.
+
+    It cannot seek, so the zip module never needs the whole archive in memory.
+    """
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -49,13 +52,13 @@ class _Pipe:
         """Do nothing."""
 
     def take(self) -> bytes:
-        """Return and forget what was written."""
+        """Return what was written, and empty the buffer."""
         parts, self._parts = self._parts, []
         return b"".join(parts)
 
 
 def read_file(path: Path) -> Iterator[bytes]:
-    """Yield a file in parts, as far as it reaches now: it may be growing."""
+    """Yield a file in parts, up to its present end: it may be growing."""
     left = path.stat().st_size
     with path.open("rb") as file:
         while left > 0 and (data := file.read(min(_READ_BYTES, left))):

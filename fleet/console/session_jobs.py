@@ -1,4 +1,4 @@
-"""Runs `fleet` in processes for the sessions page: a few at a time, one for each person, with a low priority."""
+"""Runs `fleet` in processes for the sessions page: a few at a time, one at most for each person, at low priority."""
 
 import asyncio
 import os
@@ -17,7 +17,8 @@ from schemas.process.ending import kill
 MAX_SESSION_JOBS: Final = 2
 """Maximum number of processes at work. More requests wait."""
 MAX_JOBS_OF_PERSON: Final = 8
-"""Maximum number of requests of one person that wait. One of them is at work, so that one place is left for others."""
+"""Maximum number of requests of one person that wait or are at work. Only one of them is at work, so that other persons
+have a place, too."""
 _LOW_PRIORITY: Final = 5
 
 
@@ -72,7 +73,9 @@ class SessionJobs:
                 stderr=PIPE,
             )
             self._running.add(process)
-            with suppress(OSError, AttributeError):  # it has ended; there are no priorities (Windows)
+            with suppress(
+                OSError, AttributeError
+            ):  # the process has ended, or the system has no such priorities (Windows)
                 os.setpriority(os.PRIO_PROCESS, process.pid, _LOW_PRIORITY)
             try:
                 out, err = await process.communicate()

@@ -1,6 +1,6 @@
 """Requests of the pages about recordings: the recorder, the list of sessions, verify, download, export, and Rerun.
 
-The work runs in processes of its own with a low priority: a session of gigabytes must not delay a STOP.
+The work runs in separate processes with a low priority, because a session of gigabytes must not delay a STOP.
 """
 
 import asyncio
@@ -37,10 +37,10 @@ _MAX_REQUEST_BYTES: Final = 8192
 
 
 class SessionsApi:
-    """The routes, and the processes that they started.
+    """The routes, and the processes that they started. place: the sessions folder.
 
-    `place` is the sessions folder. `refusal` returns why a person (None: this computer) may not start and stop the
-    recorder, empty if allowed.
+    refusal: returns why a person (None: this computer) may not start and stop the recorder, or an empty text if they
+    may.
     """
 
     def __init__(self, fleet: Fleet, place: Path, refusal: Callable[[PagePerson | None], str]) -> None:
@@ -49,7 +49,7 @@ class SessionsApi:
         self._refusal = refusal
         self._jobs = SessionJobs()
         self._listing: asyncio.Task[tuple[int, str, str]] | None = None
-        """The process that lists the sessions, for all who ask meanwhile."""
+        """The process that lists the sessions. All pages that ask meanwhile share its result."""
         self._scratch: Path | None = None
         self._exports: dict[str, Path] = {}
         self._number = 0
@@ -68,7 +68,7 @@ class SessionsApi:
         ]
 
     async def close(self) -> None:
-        """End the processes, and remove what was exported."""
+        """End the processes, and remove the exported files."""
         self._jobs.kill()
         if self._viewer is not None:
             await asyncio.to_thread(self._viewer.close)
@@ -122,7 +122,7 @@ class SessionsApi:
         if code:
             return refuse(err)
         listed = [json.loads(line) for line in out.splitlines()]
-        # Links are left out: they lead out of the folder, and `session_path` refuses them.
+        # Links are left out, because they lead out of the folder, so `session_path` would refuse them.
         links = await asyncio.to_thread(
             lambda: {path for path in self._place.absolute().iterdir() if path.is_symlink()}
         )
@@ -168,7 +168,10 @@ class SessionsApi:
         return _stream(zip_files(files_of(out), out.name), f"{out.name}.zip")
 
     async def _view(self, request: Request) -> Response:
-        """Open the session in Rerun's viewer, at a port of its own: in a page of ours it would delay the STOP."""
+        """Open the session in Rerun's viewer, at a port of its own.
+
+        Inside a page of ours the viewer would delay STOP.
+        """
         path, wrong = await self._find(request)
         if path is None:
             return wrong
@@ -198,7 +201,7 @@ class SessionsApi:
     # ------------------------------------------------------------------ parts
 
     async def _find(self, request: Request) -> tuple[Path | None, Response]:
-        """Return the session that a request names, or else the refusal."""
+        """Return the session that a request names, or the refusal of the request."""
         try:
             return await asyncio.to_thread(session_path, self._place, request.path_params["name"]), Response()
         except (NotInFolder, OSError) as error:
@@ -226,12 +229,12 @@ def _moment(text: object) -> dict[str, int | None]:
     try:
         at_s = datetime.fromisoformat(str(text)).timestamp()
         return {"at_ms": round(at_s * 1000), "zone_s": time.localtime(at_s).tm_gmtoff}
-    except (ValueError, OverflowError, OSError):  # of a recording that says no time, or one beyond the clock's
+    except (ValueError, OverflowError, OSError):  # the recording has no time, or one that the clock cannot represent
         return {"at_ms": None, "zone_s": 0}
 
 
 def _stream(data: Iterator[bytes], name: str) -> Response:
-    """Answer with a file. Its parts are read on a thread."""
+    """Answer with a file, whose parts are read on a thread."""
     headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name, safe='')}"}  # RFC 6266
     return StreamingResponse(data, media_type="application/octet-stream", headers=headers)
 

@@ -1,6 +1,6 @@
 """Answers the requests of pages that set up a fleet: scan, make a car blink, write its link into the fleet file.
 
-Only pages that are open on this computer may set up a fleet. An existing file keeps everything but the links.
+Only pages on this computer may set up a fleet. In an existing file, only the links are changed.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ class SetupApi:
         self._fleet = fleet
         self._file = file
         self._busy = asyncio.Lock()
-        """Held during a request, because a scan and a gateway cannot have the same port."""
+        """Held during a request, because a scan and a gateway cannot use the same port at once."""
         self._blinks = 0
 
     def routes(self) -> list[Route]:
@@ -53,7 +53,7 @@ class SetupApi:
             try:
                 fields = PageMessage.of(await read_body(request) or "{}").fields
                 return JSONResponse({"ok": True, **await asyncio.to_thread(work, fields)})
-            except (ValueError, ScanFailed, OSError) as error:  # also BadFile, CannotEdit
+            except (ValueError, ScanFailed, OSError) as error:  # BadFile and CannotEdit are among them
                 return refuse(str(error))
 
         async def alone(request: Request) -> Response:
@@ -63,7 +63,7 @@ class SetupApi:
         return alone
 
     def _read_links(self) -> Mapping[str, str]:
-        """Return the link of each car in the file, by the car's name. The link of a car without a link is empty."""
+        """Return the link of each car in the file, by the car's name. If a car has no link, the text is empty."""
         if not self._file.exists():
             return {}
         file = read_fleet(self._file, unbound=True)

@@ -1,7 +1,7 @@
 """The course of a STOP, car by car: stopping, shown, sent, not reached, or moving again. Pure: time is an argument.
 
-Each car has a row of its own. The row of a car that moves again says so for as long as it moves, and is closed then:
-whatever ended that motion was not this STOP.
+Each car has a row of its own. The row of a car that moves again says so as long as the car moves. Then the row is
+closed, because whatever ended that motion was not this STOP.
 
 `now` is monotonic, s. `at_ms` is the clock of the console, ms since the epoch: pages show it.
 """
@@ -15,7 +15,7 @@ from schemas.commands import STOPPING_VERBS
 from schemas.words import Basis, Motors, Phase
 
 MOVED: Final = "moved"
-"""State of a car that was stopped, and moves again."""
+"""State of a car that was stopped and moves again."""
 _UNDER_WAY: Final = (Phase.ASKED, Motors.STOPPING)
 """The states of a car until its result is known."""
 
@@ -27,15 +27,16 @@ class StopReport:
         self.number = number
         self.sender = sender
         self.command_id = ""
-        """The id of its command, empty if it is not sent yet. Events of other commands do not concern this STOP."""
+        """The id of its command, or empty if the command was not sent yet. Events of other commands do not concern this
+        STOP."""
         self._verb = verb
         self._asked_at = now
         self._at_ms = at_ms
         self._result_ns: dict[str, int] = {}
-        """Stamp of the event or state that the result of a car rests on, by its gateway's clock, ns."""
+        """For each car, the stamp of the event or state from which its result follows, by its gateway's clock, ns."""
         self._cars: dict[str, dict[str, Any]] = {name: _entry(Phase.ASKED) for name in cars}
         self._closed: set[str] = set()
-        """The cars whose rows are closed, since they have moved."""
+        """The cars whose rows are closed, because they moved after the STOP."""
 
     @property
     def over(self) -> bool:
@@ -43,13 +44,13 @@ class StopReport:
         return all(entry["state"] not in _UNDER_WAY for entry in self._cars.values())
 
     def on_event(self, car: str, event: Any, now: float) -> None:
-        """Handle a command event. Those of other commands say nothing about this STOP."""
+        """Handle a command event. Events of other commands say nothing about this STOP."""
         if event.verb not in STOPPING_VERBS or event.id != self.command_id or car in self._closed:
             return
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
         is_stopped = event.phase == Phase.COMPLETE or (event.phase == Phase.SENT and event.basis)
-        # A car that seemed not to be reached may be stopped later, by this STOP itself.
+        # A car that was thought not reached may still be stopped later by this STOP.
         if self._is_over(car) and not (is_stopped and self._cars[car]["state"] == Phase.FAILED):
             return
         match event.phase:
@@ -78,16 +79,16 @@ class StopReport:
             self._result_ns[car] = stamp_ns
         elif state == MOVED and safety.motors != Motors.ON and stamp_ns > self._result_ns.get(car, 0):
             self._close(car)
-        if state in _UNDER_WAY:  # a state that is older than the result must not contradict it later
+        if state in _UNDER_WAY:  # remember the stamp, so that an older state cannot contradict the result later
             self._result_ns[car] = max(stamp_ns, self._result_ns.get(car, 0))
 
     def on_presence(self, present: Collection[str]) -> None:
-        """Close the rows of cars that moved again and have no gateway any more: nobody knows whether they move."""
+        """Close the rows of cars that moved again and then lost their gateway: nobody knows whether they still move."""
         for car in [car for car, entry in self._cars.items() if entry["state"] == MOVED and car not in present]:
             self._close(car)
 
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float, *, lost_bus: bool = False) -> None:
-        """Handle the final outcomes. A car without an outcome was not reached.
+        """Handle the final outcomes. A car that has no outcome was not reached.
 
         `lost_bus` is True if the bus was lost before the stop was answered.
         """
@@ -105,7 +106,7 @@ class StopReport:
                 self._set(car, Phase.FAILED, now, outcome.words or outcome.reason or NO_ANSWER)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the report as JSON values."""
         cars = [{"name": name, **self._cars[name]} for name in sorted(self._cars)]
         return {
             "number": self.number,
@@ -120,7 +121,7 @@ class StopReport:
         """Return True if this claim about the motors began after this STOP. An older one is not a result of it."""
         if not safety.HasField("trust_since_s"):
             return False
-        # By both clocks: a bus that hung hands over old states, and the clock of another computer may be ahead.
+        # Check both clocks: a bus that hung delivers old states, and the clock of another computer may be ahead.
         began_ns = stamp_ns - int(safety.trust_since_s * 1e9)
         return now - safety.trust_since_s > self._asked_at and began_ns > self._at_ms * 1_000_000
 

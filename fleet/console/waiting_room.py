@@ -1,10 +1,11 @@
 """The connections from the network that were accepted and wait for TLS. Pure: time is an argument (s, monotonic).
 
-A TLS handshake takes some milliseconds of the loop that stops the cars, so an address may begin only so many. But a
-class has one address behind its access point, and one client that floods must not lock the others there out. So what
-is over the rate is not closed: it waits in the line of its address. Whoever has sent nothing costs nothing but a place
-and loses it first, the oldest before the others: an honest client sends its TLS hello at once. Those with a hello are
-served in their order, so that a client which connects again and again waits behind everybody else each time.
+A TLS handshake takes some milliseconds of the loop that stops the cars, so each address may begin only a limited
+number. But a whole class has one address behind its access point, and one client that floods must not lock the rest of
+the class out. So connections over the rate are not closed: they wait in the line of their address. A connection that
+has sent nothing loses its place first, the oldest of them before the others, because an honest client sends its TLS
+hello at once. Connections with a hello are served in order, so a client that connects again and again waits behind
+everybody else each time.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -14,22 +15,25 @@ from typing import Final
 from schemas.token_bucket import TokenBucket
 
 ADDRESS_BURST: Final = 300.0
-"""Handshakes of one address at once: a class behind one address opens forty pages, with seven connections each."""
+"""Handshakes of one address at once. A class behind one address opens forty pages, with seven connections each."""
 ADDRESS_RATE: Final = 20.0
-"""Handshakes per second of one address. With a request each, they take some 8 % of a core."""
+"""Handshakes of one address per second. With one request each, they take some 8 % of a core."""
 TOTAL_BURST: Final = 1000.0
-"""The same of all addresses. Three that flood leave some for the others."""
+"""Handshakes of all addresses at once. Even if three addresses flood, some are left for the rest."""
 TOTAL_RATE: Final = 100.0
 MAX_HANDSHAKES_PER_ADDRESS: Final = 16
-"""Handshakes of one address that are under way: less than the strangers that an address may have."""
+"""Maximum number of unfinished handshakes of one address. It is less than the number of strangers that an address may
+have."""
 MAX_WAITING_PER_ADDRESS: Final = 160
-"""Most connections in one line. A flood of 1000 a second without a hello leaves 0.16 s for that of an honest client."""
+"""Maximum number of connections in one line. A flood of 1000 a second without a hello leaves an honest client 0.16 s to
+send its hello."""
 MAX_WAITING: Final = 224
-"""Most connections in all lines: with those that are open, fewer than the 1024 files of a process."""
+"""Maximum number of connections in all lines. Together with the open connections they are fewer than the 1024 files of
+a process."""
 HELLO_TIMEOUT_S: Final = 10.0
-"""Timeout of a connection that sends nothing: that of a stranger (`connection_limit`)."""
+"""Timeout of a connection that sends nothing. It is that of a stranger (`connection_limit`)."""
 MAX_ADDRESSES: Final = 1024
-"""Maximum number of remembered addresses without a connection. For more, an idle one is forgotten."""
+"""Maximum number of remembered addresses without a connection. Beyond it, an idle address is forgotten."""
 
 
 @dataclass(slots=True)
@@ -57,7 +61,10 @@ class WaitingRoom:
     _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
 
     def add(self, key: Hashable, address: str, now: float) -> Hashable | None:
-        """Add a connection. Return the key of one that loses its place, perhaps this one."""
+        """Add a connection.
+
+        Return the key of a connection that loses its place for it, which may be the new one itself.
+        """
         line = self._lines.setdefault(address, _AddressLine())
         line.silent[key] = now
         self._forget_idle()
@@ -80,7 +87,7 @@ class WaitingRoom:
             line.ready.pop(key, None)
 
     def take(self, now: float) -> Hashable | None:
-        """Return the connection whose handshake begins now, or None if nobody may begin. The addresses take turns."""
+        """Return the connection whose handshake begins now, or None if none may begin. The addresses take turns."""
         if not self._total.has(now):
             return None
         for address, line in self._lines.items():
@@ -89,7 +96,7 @@ class WaitingRoom:
                 key = next(iter(line.ready))
                 del line.ready[key]
                 line.begun += 1
-                self._lines[address] = self._lines.pop(address)  # the last one of the next round
+                self._lines[address] = self._lines.pop(address)  # this address comes last in the next round
                 return key
         return None
 
@@ -116,7 +123,7 @@ class WaitingRoom:
         return sum(len(line) for line in self._lines.values())
 
     def _drop_one(self, line: _AddressLine) -> Hashable:
-        """Take a place away: that of the oldest without a hello, else that of any."""
+        """Free a place: that of the oldest connection without a hello, or else that of any connection."""
         if line.silent:
             key = next(iter(line.silent))
             del line.silent[key]

@@ -1,6 +1,7 @@
-"""A process of low priority that answers questions, one JSON line each, one at a time.
+"""A process of low priority that answers questions one at a time. A question and an answer are one line of JSON each.
 
-Python code that takes seconds must not run in the console: a thread would hold the interpreter while a STOP waits.
+Python code that takes seconds must not run in the console, not even in a thread, because it would hold the interpreter
+lock while a STOP waits.
 """
 
 import asyncio
@@ -18,19 +19,19 @@ from schemas.process.ending import kill
 NICENESS: Final = 10
 """The console, the gateways and the recorder go first."""
 _MAX_ANSWER_BYTES: Final = 64 * 1024 * 1024
-"""Maximum size of an answer. A plan of 64 KiB may have a fault in each line, with a text of 200 bytes: 16 MB. The lanes
-of fifty cars with as many spans as a lane holds take some 60 MB."""
+"""Maximum size of an answer. A plan of 64 KiB may have a fault in each line, with a text of 200 bytes each: 16 MB. The
+lanes of fifty cars, each with the maximum number of spans, take some 60 MB."""
 
 
 class TooManyQuestions(Exception):
-    """Other questions of the same person have no answer yet."""
+    """Too many other questions of the same person have no answer yet."""
 
 
 class Worker:
-    """The process. It starts with the first question, and ends when there was none for a while.
+    """The process. It starts with the first question, and ends when there was no question for a while.
 
-    module: what it runs (`serve_lines`). timeout_s: of one answer. idle_s: time after which it ends. max_open: maximum
-    number of questions of one person without an answer.
+    module: the module that it runs, which calls `serve_lines`. timeout_s: timeout of one answer. idle_s: time without a
+    question after which it ends. max_open: maximum number of questions of one person without an answer.
     """
 
     def __init__(self, module: str, *, timeout_s: float, idle_s: float, max_open: int) -> None:
@@ -46,11 +47,14 @@ class Worker:
         self._idle: asyncio.TimerHandle | None = None
 
     def is_busy(self, person: Hashable) -> bool:
-        """Return True if no more questions of this person may begin."""
+        """Return True if this person may not ask another question now."""
         return self._open[person] >= self._max_open
 
     async def ask(self, question: Any, person: Hashable) -> dict[str, Any] | None:
-        """Return the answer to a question of JSON values. None if there is none in time. Raises TooManyQuestions."""
+        """Return the answer to a question (JSON values), or None if it does not come in time.
+
+        Raises TooManyQuestions.
+        """
         if self.is_busy(person):
             raise TooManyQuestions
         self._open[person] += 1
@@ -76,8 +80,8 @@ class Worker:
         return found
 
     async def _answer(self, line: bytes) -> dict[str, Any] | None:
-        """Return what the process answers. None if it has died."""
-        # Its answer would be taken for that of the next question if this one does not wait for it.
+        """Return the answer of the process, or None if the process has died."""
+        # If nobody waited for this answer, it would be taken for the answer to the next question.
         process, self._process = self._process or await self._start(), None
         answered = False
         try:
@@ -118,7 +122,10 @@ class Worker:
 
 
 def serve_lines(answer: Callable[[Any], dict[str, Any]], lines: Iterable[str] = sys.stdin) -> None:
-    """Answer each line of stdin by a line of stdout. Return when stdin ends. Run this in the process of a worker."""
+    """Answer each line of stdin by a line on stdout. Return when stdin ends.
+
+    This is called in the process of a worker.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of the terminal
     if hasattr(os, "nice"):
         os.nice(NICENESS)
