@@ -1,7 +1,7 @@
 """Several cars from one laptop: drive, watch, record and replay them.
 
-`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin. `Session` is a recording,
-`Catalog` answers questions about all of them.
+`from fleet import Fleet` is the SDK, and `from fleet.aio import Fleet` its asyncio twin. A `Session` is one recording.
+A `Catalog` answers questions about all recordings.
 """
 
 # `fleet` handles Ctrl-C only after this module is imported, and `typing` would take longer than all the rest.

@@ -1,4 +1,7 @@
-"""The `fleet` command as a script and as `python -m fleet`: a Ctrl-C while it starts or ends prints no traceback."""
+"""The `fleet` command as a script and as `python -m fleet`.
+
+Ctrl-C prints no traceback, even while it starts or ends.
+"""
 
 from schemas.process import startup
 

@@ -1,4 +1,4 @@
-"""Fleet and Car for asyncio: the same names as in `fleet.client`, with coroutines.
+"""Fleet and Car for asyncio, with the same names as in `fleet.client`, but as coroutines.
 
 The blocking calls run in threads. A watch is an asynchronous iterator with a bounded queue.
 """
@@ -35,7 +35,7 @@ from schemas.commands import Verb
 from schemas.words import Rank, Scope
 
 _THREADS: Final = 256
-"""Maximum number of concurrent calls. A drive blocks its thread until its end."""
+"""Maximum number of concurrent calls. A drive blocks its thread until the drive ends."""
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -79,7 +79,7 @@ class Fleet:
         self._threads.shutdown(wait=False)
 
     async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
-        """Run a blocking call in a thread. It runs on if the task is cancelled."""
+        """Run a blocking call in a thread. If the task is cancelled, the call still runs to its end."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(function, *args, **options))
 
     @property
@@ -108,8 +108,8 @@ class Fleet:
     def watch(self, expression: str, *, when: str | None = None) -> "Watch":
         """Subscribe to readings: `async for reading in fleet.watch("*/sensor/range")`.
 
-        Use it with `async with` if the fleet stays open longer. Otherwise it receives readings until the fleet is
-        closed.
+        If the fleet stays open longer than you need the watch, use the watch with `async with`. Otherwise it receives
+        readings until the fleet is closed.
         """
         written = check_key(self.sync.expression(expression))
         watch = Watch(None if when is None else KeyCondition.of(when, written).holds)
@@ -160,7 +160,7 @@ class Fleet:
     async def resume(
         self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False
     ) -> list[Outcome]:
-        """End the e-stops with these ids, or without ids the hold. If `cars` is None, do so for every car."""
+        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do so for every car."""
         return await self.ask(resume_request(ids, everything=everything), cars)
 
     async def pause(self, why: str = "") -> list[Outcome]:
@@ -168,7 +168,7 @@ class Fleet:
         return await self.ask(pause_request(why))
 
     async def unpause(self) -> list[Outcome]:
-        """End the pause of the fleet. No car moves."""
+        """End the pause of the fleet. This does not move a car."""
         return await self.ask(plain_request(Verb.UNPAUSE))
 
     async def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
@@ -180,7 +180,10 @@ class Fleet:
         return await self.ask(end_loan_request(), cars)
 
     async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Send a command to the cars and return their outcomes. It is sent at once, whatever the threads wait for."""
+        """Send a command to the cars and return their outcomes.
+
+        The command is sent at once, even if all threads are busy.
+        """
         return await self.call(self.sync.outcomes, self.sync.send(request, cars))
 
 
@@ -211,7 +214,7 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
 
 
 class Lease:
-    """A lease, made by `Car.lease`. Use it with `async with`, which raises LeaseLost if another sender has the car."""
+    """A lease, made by `Car.lease`. Use it with `async with`. If another sender has the car, that raises LeaseLost."""
 
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet
@@ -254,7 +257,7 @@ class Watch:
         return self._dropped + self.hand_over.dropped
 
     def begin(self, undeclare: Callable[[], object]) -> None:
-        """Note the function that ends the subscription."""
+        """Store the function that ends the subscription."""
         self._undeclare = undeclare
 
     def close(self) -> None:

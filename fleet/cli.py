@@ -150,14 +150,20 @@ _EXTRAS: Final = {
 
 @add_completion_class
 class _BashCompletion(BashComplete):
-    """Completion for bash. Without the second part bash takes `@` for a word of its own, and completes no group."""
+    """Completion for bash.
+
+    Without the second line, bash treats `@` as a separate word, so it cannot complete the name of a group.
+    """
 
     source_template = f"{BashComplete.source_template}\nCOMP_WORDBREAKS=${{COMP_WORDBREAKS//@/}}\n"
 
 
 @add_completion_class
 class _FishCompletion(FishComplete):
-    """Completion for fish, also of `red,blue`: only the first comma ends the type of a completion."""
+    """Completion for fish.
+
+    It works for lists such as `red,blue`, because only the first comma ends the type of a completion.
+    """
 
     source_template = FishComplete.source_template.replace('string split ","', 'string split -m 1 ","')
 
@@ -177,7 +183,7 @@ class _LazyGroup(CommandGroup):
         return command
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands first: they are what one looks for."""
+        """Write the commands before the options, because most users look for a command."""
         self.format_commands(ctx, formatter)
         click.Command.format_options(self, ctx, formatter)
 
@@ -230,7 +236,7 @@ def main() -> None:
         sys.stderr.write(f"fleet: {_missing(error)}\n")
         code = 1
     except RuntimeError as error:
-        # Python's locks raise it ("release unlocked lock") if Ctrl-C comes while a wait ends.
+        # Python's locks raise this error ("release unlocked lock") if Ctrl-C comes while a wait ends.
         if not isinstance(error.__context__, KeyboardInterrupt):
             raise
         code = startup.INTERRUPTED
@@ -244,7 +250,10 @@ def main() -> None:
 
 
 def _missing(error: ModuleNotFoundError) -> str:
-    """Return words about the missing package and how to install it. Raises the error again for a module of ours."""
+    """Return a message about the missing package and how to install it.
+
+    Raises the error again if the module is our own.
+    """
     module = (error.name or "").partition(".")[0]
     if module in ("", "fleet", "gateway", "schemas"):
         raise error
@@ -253,7 +262,10 @@ def _missing(error: ModuleNotFoundError) -> str:
 
 
 def _command_path(error: click.UsageError) -> str:
-    """Return the command that the error is about. Errors of click's parser do not carry it."""
+    """Return the command that the error is about.
+
+    Errors of click's parser do not contain it, so find it in the arguments.
+    """
     if error.ctx is not None:
         return error.ctx.command_path
     path: list[str] = ["fleet"]
@@ -269,12 +281,15 @@ def _command_path(error: click.UsageError) -> str:
 
 
 def _one_line(error: click.ClickException) -> str:
-    """Return the message on one line. Our types name the wrong word, so an argument needs no name."""
+    """Return the message on one line.
+
+    Messages of our own types quote the wrong word, so the name of an argument is left out.
+    """
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""
         return " ".join(f"{option}{error.message}".split())
     if isinstance(error, click.NoSuchOption) and error.ctx is not None:
-        # click suggests --as for --json: names that are only somewhat like the word.
+        # click also suggests names that are hardly similar, such as --as for --json.
         options = [each for param in error.ctx.command.get_params(error.ctx) for each in param.opts]
         near = misspelled(error.option_name.lstrip("-"), [each[2:] for each in options if each.startswith("--")])
         return f"No such option '{error.option_name}'.{f' Did you mean --{near[0]}?' if near else ''}"

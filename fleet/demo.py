@@ -1,6 +1,6 @@
 """`fleet demo`: runs a job with three simulated cars as real processes, records and checks it, and exports it to Rerun.
 
-Each check compares a belief with the truth: the simulator publishes the true mode, motors and LED of a car.
+Checks compare what a gateway believes with the truth: the simulator publishes the true mode, motors and LED of a car.
 """
 
 import json
@@ -45,7 +45,7 @@ LED_COLORS: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64,
 CHECK_TIMEOUT_S: Final = 30.0
 """Timeout for a condition of a check."""
 PROCESS_EXIT_TIMEOUT_S: Final = 30.0
-"""Timeout for the exit of a process: twice the longest stop sequence with its worst case."""
+"""Timeout for the exit of a process: twice the time of the longest stop sequence in the worst case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Check:
 
 @dataclass(slots=True)
 class Demo:
-    """One run: its checks, and the messages that it saw."""
+    """One run of the demo: its checks, and the messages that it received."""
 
     folder: Path
     endpoint: str
@@ -70,13 +70,13 @@ class Demo:
     """Sequence numbers that this process received, by key. The recording must contain them."""
 
     def check(self, name: str, words: str, *, ok: bool) -> None:
-        """Note a check and print its result."""
+        """Store the result of a check, and print it."""
         self.checks.append(Check(name, ok, words))
         mark = click.style("ok  ", fg="green") if ok else click.style("FAIL", fg="red", bold=True)
         self.say(f"{mark} {name}: {words}")
 
     def on_sample(self, sample: bus.Sample) -> None:
-        """Note a publication. Runs on a Zenoh thread."""
+        """Store what was published. Runs on a Zenoh thread."""
         key = keys.parse(sample.key)
         if key is None or key.car not in DEMO_CARS:
             return
@@ -259,7 +259,8 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         f"link {_state(client, 'red', 'link').state}, motors {_state(client, 'red', 'safety').motors}",
         ok=lost,
     )
-    # The link comes back now, and not after a fixed time: on a busy machine that might pass before the loss is noticed.
+    # The link comes back now, not after a fixed time, because on a busy machine that time might pass before the loss is
+    # noticed.
     _ask(simulator, {"car": "red", "fault": "link_drop", "for_s": 0})
     back = run.wait_until(
         lambda: (
@@ -303,7 +304,7 @@ def _shown(outcomes: Sequence[Outcome]) -> str:
 
 
 def _ends(codes: Mapping[str, int | None]) -> str:
-    """Say how processes have ended."""
+    """Return how processes have ended, in words."""
     bad = {name: "did not end" if code is None else f"exit code {code}" for name, code in codes.items() if code != 0}
     return _listed(bad) if bad else "in order"
 
@@ -407,7 +408,10 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
 
 
 def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
-    """Start a process that the stack ends. Delay signals meanwhile, which could leave the process behind."""
+    """Start a process that the stack ends.
+
+    Delay signals meanwhile, because a signal could leave the process running.
+    """
     with signals.held_back():
         return stack.enter_context(process)
 
@@ -437,7 +441,7 @@ def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
 
 
 def _ended(process: "subprocess.Popen[str]") -> int | None:
-    """Return the exit code, None after the timeout."""
+    """Return the exit code, or None if the process still runs after the timeout."""
     try:
         return process.wait(PROCESS_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:

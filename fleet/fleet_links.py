@@ -1,4 +1,7 @@
-"""The links in a fleet file: those of `gateway run --link`, and `sim`. Finds links that name the same port."""
+"""The links in a fleet file: the links that `gateway run --link` accepts, and `sim`.
+
+Finds links that name the same port.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,7 +27,7 @@ def parse_fleet_link(text: str) -> FleetLink:
 
 
 def may_be_same(one: FleetLink, other: FleetLink) -> bool:
-    """Return True if both can be one port: one device behind two paths, or one USB device described twice."""
+    """Return True if both may be the same port: two paths of one device, or two descriptions of one USB device."""
     if isinstance(one, SimLink) or isinstance(other, SimLink):
         return False
     return one.port_key in other.possible_ports() or other.port_key in one.possible_ports()
@@ -32,7 +35,7 @@ def may_be_same(one: FleetLink, other: FleetLink) -> bool:
 
 def shared_ports(links: Mapping[str, FleetLink]) -> Iterator[tuple[str, str]]:
     """Yield (first car, second car) for each car whose link may name the port of an earlier car."""
-    # Look-ups instead of pairs: 5,000 cars would make 12 million pairs.
+    # Look up the ports instead of comparing all pairs, because 5,000 cars have 12 million pairs.
     order = {car: index for index, car in enumerate(links)}
     by_port: dict[PortKey, str] = {}
     by_possible: dict[PortKey, str] = {}

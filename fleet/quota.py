@@ -1,6 +1,7 @@
-"""How much a recorder keeps: one value from a fleet file through `fleet up` to `fleet record run`. Pure.
+"""How much a recorder keeps: one value, passed from a fleet file through `fleet up` to `fleet record run`. Pure.
 
-A further limit is a field here, with what it decides, a key in the model of the fleet file, and an option.
+To add a limit, add a field here with the methods that apply it, a key in the model of the fleet file, and
+an option.
 """
 
 import re
@@ -8,11 +9,13 @@ from dataclasses import dataclass
 from typing import Final
 
 SESSIONS_PER_QUOTA: Final = 10
-"""Minimum sessions in a quota. The quota spares the session that is being written, so each is at most a tenth of it."""
+"""Minimum number of sessions that fit into a quota. Nothing of the session that is being written may be removed, so
+each session is at most a tenth of the quota."""
 QUOTA_SEGMENT_S: Final = 60.0
-"""Length of a segment, s, if there is a quota: it takes whole segments, and a pin is of a minute."""
+"""Length of a segment, s, if there is a quota. Whole segments are removed for the quota, and a pin keeps whole
+minutes."""
 MAX_SEGMENTS: Final = 9990
-"""Maximum segments of a session: their names have four digits."""
+"""Maximum number of segments of a session, because their names have four digits."""
 _SIZE_UNITS: Final = {"TB": 10**12, "GB": 10**9, "MB": 10**6, "KB": 10**3, "B": 1, "": 1}
 
 
@@ -35,7 +38,7 @@ class Quota:
     total: int = 0
     """The oldest unpinned segments of unmarked sessions are removed first."""
     session: int = 0
-    """Size at which a session is closed and the next one begins; 0: a tenth of `total`."""
+    """Size at which a session is closed and the next one begins. 0 means a tenth of `total`."""
 
     @property
     def session_limit(self) -> int:
@@ -44,7 +47,7 @@ class Quota:
 
     @property
     def refusal(self) -> str:
-        """Return why the two sizes do not fit each other. Empty if they do."""
+        """Return why the two sizes contradict each other, or an empty text if they do not."""
         if not self.session or not self.total or self.session <= self.total // 2:
             return ""
         return (
@@ -54,18 +57,18 @@ class Quota:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Return the options of `fleet record run` that say this."""
+        """Return the options of `fleet record run` for this quota."""
         options = {"--quota": self.total, "--session-size": self.session}
         return tuple(word for option, size in options.items() if size for word in (option, format_size(size)))
 
     def segment_s(self, otherwise_s: float) -> float:
-        """Return the length of a segment for these limits, s. otherwise_s: without any."""
+        """Return the length of a segment for these limits, s. otherwise_s: the length if there is no quota."""
         return QUOTA_SEGMENT_S if self.total else otherwise_s
 
     def is_session_over(self, size: int, segments: int) -> bool:
-        """Return True if a session of this size has enough: the next one begins."""
+        """Return True if a session of this size is complete, so that the next one begins."""
         return 0 < self.session_limit <= size or segments >= MAX_SEGMENTS
 
     def excess(self, size: int) -> int:
-        """Return by how many bytes all sessions are too large together; 0 if they are not."""
+        """Return by how many bytes all sessions together exceed the quota, or 0 if they do not."""
         return max(0, size - self.total) if self.total else 0

@@ -1,5 +1,5 @@
-"""Brings what the bus says of a fleet to other people's programs, each as a process of its own. No command comes back.
+"""Bridges from the bus to other programs, each in a process of its own.
 
-`foxglove_server` serves Foxglove live. `home_assistant` says what Home Assistant reads of a car, pure; `mqtt_bridge`
-publishes it to a broker.
+They publish the state of a fleet, and accept no commands. `foxglove_server` serves Foxglove live. `home_assistant`
+decides what Home Assistant gets about a car, and is pure. `mqtt_bridge` publishes that to a broker.
 """

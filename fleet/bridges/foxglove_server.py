@@ -1,10 +1,10 @@
-"""Serves a fleet live to Foxglove: each message of the bus on a topic of its key, with its schema. It takes none.
+"""Serves a fleet live to Foxglove. Each message of the bus appears on a topic named like its key, with its schema.
 
-The topics are those that `fleet sessions export --foxglove` writes, so one layout shows both. Three parties may be slow
-or odd, and none may hold up the others. A client of Foxglove that does not read loses its oldest messages, which the
-SDK drops, and no other client notices. If we are behind the bus, Zenoh's queue for us fills and the hub drops what is
-for us. A program that publishes nonsense gets a topic of its own, or none: what is not protobuf of this version is
-counted and named at the end, and the number of topics is bounded.
+The server accepts no messages from Foxglove. The topics are the same as those that `fleet sessions export --foxglove`
+writes, so one layout shows both. Nobody who is slow, or publishes nonsense, may delay the others. If a client of
+Foxglove does not read, the SDK drops its oldest messages, and no other client notices. If we are slower than the bus,
+Zenoh's queue for us fills, and the hub drops messages for us. If a program publishes messages that are not protobuf of
+this version, they are counted, and named at the end. The number of topics is bounded.
 """
 
 import logging
@@ -26,37 +26,40 @@ from schemas.bus import LARGEST_PAYLOAD, Sample, sample_of
 from schemas.topics import Qos
 
 DEFAULT_FOXGLOVE_PORT: Final = 8765
-"""Foxglove offers this port by itself."""
+"""The port that Foxglove suggests."""
 BACKLOG_SIZE: Final = 1024
-"""Maximum messages that wait for one client. Beyond it, its oldest are dropped."""
+"""Maximum number of messages that wait for one client. Beyond it, the oldest are dropped."""
 MAX_FOXGLOVE_TOPICS: Final = 8192
-"""Maximum topics: 256 cars with all of theirs, and some thousand of strangers."""
+"""Maximum number of topics: all topics of 256 cars, and some thousand topics of other programs."""
 MAX_NAMED_KEYS: Final = 1024
-"""Maximum keys whose left-out messages are counted singly."""
+"""Maximum number of keys whose left-out messages are counted separately."""
 OTHER_KEYS: Final = "other keys"
 _QUEUE_SIZE: Final = 16_384
-"""Maximum messages in the queue of one subscription: three seconds of 100 cars."""
+"""Maximum number of messages in the queue of one subscription: three seconds of 100 cars."""
 _MAX_BATCH: Final = 4096
 _LAST_TIMEOUT_S: Final = 3.0
-"""Timeout for the last message of a topic that is published on change. If nobody answers, no time passes."""
+"""Timeout for the last message of a topic that is published only on change. If no process can answer, nobody waits."""
 
-# The SDK logs an error for each message to a client that has gone without a word.
+# The SDK logs an error for each message to a client that has gone without closing its connection.
 logging.getLogger("foxglove").setLevel(logging.CRITICAL + 1)
 
 
 class PortInUse(Exception):
-    """The server cannot listen. The message says why."""
+    """The server cannot listen on its port. The message says why."""
 
 
 class FoxgloveServer:
-    """Serves one fleet from its making to `close`. `step` passes on what has come since."""
+    """Serves one fleet from the constructor until `close`.
+
+    `step` passes on the messages that have come since the last step.
+    """
 
     def __init__(self, client: Fleet, address: str, port: int, backlog: int = BACKLOG_SIZE) -> None:
         self._client = client
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         self._last: dict[int, tuple[bytes, int]] = {}
-        """Last message and its time by channel, of states and events."""
+        """The last message of each channel of states or events, and its time."""
         self._names = TopicNames()
         self.left_out = LeftOut()
         """Messages that have no topic."""
@@ -66,7 +69,7 @@ class FoxgloveServer:
                 name=f"{keys.describe_fleet(client.name)} (live)",
                 host=address,
                 port=port,
-                capabilities=[],  # nobody may publish, call or set anything here
+                capabilities=[],  # clients may not publish, call or set anything
                 server_listener=self._listener,
                 message_backlog_size=backlog,
                 context=self._context,
@@ -83,7 +86,7 @@ class FoxgloveServer:
 
     @property
     def port(self) -> int:
-        """Return the port that it listens on."""
+        """Return the port that the server listens on."""
         return self._server.port
 
     def step(self) -> int:
@@ -112,8 +115,8 @@ class FoxgloveServer:
             self.left_out.add(sample.key if known else OTHER_KEYS, channel)
             return
         now_ns = time.time_ns()
-        # A client learns of a topic by its first message, and subscribes when it has passed. Keep the message before it
-        # goes out, so that who subscribes meanwhile gets it twice rather than not at all.
+        # A client learns of a topic by its first message, so it subscribes only after this message was sent. Store the
+        # message before it is sent: a client that subscribes in between then gets it twice rather than not at all.
         if self._is_kept(sample):
             self._last[channel.id()] = sample.payload, now_ns
         channel.log(sample.payload, log_time=now_ns)
@@ -124,7 +127,7 @@ class FoxgloveServer:
         return topic is not None and topic.qos is Qos.STATE and len(sample.payload) <= LARGEST_PAYLOAD
 
     def _channel(self, sample: Sample) -> "foxglove.Channel | LeftOutCause":
-        """Return the channel of a message, or why it has none."""
+        """Return the channel of a message, or why the message has none."""
         kind = messages.name_in(sample.encoding)
         if kind is None:
             return LeftOutCause.NOT_PROTOBUF
@@ -146,7 +149,7 @@ class FoxgloveServer:
         return self._channels[topic]
 
     def _on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Give a new client the last message of a state or event. Runs on a thread of the SDK."""
+        """Send the last message to a client that subscribes to states or events. Runs on a thread of the SDK."""
         if (last := self._last.get(channel.id)) is None:
             return
         payload, at_ns = last
@@ -154,13 +157,13 @@ class FoxgloveServer:
 
 
 class _Listener(ServerListener):
-    """Passes on who subscribes to what."""
+    """Tells the server which client subscribes to which channel."""
 
     def __init__(self, on_subscribe: Callable[[Client, ChannelView], object]) -> None:
         self._on_subscribe = on_subscribe
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Pass it on."""
+        """Call the function for subscriptions."""
         self._on_subscribe(client, channel)
 
 

@@ -1,19 +1,19 @@
-"""Decides which MQTT messages Home Assistant gets of a fleet, and when. Pure: time is an argument.
+"""Decides which MQTT messages about a fleet Home Assistant gets, and when. Pure: time is an argument.
 
-Each car is a device with a few entities. One retained message announces it (device discovery, Home Assistant 2024.11
-and later). Then there are two topics for each car: `state`, one JSON object with a value for each entity, and
+Each car is a device with a few entities. One retained message announces the car (device discovery, Home Assistant
+2024.11 and later). Then there are two topics for each car: `state`, one JSON object with a value for each entity, and
 `availability`.
 
 **A number is never older than it looks.** A value that was not measured, or is stale, is null, which Home Assistant
-shows as unknown. States are not retained: who connects gets the next one, at most REPEAT_S later, and none of
-yesterday. An entity expires after EXPIRE_S without a state, so a bridge that hangs leaves no value behind. Availability
-is retained, since Home Assistant asks for it when it starts. It is `offline` for a car whose gateway has gone, whose
-gateway says nothing any more, or whose link is lost. The bridge has an availability of its own, `offline` by its last
-will, and an entity needs both.
+shows as unknown. States are not retained: a client that connects gets the next state, at most REPEAT_S later, and never
+yesterday's. An entity expires after EXPIRE_S without a state, so a bridge that hangs leaves no old value on the screen.
+Availability is retained, because Home Assistant reads it when it starts. It is `offline` for a car whose gateway has
+gone or is silent, or whose link is lost. The bridge has an availability of its own, which its last will sets to
+`offline`. An entity is available only if the car and the bridge are.
 
-**What stays after a crash.** An announcement and an `online` of a bridge that was killed stay in the broker. The next
-bridge hears them when it begins (`adopt`) and says `offline` for cars that are not there. A clean end takes all of it
-back, so Home Assistant forgets the devices.
+**After a crash,** the announcements and the `online` of cars from a bridge that was killed stay in the broker. The next
+bridge reads them when it begins (`adopt`), and publishes `offline` for cars that are not there. A bridge that ends
+normally removes them all, so Home Assistant forgets the devices.
 """
 
 import json
@@ -26,7 +26,7 @@ from schemas import keys
 from schemas.words import UNKNOWN, BatteryLevel, LinkState, Mode, Motors
 
 BASE: Final = "car-fleet"
-"""First part of all topics but the announcements."""
+"""First part of all topics except those of the announcements."""
 DISCOVERY_PREFIX: Final = "homeassistant"
 """Home Assistant's own default."""
 ONLINE: Final = "online"
@@ -36,16 +36,17 @@ STATE_INTERVAL_S: Final = 1.0
 REPEAT_S: Final = 10.0
 """Maximum interval of the states of a car that is available."""
 EXPIRE_S: Final = 30
-"""Time without a state after which Home Assistant shows no value."""
+"""After this time without a state, Home Assistant shows no value."""
 MAX_ANNOUNCED_CARS: Final = 256
-"""Maximum devices, as of the exporter: anybody on an open bus may invent names."""
+"""Maximum number of devices, the same as that of the exporter. Without it, anybody on an open bus could invent cars
+without end."""
 _DIGITS: Final = 3
 _AVAILABILITY_PARTS: Final = 4
-"""Parts of the topic of a car's availability."""
+"""Number of parts of the topic of a car's availability."""
 
 
 class Publication(NamedTuple):
-    """One MQTT message. An empty retained one removes what the broker keeps."""
+    """One MQTT message. A retained message without content removes the message that the broker keeps."""
 
     topic: str
     payload: str
@@ -57,17 +58,17 @@ class Entity:
     """One value of a car."""
 
     name: str
-    """Its field of the state, and the last part of its id."""
+    """Its field in the state, and the last part of its id."""
     title: str
     value: Callable[[CarState, float], Any]
     """The value at a time. None means that it was not measured, or is stale."""
     config: Mapping[str, Any]
-    """Its settings for Home Assistant. In a template, {0} is its name."""
+    """Its settings for Home Assistant. In a template, {0} stands for `name`."""
     of_absent: bool = False
-    """True if it has a value also of a car that is not available."""
+    """True if it has a value even if the car is not available."""
 
     def component(self, car_id: str) -> dict[str, Any]:
-        """Return its part of the announcement of a car, without its availability."""
+        """Return the part of a car's announcement that describes this entity, without its availability."""
         template = self.config.get("value_template", "{{{{ value_json.{0} }}}}").format(self.name)
         return {
             **self.config,
@@ -79,13 +80,13 @@ class Entity:
 
 
 def is_available(state: CarState, now: float) -> bool:
-    """Return True if the car's gateway is there and speaks, and its link is not lost."""
+    """Return True if the car's gateway is on the bus and publishes, and the car's link is not lost."""
     link = state.fresh("state/link", now) if state.present else None
     return link is not None and link.state != LinkState.LOST
 
 
 def _of(topic: str, read: Callable[[Any], Any]) -> Callable[[CarState, float], Any]:
-    """Return the value of a field of a topic's newest message, or None if it is stale."""
+    """Return a function that reads a value from a topic's newest message. It returns None if the message is stale."""
     return lambda state, now: None if (found := state.fresh(topic, now)) is None else read(found)
 
 
@@ -117,7 +118,11 @@ def _words(*words: str) -> dict[str, Any]:
 
 
 def _flag(device_class: str | None = None) -> dict[str, Any]:
-    config = {"platform": "binary_sensor", "payload_on": "True", "payload_off": "False"}  # as templates print them
+    config = {
+        "platform": "binary_sensor",
+        "payload_on": "True",
+        "payload_off": "False",
+    }  # the texts in which a template prints True and False
     return {**config, "device_class": device_class} if device_class else config
 
 
@@ -176,20 +181,21 @@ ENTITIES: Final = (
 
 
 class HomeAssistant:
-    """Decides what is published about one fleet. Times: s, of one clock that the caller chooses."""
+    """Decides what is published about one fleet. Times are in s, of one clock that the caller chooses."""
 
     def __init__(self, fleet: str, prefix: str = DISCOVERY_PREFIX, version: str = "") -> None:
         self._fleet = fleet
         self._prefix = prefix
         self._version = version
         self._said: dict[str, bool] = {}
-        """Availability that was said of each announced car, the one that changed first at the front."""
+        """The last published availability of each announced car. The car that has not changed for the longest time
+        comes first."""
         self._states: dict[str, tuple[str, float]] = {}
-        """Last state of each car, and its time."""
+        """The last published state of each car, and its time."""
 
     @property
     def bridge_availability(self) -> str:
-        """Return the topic of the bridge's own availability, which is its last will, too."""
+        """Return the topic of the bridge's own availability. Its last will is published there, too."""
         return f"{BASE}/{self._fleet}/@mqtt/availability"
 
     @property
@@ -199,11 +205,14 @@ class HomeAssistant:
 
     @property
     def birth(self) -> str:
-        """Return the topic under which Home Assistant says that it has started."""
+        """Return the topic on which Home Assistant publishes that it has started."""
         return f"{self._prefix}/status"
 
     def adopt(self, topic: str, payload: bytes) -> Iterator[Publication]:
-        """Take in what the broker has kept of an earlier bridge. Yield what takes back an `online` of a car."""
+        """Handle an availability that the broker has kept from an earlier bridge.
+
+        If it says that a car is online, yield the message that corrects it.
+        """
         parts = topic.split("/")
         if len(parts) != _AVAILABILITY_PARTS or topic == self.bridge_availability or not payload:
             return
@@ -216,14 +225,14 @@ class HomeAssistant:
             yield Publication(self._topic(car, "availability"), OFFLINE, retain=True)
 
     def begin(self) -> Iterator[Publication]:
-        """Yield what says again all that holds: to a broker that may have forgotten, or to a new Home Assistant."""
+        """Yield all that is known, for a broker that may have forgotten it, or a Home Assistant that has started."""
         yield Publication(self.bridge_availability, ONLINE, retain=True)
         self._states.clear()
         for car, available in self._said.items():
             yield from self._announcement(car, available=available)
 
     def news(self, states: Mapping[str, CarState], now: float) -> Iterator[Publication]:
-        """Yield what has changed since the last call, of the cars that are known."""
+        """Yield what has changed since the last call. `states` are the cars that are known."""
         for car, state in sorted(states.items()):
             available = is_available(state, now)
             if car not in self._said:
@@ -241,7 +250,7 @@ class HomeAssistant:
             yield self._availability(car, available=False)
 
     def end(self) -> Iterator[Publication]:
-        """Yield what takes back all announcements, so that Home Assistant forgets the cars."""
+        """Yield the messages that remove all announcements, so that Home Assistant forgets the cars."""
         for car in list(self._said):
             yield from self._removal(car)
         yield Publication(self.bridge_availability, "", retain=True)
@@ -259,7 +268,7 @@ class HomeAssistant:
 
     def _availability(self, car: str, *, available: bool) -> Publication:
         self._said.pop(car, None)
-        self._said[car] = available  # behind those that changed before
+        self._said[car] = available  # at the end, because it has changed last
         return Publication(self._topic(car, "availability"), ONLINE if available else OFFLINE, retain=True)
 
     def _announcement(self, car: str, *, available: bool) -> Iterator[Publication]:
@@ -302,7 +311,7 @@ class HomeAssistant:
         yield Publication(self._topic(car, "availability"), "", retain=True)
 
     def _room(self) -> Iterator[Publication]:
-        """Make room for another car: forget the one that has been away the longest."""
+        """Make room for another car: forget the car that has been away the longest."""
         if len(self._said) >= MAX_ANNOUNCED_CARS:
             away = next((car for car, available in self._said.items() if not available), None)
             if away is not None:

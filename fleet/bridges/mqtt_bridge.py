@@ -1,8 +1,8 @@
-"""Publishes the cars of a fleet to an MQTT broker, for Home Assistant. Nothing that comes from there is a command.
+"""Publishes the cars of a fleet to an MQTT broker, for Home Assistant. No message from the broker is a command.
 
-One loop hears the bus, and always does, so that the bus never waits for a broker. Another keeps a connection to the
-broker, and sends what has changed since it sent last. Nothing is queued for a broker that is slow or away: the cars go
-on, and when it is back it gets what is so then.
+One loop reads the bus all the time, so that the bus never waits for a broker. Another loop keeps a connection to the
+broker, and sends what has changed since the last time. Nothing is queued for a broker that is slow or away. When it is
+back, it gets the state of that moment.
 """
 
 import asyncio
@@ -28,35 +28,37 @@ from schemas.process import signals
 PLAIN_PORT: Final = 1883
 TLS_PORT: Final = 8883
 _WAIT_S: Final = 0.25
-"""Maximum time until a change, or the end, is noticed."""
+"""Maximum time until a change, or a signal to end, is noticed."""
 _TOPICS: Final = ("state/*", "sensor/battery", "sensor/range")
 _BROKER_TIMEOUT_S: Final = 5.0
-"""Timeout of each exchange with the broker. Beyond it the connection is opened again."""
+"""Timeout of each exchange with the broker. After it, the connection is opened again."""
 _KEEPALIVE_S: Final = 10
-"""Silence after which broker and bridge ask each other. The broker sends the last will after one and a half of it."""
+"""After this silence, the bridge sends the broker a ping. The broker publishes the last will after one and a half times
+this silence."""
 _FAREWELL_TIMEOUT_S: Final = 1.0
-"""Timeout for the first answer of the broker at the end."""
+"""Timeout for the broker's first answer when the bridge ends."""
 _END_TIMEOUT_S: Final = 5.0
-"""Timeout for all that is taken back at the end, of 256 cars at most."""
+"""Timeout for removing everything at the end, of 256 cars at most."""
 _FIRST_RETRY_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 10.0
 _MAX_INCOMING: Final = 1024
-"""Maximum messages of the broker in the queue: the availability of earlier cars, and Home Assistant's births."""
+"""Maximum number of messages from the broker in the queue: the availability of earlier cars, and the starts of Home
+Assistant."""
 _REFUSED: Final = frozenset({4, 5, 134, 135})
-"""Codes of a broker that knows the user or the password not, MQTT 3.1.1 and 5."""
+"""Codes with which a broker refuses the user or the password, in MQTT 3.1.1 and 5."""
 
 _SILENT: Final = logging.getLogger(f"{__name__}.paho")
-"""The logger of paho. `notify` tells a person the same."""
+"""The logger of paho. It is silent, because `notify` tells a person the same."""
 _SILENT.setLevel(logging.CRITICAL + 1)
 
 
 class BrokerRefused(Exception):
-    """The broker takes nobody with this user and password. The message says so."""
+    """The broker refuses this user or password. The message says so."""
 
 
 @dataclass(frozen=True, slots=True)
 class Broker:
-    """Where the broker is, and who we are there."""
+    """The address of the broker, and the user under which we log in there."""
 
     host: str
     port: int
@@ -66,12 +68,15 @@ class Broker:
 
     @property
     def words(self) -> str:
-        """Return its address for a person."""
+        """Return the broker's address as a person writes it."""
         return f"{self.host}:{self.port}"
 
 
 class MqttBridge:
-    """Publishes one fleet to one broker. `notify` is called with news for a person: the broker is there, or is away."""
+    """Publishes one fleet to one broker.
+
+    `notify` is called with news for a person: the broker is reached, or it is away.
+    """
 
     def __init__(self, client: Fleet, broker: Broker, plan: HomeAssistant, notify: Callable[[str], object]) -> None:
         self._inbox = Inbox.listening(client, _TOPICS)
@@ -115,7 +120,7 @@ class MqttBridge:
     # ------------------------------------------------------------------ the broker
 
     async def _connect(self, ended: asyncio.Event) -> None:
-        """Keep a connection until the end."""
+        """Connect, and connect again whenever the connection breaks, until the end."""
         failures, was_there = 0, None
         while not ended.is_set():
             try:
@@ -154,13 +159,14 @@ class MqttBridge:
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for each in done:
-                each.result()  # raises what has ended the connection
+                each.result()  # raises the error that ended the connection
         finally:
             for each in tasks:
                 each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-        # Unread bytes at the close reset the connection, and the broker takes that for a crash. So hear no more. A
-        # broker that hangs answers nothing. Later it reads all of this, or sends our will.
+        # If there are unread bytes when we close the connection, it is reset, which looks like a crash to the broker.
+        # So unsubscribe first. A broker that hangs does not answer. Later it will read all of this, or publish our last
+        # will.
         qos = 1
         try:
             await client.unsubscribe([self._plan.availabilities, self._plan.birth], timeout=_FAREWELL_TIMEOUT_S)
@@ -185,7 +191,7 @@ class MqttBridge:
                 await _send(client, self._plan.adopt(topic, payload))
 
     def _cars(self) -> dict[str, CarState]:
-        """Return the cars that are confirmed, with what was heard of them."""
+        """Return the confirmed cars, with the newest messages about them."""
         return {
             car: state
             for car in self._observer.snapshot(()).cars
@@ -194,7 +200,9 @@ class MqttBridge:
 
 
 async def _send(client: aiomqtt.Client, publications: Iterable[Publication], qos: int = 1) -> None:
-    for each in list(publications):  # all at once: while one is sent, the plan goes on
+    for each in list(
+        publications
+    ):  # compute all of them first, because the state of `_plan` may change while one is sent
         await client.publish(each.topic, each.payload, qos=qos, retain=each.retain)
 
 

@@ -1,5 +1,5 @@
-"""Serves what the bus says of a fleet to Prometheus, and makes the board of Grafana that shows it.
+"""Serves the state of a fleet to Prometheus, and makes the Grafana dashboard that shows it.
 
-`metrics` is the one table of metrics. `fleet_metrics` keeps what was heard and computes their values, pure. `exporter`
-is the process. `dashboard` makes the board from the same table.
+`metrics` is the one table of metrics. `fleet_metrics` stores the newest messages and computes the values of the
+metrics, and is pure. `exporter` is the process. `dashboard` makes the dashboard from the same table.
 """

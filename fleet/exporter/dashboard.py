@@ -1,6 +1,6 @@
-"""Makes the board of Grafana from the table of metrics: deploy/grafana.json, and `fleet exporter --dashboard`.
+"""Makes the Grafana dashboard from the table of metrics: deploy/grafana.json, and `fleet exporter --dashboard`. Pure.
 
-Pure. The data source is an input of the board, which Grafana asks for when the board is imported.
+The data source is an input of the dashboard: Grafana asks for it when somebody imports the dashboard.
 """
 
 from typing import Any, Final
@@ -12,11 +12,12 @@ _COLUMNS: Final = 24  # of Grafana's grid
 _WIDTH: Final = 12
 _HEIGHT: Final = 7
 _WORDS: Final = ("state", "mode")
-"""Labels of which one word has a 1: a time line shows that word."""
+"""Labels with one value for each possible word: 1 for the word that applies, 0 for the rest. A time line shows that
+word."""
 
 
 def dashboard() -> dict[str, Any]:
-    """Return the board, with a panel for each title in the table."""
+    """Return the dashboard, with a panel for each title in the table."""
     by_title: dict[str, list[Metric]] = {}
     for metric in METRICS:
         by_title.setdefault(metric.panel, []).append(metric)
@@ -84,7 +85,7 @@ def _unit(metric: Metric) -> str:
 
 
 def _expression(metric: Metric) -> str:
-    """Return what is drawn: a counter's growth, else the value; of words only the one that is so."""
+    """Return the expression to draw: the growth of a counter, the word that applies, or else the value."""
     names = metric.label_names
     selected = f'{metric.sample}{{car=~"$car"}}' if "car" in names else metric.sample
     if metric.kind is MetricKind.COUNTER:

@@ -1,4 +1,4 @@
-"""The exporter: a client of the bus that answers Prometheus over HTTP. It commands nothing."""
+"""The exporter: a client of the bus that answers Prometheus over HTTP. It sends no commands."""
 
 import threading
 import time
@@ -17,15 +17,19 @@ from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, Metric, MetricKind
 
 DEFAULT_EXPORTER_PORT: Final = 9478
 _WAIT_S: Final = 0.25
-"""Maximum time until a stop of the exporter is noticed."""
+"""Maximum time until the exporter notices that it has to end."""
 _TOPICS: Final = ("state/*", "sensor/battery")
-"""Topics that are heard, and asked for when a car arrives. The other readings come 27 times a second in tracking."""
+"""Topics that the exporter subscribes to, and queries when a car appears. It leaves out the other readings, which come
+27 times a second in mode tracking."""
 
 _Family = CounterMetricFamily | GaugeMetricFamily
 
 
 class Exporter(Collector):
-    """Collects for the registry of Prometheus' client. `run` hears the bus; a thread of the server calls `collect`."""
+    """A collector for the registry of Prometheus' client. `run` reads the bus.
+
+    A thread of the server calls `collect`.
+    """
 
     def __init__(self, client: Fleet) -> None:
         self._client = client
@@ -35,7 +39,10 @@ class Exporter(Collector):
         self._inbox.subscribe(f"{client.name}/{STATUS}")
 
     def serve(self, address: str, port: int) -> tuple[int, Callable[[], None]]:
-        """Serve the metrics. Return the port, and a function that ends it. Raises OSError if the port is in use."""
+        """Serve the metrics. Return the port, and a function that ends the server.
+
+        Raises OSError if the port is in use.
+        """
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
         server, thread = start_http_server(port, address, registry)
@@ -48,10 +55,10 @@ class Exporter(Collector):
         return int(server.server_port), close
 
     def run(self, has_ended: Callable[[], bool]) -> None:
-        """Hear the bus until `has_ended()`."""
+        """Read the bus until `has_ended()` returns True."""
         with ThreadPoolExecutor(max_workers=4) as pool:
             while not has_ended():
-                # Wait without the lock: a scrape must not wait for a message.
+                # Wait without the lock, because a scrape must not wait for a message.
                 heard = self._inbox.hear(_WAIT_S, pool)
                 with self._lock:
                     for car, alive in heard.gateways.items():

@@ -1,4 +1,4 @@
-"""What was heard of a fleet, and the values of its metrics. Pure: time is an argument."""
+"""The newest messages of a fleet, and the values of its metrics. Pure: time is an argument."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -14,11 +14,12 @@ from schemas.words import Phase, Reason
 STATUS: Final = f"{keys.RECORDER}/status"
 EVENTS: Final = "event/command"
 MAX_EXPORTED_CARS: Final = 256
-"""Maximum cars with metrics, the first by name: each has about eighty series, and anybody on an open bus may invent
-names. A fleet file of a hall has some dozens."""
+"""Maximum number of cars with metrics, the first by name. Each car has about eighty series, and anybody on an open bus
+may invent cars. The fleet file of a whole hall has some dozens."""
 MAX_RECENT_RECORDS: Final = 4096
-"""Maximum remembered records of commands, to count each phase once. A command whose car can show nothing ends with a
-second `sent`, at most 18 s later (schemas.limits.MAX_EVIDENCE_TIMEOUT_S): 200 records a second have room."""
+"""Maximum number of remembered records of commands. They are remembered so that each phase counts once, because a
+command whose car cannot show its effect ends with a second `sent`, at most 18 s later
+(schemas.limits.MAX_EVIDENCE_TIMEOUT_S). This is enough for 200 records a second."""
 _REFUSALS: Final = frozenset({Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 Sampled = tuple[Metric, tuple[str, ...], float]
@@ -26,7 +27,7 @@ Sampled = tuple[Metric, tuple[str, ...], float]
 
 
 class FleetMetrics:
-    """The metrics of one fleet. Times: s, of one clock that the caller chooses."""
+    """The metrics of one fleet. Times are in s, of one clock that the caller chooses."""
 
     def __init__(self) -> None:
         self.observer = FleetObserver()
@@ -38,7 +39,10 @@ class FleetMetrics:
         self._recorder_at = 0.0
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None = None) -> None:
-        """Take a message in. `wall_s` is the wall clock if a query returned it (it may be old), else None."""
+        """Handle a message.
+
+        `wall_s` is the wall clock if a query returned the message, because then it may be old, else None.
+        """
         key = keys.parse(sample.key)
         if key is None:
             return
@@ -51,7 +55,7 @@ class FleetMetrics:
             self.observer.on_sample(sample, now, wall_s)
 
     def forget(self, now: float) -> None:
-        """Forget cars whose gateways have been gone for long, with their commands."""
+        """Forget cars whose gateways have been gone for a long time, and the commands of these cars."""
         self.observer.forget(now, ())
         for counter in (self._commands, self._refusals):
             for labels in [each for each in counter if each[0] not in self.observer.states]:
@@ -96,7 +100,7 @@ class FleetMetrics:
 
 
 def _parsed(topic: str, sample: Sample) -> Any:
-    """Return the message of a sample, or None if this version does not know it."""
+    """Return the message of a sample, or None if this version cannot decode it."""
     try:
         return messages.parse(topics.TOPICS[topic].message, sample.payload, sample.encoding)
     except messages.BadPayload:

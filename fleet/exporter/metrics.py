@@ -1,7 +1,8 @@
 """The one table of metrics: names, labels, values and the panels that show them. Pure: time is an argument.
 
-A car whose gateway has gone has `fleet_car_up` 0 and nothing else, and a message that is stale gives no value. So no
-number is ever older than its topic may be. Labels have only words of closed sets, and cars that have a gateway.
+A car whose gateway has gone has only `fleet_car_up`, which is 0. A stale message gives no value. So no number is ever
+older than its topic allows. The values of labels are only words from fixed sets, and names of cars that have or had a
+gateway.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,13 +14,13 @@ from fleet.client.car_state import CarState
 from schemas.words import UNKNOWN, LinkState, Mode, Motors, RecorderState
 
 Values = Iterable[tuple[tuple[str, ...], float]]
-"""Values with those of the labels after the car."""
+"""Pairs: the values of the labels after `car`, and the value of the metric."""
 OTHER: Final = "other"
-"""Label of a word that this version does not know."""
+"""The label for any word that this version does not know."""
 
 
 class MetricKind(StrEnum):
-    """The kinds of metrics. A counter only grows, and begins again with its process."""
+    """The kinds of metrics. A counter only grows, and begins again from 0 when its process restarts."""
 
     GAUGE = "gauge"
     COUNTER = "counter"
@@ -41,13 +42,13 @@ class Metric:
     """One row of the table."""
 
     name: str
-    """A counter's name is without `_total`, which is put behind it."""
+    """The name. A counter's name is written without `_total`, which `sample` adds."""
     about: str
     unit: Unit = Unit.NONE
     kind: MetricKind = MetricKind.GAUGE
     labels: tuple[str, ...] = ()
     panel: str = ""
-    """Title of the panel of the board that shows it. Metrics of one title share a panel."""
+    """Title of the panel of the dashboard that shows the metric. Metrics with the same title share a panel."""
 
     @property
     def label_names(self) -> tuple[str, ...]:
@@ -66,7 +67,7 @@ class CarMetric(Metric):
 
     values: Callable[[CarState, float], Values] = lambda *_: ()
     of_absent: bool = False
-    """True if a car without a gateway has it, too."""
+    """True if a car without a gateway has this metric, too."""
 
     @property
     def label_names(self) -> tuple[str, ...]:
@@ -75,7 +76,7 @@ class CarMetric(Metric):
 
 
 def one_of(words: Iterable[str], word: str) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Yield a 1 for the word, and a 0 for each other one. A word that is not among them counts as `unknown`."""
+    """Yield a 1 for the word, and a 0 for each other word. A word that is not in `words` counts as `unknown`."""
     known = tuple(dict.fromkeys((*map(str, words), UNKNOWN)))
     found = word if word in known else UNKNOWN
     for each in known:
@@ -83,7 +84,10 @@ def one_of(words: Iterable[str], word: str) -> Iterator[tuple[tuple[str, ...], f
 
 
 def _number(topic: str, read: Callable[[Any], float | None]) -> Callable[[CarState, float], Values]:
-    """Return the value of a field of a topic's newest message, none if it is stale or was left out."""
+    """Return a function that yields a number from a topic's newest message.
+
+    It yields nothing if the message is stale, or if the field is missing.
+    """
 
     def values(state: CarState, now: float) -> Iterator[tuple[tuple[str, ...], float]]:
         message = state.fresh(topic, now)
@@ -94,7 +98,10 @@ def _number(topic: str, read: Callable[[Any], float | None]) -> Callable[[CarSta
 
 
 def _word(topic: str, words: Iterable[str], read: Callable[[Any], str]) -> Callable[[CarState, float], Values]:
-    """Return a 1 for the word of a topic's newest message, a 0 for each other. None if it is stale."""
+    """Return a function that yields a 1 for the word in a topic's newest message, and a 0 for each other word.
+
+    It yields nothing if the message is stale.
+    """
     return lambda state, now: () if (found := state.fresh(topic, now)) is None else one_of(words, read(found))
 
 
@@ -330,7 +337,7 @@ DROPS: Final = Metric(
 )
 
 METRICS: Final[tuple[Metric, ...]] = (CONNECTED, *CAR_METRICS, COMMANDS, REFUSALS, *RECORDER_METRICS, DROPS)
-"""All metrics, in the order of the board."""
+"""All metrics, in the order of the dashboard."""
 
 
 def recorder_values(status: Any) -> Iterator[tuple[Metric, Values]]:

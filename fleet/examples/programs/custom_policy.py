@@ -1,6 +1,6 @@
-"""Let the car with most room ahead avoid obstacles.
+"""Let the car with the most room ahead avoid obstacles, while the other cars rest.
 
-The others rest; three rounds of 5 s: `python -m fleet.examples.programs.custom_policy`.
+Three rounds of 5 s: `python -m fleet.examples.programs.custom_policy`.
 """
 
 import time
@@ -18,10 +18,10 @@ def main() -> None:
                 print(outcome, flush=True)
                 if outcome.ok:
                     time.sleep(5)
-                    fleet.car(car).mode("manual")  # closes the mode, and stops
+                    fleet.car(car).mode("manual")  # ends the mode, and stops the car
                     break
             else:
-                time.sleep(5)  # no car may or can
+                time.sleep(5)  # no car carried it out
 
 
 if __name__ == "__main__":
