@@ -52,7 +52,8 @@ class Quota:
             return ""
         return (
             f"--session-size: {self.session / 10**6:g} MB is more than half of --quota: at most "
-            f"{self.total / 2 / 10**6:g} MB are allowed, because the quota takes nothing of the session that is written"
+            f"{self.total / 2 / 10**6:g} MB are allowed, because nothing of the session "
+            "that is being written is ever removed"
         )
 
     @property
