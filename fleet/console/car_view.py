@@ -33,8 +33,8 @@ SILENT_AFTER_S: Final = topics.TOPICS["state/safety"].stale_after_s or 0.0
 state."""
 MAX_LISTED_CARS: Final = MAX_CARS
 """Maximum number of cars of the running fleet: as many as one message of a page may name."""
-# Without `fleet up` nobody lists the cars. Fifty gateways are the most that were measured on one bus. A place costs a
-# card ten times a second, and some 0.1 MB when its lists are full: anybody on the bus may take one.
+# Without `fleet up` nobody lists the cars. At most fifty gateways were measured on one bus. Anybody on the bus may take
+# a place, and each place costs a card ten times a second, and some 0.1 MB when its lists are full.
 MAX_OTHER_CARS: Final = 64
 """Maximum number of cars that the running fleet does not list."""
 _LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
@@ -278,8 +278,9 @@ class CarView:
 class FleetView:
     """The cars that the console knows: all that were on the bus since it started, up to a bound.
 
-    Anybody on the bus may invent a name. A car that the running fleet lists always has a place. Any other takes a free
-    one, or that of the car that has been silent the longest. A car that is heard gives way to none.
+    Anybody on the bus may invent a name, so the number of places is bounded. A car that the running fleet lists always
+    has a place. Any other car gets a free place, or the place of the car that has been silent the longest. A car that
+    still publishes keeps its place.
     """
 
     def __init__(self, color_of: Any) -> None:

@@ -421,11 +421,12 @@ class Console:
     def stop_all(
         self, stop_id: str, operator: ConsoleOperator | None = None, request: CommandRequest | None = None
     ) -> None:
-        """Stop every car, once for each id: a page sends each STOP twice, over its socket and by fetch.
+        """Stop every car.
 
-        Without an id, every call counts.
+        Calls with an id that was used before do nothing, because a page sends each STOP twice, over its socket and by
+        fetch. Without an id, every call counts.
 
-        `operator` is the page's, or None for this computer. `request` is an e-stop, a pause, or None for a stop.
+        operator: the operator of the page, or None for this computer. request: an e-stop, a pause, or None for a stop.
         """
         if stop_id in self._stop_ids:
             return
@@ -458,9 +459,9 @@ class Console:
         self._newest_stop = operator.stop(request, self._report, self._view.has_place)
 
     async def is_stop_taken(self) -> bool:
-        """Wait until a gateway has answered the newest STOP of all cars. Return False if none does in time.
+        """Wait until a gateway has answered the newest STOP of all cars. Return False if none answers in time.
 
-        Any newer STOP counts, too: it stops the same cars. Without any car there is nothing to wait for.
+        If a newer STOP follows meanwhile, wait for that one, which stops the same cars. Without any car, do not wait.
         """
         with suppress(TimeoutError):
             async with asyncio.timeout(STOP_ANSWER_TIMEOUT_S):

@@ -183,7 +183,8 @@ class Lan:
     ) -> tuple[str | None, float, PagePerson | None]:
         """Pair a device. Return its cookie, or None and the time to wait before the next try (s). Raises ClassFull.
 
-        cookie_before: the cookie of a device that is paired already. With the code of a class it keeps its person.
+        cookie_before: the cookie of a device that is paired already. Its device keeps its person if the code is that of
+        a class.
         """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
@@ -276,7 +277,7 @@ class Lan:
     async def run(self, people: Callable[[], People | None]) -> None:
         """Close pages of revoked devices and renew the certificate until the task is cancelled.
 
-        `people` returns the people of the fleet, None if no gateway has named them yet.
+        `people` returns the people of the fleet, or None if no gateway has named them yet.
         """
         next_look = time.monotonic() + ADDRESS_INTERVAL_S
         while True:

@@ -52,7 +52,7 @@ class ConsoleOperator:
     # ------------------------------------------------------------------ driving
 
     def begin_press(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> "asyncio.Task[None]":
-        """Start the cars of a press. A refusal of a car is reported; the other cars drive.
+        """Start the cars of a press. If a car refuses, this is reported, and the other cars drive.
 
         Return the task that waits for the outcomes of the start.
         """
@@ -176,7 +176,7 @@ class ConsoleOperator:
     ) -> "asyncio.Task[None] | None":
         """Give these cars back, or all cars that this page has taken if `cars` is None.
 
-        Return the task that waits for the outcomes, None if there are no such cars.
+        Return the task that waits for the outcomes, or None if there are no such cars.
         """
         taken = [car for car, by in self._leases.items() if by == client]
         released = taken if cars is None else list(cars)
@@ -200,9 +200,9 @@ class ConsoleOperator:
             self._renewals.discard(car)
 
     async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str] | None:
-        """Send a request to the coordinator. Return whether it was carried out, and words. None if no plan is running.
+        """Send a request to the coordinator.
 
-        text: of a plan to set.
+        Return whether it was carried out, and words, or None if no plan is running. text: the text of a plan to set.
         """
         answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text, sender)
         if answer is None:

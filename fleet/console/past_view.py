@@ -38,9 +38,8 @@ def cars_at(known: Iterable[Known], at_ns: int, colors: Mapping[str, str]) -> li
     view.list_cars(sorted({each.key.car for each in of_cars}))
     spoke = {each.key.car: each.log_ns for each in of_cars if each.key.topic.startswith("state/")}
     begun = min((each.log_ns for each in of_cars), default=at_ns)
-    view.on_presence(
-        spoke, begun / _S
-    )  # presence is not recorded, so infer it: the gateway of a car publishes each second
+    # Presence is not recorded, so infer it: the gateway of a car publishes each second.
+    view.on_presence(spoke, begun / _S)
     for each in of_cars:
         view.on_message(each.key.car, each.key.topic, each.message, each.log_ns / _S)
     for end_ns in sorted({ns + HELD_NS for ns in spoke.values() if ns + HELD_NS < at_ns}):
@@ -75,12 +74,11 @@ def map_at(known: Iterable[Known], trail: Iterable[Known], at_ns: int) -> dict[s
 def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, Any]:
     """Return what the plan page shows of a moment: the last plan by then, who had which role, and late decisions.
 
-    Nothing records whether the coordinator still ran.
+    A recording does not show whether the coordinator was still running.
     """
     view = PlanView()
-    newest = sorted(
-        in_force, key=lambda each: each.key.topic != "plan"
-    )  # the plan first, because a new plan discards decisions
+    # The plan first, because a new plan discards decisions.
+    newest = sorted(in_force, key=lambda each: each.key.topic != "plan")
     for each in (*newest, *sorted(decisions, key=lambda each: each.publish_ns)):
         if each.key.car == COORDINATOR and is_finite(each.message):
             view.on_message(f"{each.key.car}/{each.key.topic}", each.message)
@@ -90,7 +88,7 @@ def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, 
 def detail_of(car: str, messages: Iterable[Known], known: Iterable[Known], at_ns: int) -> dict[str, Any]:
     """Return the frames, commands, events and states of one car before a moment, as the inspect page shows them.
 
-    `messages` are its frames and events. `known` is the newest of everything else.
+    `messages` are the frames and events of the car. `known` has the newest message of every other topic.
     """
     view, frames = CarView(car, ""), FrameLog()
     view.on_presence(0.0, present=True)

@@ -56,7 +56,7 @@ class PeopleFile:
     def serve(self) -> None:
         """Let others see that a console serves the network with this file, until this process ends. Raises OSError.
 
-        If a fleet has two consoles, the second one takes the place of the first one: call this again and again.
+        If a fleet has two consoles and the first one ends, the second one takes over. So call this again and again.
         """
         self._served.try_take()
 

@@ -29,7 +29,7 @@ class PlanProcess:
     async def set_plan(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
         """Put a plan in force, and start a coordinator if there is none. Return its answer, or what went wrong.
 
-        ask: put the plan in force. None if there is no coordinator.
+        ask: asks the coordinator to put the plan in force. It returns None if there is no coordinator.
         """
         async with self._starting:
             if (answer := await ask()) is not None:

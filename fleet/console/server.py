@@ -178,7 +178,7 @@ async def serve(
 ) -> None:
     """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive.
 
-    `place` is the sessions folder. `file` is the fleet file. `lan` is what serves the network, too.
+    place: the sessions folder. file: the fleet file. lan: the part that serves the network, too, or None.
     """
     rate = LogRate()
     for name in _LOGGERS:

@@ -11,9 +11,8 @@ from fleet import Session
 def main(session: str, car: str, picture: str) -> None:
     """Save the picture. Each dot is a reading. A reading without an echo has no dot."""
     frame = Session(session).to_pandas(f"{car}/sensor/range")
-    zone = (
-        frame["publish_time"].min().floor("s").to_pydatetime().astimezone().tzinfo
-    )  # the time zone of this computer, with its offset at that time
+    # The time zone of this computer, with its offset at that time.
+    zone = frame["publish_time"].min().floor("s").to_pydatetime().astimezone().tzinfo
     frame["time"] = frame["publish_time"].dt.tz_convert(zone)
     plot = frame.plot(x="time", y="range_m", style=".", xlabel=f"time ({zone})", ylabel="distance (m)")
     plot.figure.savefig(picture)

@@ -138,9 +138,8 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
 
     def once() -> Iterator[Row]:
         nonlocal twice
-        seen: set[int] = (
-            set()
-        )  # hashes of 64 bits: with ten million messages, two are equal by chance once in 400,000 merges
+        # Hashes of 64 bits: with ten million messages, two are equal by chance once in 400,000 merges.
+        seen: set[int] = set()
         for row in heapq.merge(*map(counted, range(len(sessions))), key=lambda row: row[2]):
             info, sequence, _, publish_ns, payload = row
             told = hash((info.channel.topic, sequence, publish_ns, payload))
