@@ -237,9 +237,8 @@ class Coordinator:
     def _drain_inbox(self, observer: FleetObserver, pool: ThreadPoolExecutor, wait_s: float = STEP_INTERVAL_S) -> None:
         """Handle all items in the inbox. Wait at most `wait_s` for the first."""
         for item in self._inbox.items(wait_s):
-            self._handle_gateways(
-                observer, pool
-            )  # handle tokens first: a gateway declares its token before it publishes states
+            # Handle tokens first: a gateway declares its token before it publishes states.
+            self._handle_gateways(observer, pool)
             try:
                 self._handle(item, observer)
             except OSError:  # our own output is closed, because the parent process has ended

@@ -152,9 +152,8 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     decisions = [explain_phase(plan, phase, snapshot)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            kept_s = (
-                HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
-            )  # on_hub_back has set the later time
+            # A time in the future was set by on_hub_back.
+            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain_rule(car, overrides[car], allocation.roles.get(car)))

@@ -46,9 +46,8 @@ class PlanCondition:
     """The condition in words."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "text", self._text()
-        )  # computed once, because it is used ten times a second for each car
+        # Compute the text once, because it is used ten times a second for each car.
+        object.__setattr__(self, "text", self._text())
 
     def _text(self) -> str:
         who = (
