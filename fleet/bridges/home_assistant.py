@@ -118,11 +118,8 @@ def _words(*words: str) -> dict[str, Any]:
 
 
 def _flag(device_class: str | None = None) -> dict[str, Any]:
-    config = {
-        "platform": "binary_sensor",
-        "payload_on": "True",
-        "payload_off": "False",
-    }  # the texts in which a template prints True and False
+    # The texts are those in which a template prints True and False.
+    config = {"platform": "binary_sensor", "payload_on": "True", "payload_off": "False"}
     return {**config, "device_class": device_class} if device_class else config
 
 

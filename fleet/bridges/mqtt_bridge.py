@@ -200,9 +200,8 @@ class MqttBridge:
 
 
 async def _send(client: aiomqtt.Client, publications: Iterable[Publication], qos: int = 1) -> None:
-    for each in list(
-        publications
-    ):  # compute all of them first, because the state of `_plan` may change while one is sent
+    # Compute all of them first, because the state of `_plan` may change while one is sent.
+    for each in list(publications):
         await client.publish(each.topic, each.payload, qos=qos, retain=each.retain)
 
 

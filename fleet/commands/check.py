@@ -187,11 +187,7 @@ def recognize(text: str) -> FileKind:
     """
     try:
         found: Any = yaml.safe_load(text)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        RecursionError,
-    ):  # e.g. a bad date, or nested too deep: the parser will name the place
+    except (yaml.YAMLError, ValueError, RecursionError):  # a bad date, or nested too deep: the parser will say where
         found = None
     if not isinstance(found, dict):
         return FileKind.PLAN if text.lstrip().startswith(("roles:", "rules:")) else FileKind.FLEET

@@ -42,9 +42,8 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing
 
-    if (
-        tables and directory is None and sql is not None and Path(sql).is_dir()
-    ):  # with --tables, the one argument is DIR
+    # With --tables there is no question, so a single argument is DIR.
+    if tables and directory is None and sql is not None and Path(sql).is_dir():
         directory, sql = Path(sql), None
     if (sql is None) is not tables or (as_csv and as_json):
         raise click.UsageError("give one question, or --tables; and --csv or --json, not both")

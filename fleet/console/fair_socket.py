@@ -122,9 +122,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         if self._rest and not self.read_paused:
             self.read_paused = True
             self.transport.pause_reading()
-        if (
-            self._rest and self.queue.empty() and not self.transport.is_closing()
-        ):  # the piece had only pings, or a part of a message
+        # If no message came out, the piece had only pings, or a part of a message.
+        if self._rest and self.queue.empty() and not self.transport.is_closing():
             self._waits = True
             self.loop.call_later(CLOSED_INTERVAL_S if self.close_sent else 0.0, self._parse)
         elif not self._rest and self.queue.empty() and self.read_paused:

@@ -73,9 +73,8 @@ class SessionJobs:
                 stderr=PIPE,
             )
             self._running.add(process)
-            with suppress(
-                OSError, AttributeError
-            ):  # the process has ended, or the system has no such priorities (Windows)
+            # The process may have ended, or the system may have no such priorities (Windows).
+            with suppress(OSError, AttributeError):
                 os.setpriority(os.PRIO_PROCESS, process.pid, _LOW_PRIORITY)
             try:
                 out, err = await process.communicate()

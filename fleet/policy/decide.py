@@ -115,9 +115,8 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     free = tuple(car for car in subjects if car not in barriers)
     cars = CarSets(subjects, frozenset(free), frozenset({*free, *lately}), roles_before)
     phase = memory.phase
-    if (
-        not phase.name
-    ):  # the first phase begins before the rules are evaluated, because some rules count only in this phase
+    # The first phase begins before the rules are evaluated, because some rules count only in this phase.
+    if not phase.name:
         phase = follow_phase(plan, snapshot, cars, phase, {}, now, ready=False)
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
     phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, barrier_of, memory))
