@@ -142,12 +142,12 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
     assert (again.returncode, "already exists" in again.stderr) == (2, True)
     began = of_iso("2026-09-21T14:13:20Z")
     for arguments, words in (
-        (("--from", "1h"), "The time range is empty"),
+        (("--from", "1h"), "is outside the session"),
         (("--from", "2s", "--to", "1s"), "is not before"),
         (("--from", "soon"), f"is not a time. Write {time_spec.RULE}. The session is from {began} to "),
         (("--from", "12:34"), "are written as 12m34s"),
         (("--car", "pink"), "pink is not in"),
-        (("--to", "2026-09-21T14:13:19Z"), "The time range is empty"),
+        (("--to", "2026-09-21T14:13:19Z"), "is outside the session"),
     ):
         wrong = fleet("cut", session, *arguments, "--out", tmp_path / "other")
         assert (wrong.returncode, words in wrong.stderr) == (2, True), wrong.stderr

@@ -153,7 +153,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)
     made.close()
     assert "no raw frames" in run("sessions", "redecode", no_frames).output
-    assert "there are red" in run("sessions", "redecode", no_frames, "--car", "blue").output
+    assert "its cars: red" in run("sessions", "redecode", no_frames, "--car", "blue").output
     assert "of red there" in run("sessions", "vector", no_frames, "--car", "red", "--out", tmp_path / "x.jsonl").output
 
     unknown = tmp_path / "unknown.mcap"

@@ -182,7 +182,7 @@ def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, 
         result = run("plan", "try", tmp_path / out)
         assert result.exit_code == 1
         assert "cut to red" in result.output
-        assert "blue, green too" in result.output
+        assert "depended on blue, green" in result.output
         assert "then:" not in result.output
 
 

@@ -157,7 +157,7 @@ def test_player_looks_like_fleet_and_takes_no_command(fleet: FleetProcesses, ses
     waited = fleet.start("-m", "fleet.cli", "wait", "red/sensor/range", "range_m >= 0", "--fleet", "fleet-replay")
     assert waited.wait() == 0, "it is old, and published now"
 
-    key, words = "fleet-replay/*/@cmd/stop", "fleet fleet-replay is a replay of made: nothing in it takes commands"
+    key, words = "fleet-replay/*/@cmd/stop", "fleet fleet-replay is a replay of made: it accepts no commands"
     found = fleet.bus.query(key, timeout_s=PATIENCE_S)
     answers = [json.loads(each.payload) for each in found if isinstance(each, bus.Sample)]
     assert {(each["car"], each["status"], each["words"]) for each in answers} == {

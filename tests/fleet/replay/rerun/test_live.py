@@ -242,7 +242,7 @@ def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     endpoint = free_endpoint()
     for arguments, code, words in (
         ([], 1, "--web serves it as a page, --save out.rrd writes a file"),
-        (["--web", "--save", "x.rrd"], 2, "not both"),
+        (["--web", "--save", "x.rrd"], 2, "exclude each other"),
         (["--save", "x.txt"], 2, "name it x.rrd"),
         (["--web", "--memory", "much"], 2, "--memory much is not allowed"),
         (["--web", "--connect", endpoint], 1, f"(Tried {endpoint}; "),
