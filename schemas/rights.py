@@ -14,7 +14,6 @@ from math import inf
 from typing import Any, Final, Self
 
 from schemas.keys import NAME_RULE, is_name, name_of, person_of
-from schemas.messages import stamp_ns
 from schemas.words import Rank, Reason, Scope
 
 _STRENGTH: Final = {rank: -number for number, rank in enumerate(Rank)}
@@ -340,8 +339,8 @@ class Authority:
             People.of(safety.people if safety.HasField("people") else None),
             estops_of(safety),
             pauses_of(safety),
-            Hold(hold.by, stamp_ns(hold.since), rank_of(hold.rank)) if safety.HasField("hold") else None,
-            Loan(loan.to, loan.by, rank_of(loan.rank), stamp_ns(loan.since)) if loan.to else None,
+            Hold(hold.by, hold.since.ToNanoseconds(), rank_of(hold.rank)) if safety.HasField("hold") else None,
+            Loan(loan.to, loan.by, rank_of(loan.rank), loan.since.ToNanoseconds()) if loan.to else None,
             LeaseState(Sender(lease.holder, rank_of(lease.kind))) if safety.HasField("lease") else None,
         )
 
@@ -449,7 +448,7 @@ class Authority:
 def estops_of(safety: Any) -> tuple[Estop, ...]:
     """Return the e-stops of a fleet.v1.Safety, oldest first."""
     return tuple(
-        Estop(each.id, each.by, each.why, stamp_ns(each.stamp), each.scope == Scope.FLEET, rank_of(each.rank))
+        Estop(each.id, each.by, each.why, each.stamp.ToNanoseconds(), each.scope == Scope.FLEET, rank_of(each.rank))
         for each in safety.estops
     )
 
@@ -457,5 +456,5 @@ def estops_of(safety: Any) -> tuple[Estop, ...]:
 def pauses_of(safety: Any) -> tuple[FleetPause, ...]:
     """Return the pauses of a fleet.v1.Safety, oldest first."""
     return tuple(
-        FleetPause(each.id, each.by, each.why, stamp_ns(each.stamp), rank_of(each.rank)) for each in safety.pauses
+        FleetPause(each.id, each.by, each.why, each.stamp.ToNanoseconds(), rank_of(each.rank)) for each in safety.pauses
     )
