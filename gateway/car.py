@@ -45,7 +45,7 @@ from schemas.process import json_log, signals
 from schemas.process.parent import has_ended
 from schemas.process.service_notifier import ServiceNotifier
 from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
-from schemas.rights import People
+from schemas.rights import NO_PEOPLE, People
 from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
 
@@ -82,7 +82,7 @@ class Settings:
     """True to try again if the first attempt to open the link fails."""
     battery: BatteryPolicy = field(default_factory=BatteryPolicy)
     speed_max: float = 1.0
-    people: People = field(default_factory=People)
+    people: People = NO_PEOPLE
     longest_drive_s: float = DEFAULT_MAX_DRIVE_S
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""

@@ -13,7 +13,6 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.links import LINK_HELP, LINK_HELP_OPTIONS
 from schemas.process import startup, stdio
 from schemas.process.parent import watched_pid
-from schemas.rights import NO_PEOPLE, People
 from schemas.suggestion import did_you_mean
 from schemas.words import BatteryAction, BatteryLevel
 
@@ -220,11 +219,14 @@ def _run(arguments: argparse.Namespace) -> int:
         return _failed(str(error), 2)
     speed_max = arguments.speed_max
     low_v, critical_v = arguments.battery_low_v, arguments.battery_critical_v
-    try:
-        listed = arguments.people_only or arguments.person
-        people = People.parse(arguments.person or ()) if listed else NO_PEOPLE
-    except ValueError as error:
-        return _failed(f"--person: {error}", 2)
+    people = None
+    if arguments.people_only or arguments.person:
+        from schemas.rights import People  # without people, the rights are loaded when the car is on the bus
+
+        try:
+            people = People.parse(arguments.person or ())
+        except ValueError as error:
+            return _failed(f"--person: {error}", 2)
     try:
         longest_s = parse_duration(arguments.longest_drive, max_s=3600)
     except ValueError as error:
@@ -244,6 +246,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             from gateway.car import Settings, begin_logging, serve
             from gateway.control.battery import BatteryPolicy
+            from schemas.rights import NO_PEOPLE
 
             begin_logging()
             settings = Settings(
@@ -260,7 +263,7 @@ def _run(arguments: argparse.Namespace) -> int:
                     critical_v,
                 ),
                 speed_max=speed_max,
-                people=people,
+                people=people or NO_PEOPLE,
                 longest_drive_s=longest_s,
                 parent=parent,
                 holds_of=arguments.holds_of or "",
