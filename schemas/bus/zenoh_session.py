@@ -353,7 +353,7 @@ class Bus:
         return token
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
-        """Return the existing tokens. After a timeout, the list is empty, too."""
+        """Return the existing tokens. Nothing is raised after a timeout: tokens that came later are missing then."""
         # In a session with a watch, Zenoh may leave the watched tokens out of the answer to a get: of 300 sessions that
         # watched `fleet/*`, ten got `*/*` without them. So take those from the watch.
         wanted = zenoh.KeyExpr(expression)

@@ -1,7 +1,4 @@
-"""The two programs of the Raspberry Pi car: a TCP server, and a program for a Bluetooth module. Neither has modes.
-
-"Row" in a comment means the row of that name in docs/reference/protocol.md.
-"""
+"""The two programs of the Raspberry Pi car: a TCP server, and a program for a Bluetooth module. Neither has modes."""
 
 from collections.abc import Generator
 from enum import StrEnum

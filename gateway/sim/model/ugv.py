@@ -93,7 +93,8 @@ class UgvCar:
     - `mission`: the boot mission drives for 2 s.
     - `no_encoder`: the left encoder counts nothing, as with a loose wire.
     - `quiet`: `T:605` is 0, so there is no echo.
-    - `arm`: the boot mission says that there is an arm, whose numbers then replace the angles in the feedback.
+    - `arm`: the boot mission says that there is an arm. Its position then overwrites fields of the same name in the
+      feedback: the yaw `y`, or with ROS the accelerations `ax`, `ay`, `az`.
     - `gimbal`: the boot mission says that there is a gimbal, but there is none. So each turn of the loop waits for two
       servos.
     """
