@@ -255,7 +255,7 @@ class CarGateway:
             "`fleet join` here make another certificate; then start this gateway again."
         )
         self._commands.log(Level.ERROR, "revoked", words)
-        self._control.cut_off(words, self._loop.time())
+        self._control.halt(words, self._loop.time())
         self._wake.set()
 
     async def _check_rival(self) -> None:

@@ -251,7 +251,7 @@ class Controller(Generic[D_co]):
             f"(e-stop {latched[0].id}, seen from {source})"
         )
         self._log.log(Level.ERROR, "estop_joined", words, now)
-        self._halt(words, now)
+        self.halt(words, now)
 
     def merge_pauses(self, pauses: Iterable[FleetPause], ended: Iterable[str], source: str, now: float) -> None:
         """Merge the pauses, in force and ended, of another gateway of the fleet."""
@@ -264,11 +264,12 @@ class Controller(Generic[D_co]):
             why = f": {joined[0].why}" if joined[0].why else ""
             words = f"{self.car} is paused with the whole fleet by {name_of(joined[0].by)}{why} (seen from {source})"
             self._log.log(Level.WARNING, "paused", words, now)
-            self._halt(words, now)
+            self.halt(words, now)
 
-    def cut_off(self, words: str, now: float) -> None:
-        """Stop the car, because nobody can command it any more. `words` is the reason."""
-        self._halt(words, now)
+    def halt(self, words: str, now: float) -> None:
+        """Drop all commands of the car, and stop it. `words` is the reason."""
+        self.driver.halt(words, now)
+        self.driver.stop_if_open(now)
 
     # ------------------------------------------------------------------ each command
 
@@ -395,12 +396,7 @@ class Controller(Generic[D_co]):
         self.safety.lease = None
         waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
         if waiting or not self.driver.model.at_rest:
-            self._halt(words, now)
-
-    def _halt(self, words: str, now: float) -> None:
-        """Drop all commands of the car, and stop it."""
-        self.driver.halt(words, now)
-        self.driver.stop_if_open(now)
+            self.halt(words, now)
 
     def _still_estopped(self, sender: Sender, now: float) -> str:
         """Describe the e-stops in force, with their ids if there are several, and whether the sender can end them."""
