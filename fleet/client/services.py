@@ -2,13 +2,12 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any, Final
 
 from fleet.client.client import Fleet
 from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from schemas import keys, messages, topics
-from schemas.bus import Bus, Failure, Sample
+from schemas.bus import Bus, Failure, Sample, messages_of
 from schemas.words import RecorderState
 
 RECORDER_TIMEOUT_S: Final = 15.0
@@ -46,10 +45,8 @@ def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
 
 def _recording(answer: Sample) -> Any:
     """Return the fleet.v1.Recording in an answer. None for another answer: without certificates, anybody may answer."""
-    with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
-        found: Any = answer.message()
-        return found if found.DESCRIPTOR.full_name == topics.TOPICS["@recorder/status"].message else None
-    return None
+    named = topics.TOPICS["@recorder/status"].message
+    return next((each for each in messages_of([answer]) if each.DESCRIPTOR.full_name == named), None)
 
 
 def why_unrecorded(status: Any) -> str:

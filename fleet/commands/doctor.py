@@ -58,10 +58,10 @@ def doctor(name: str | None, car: str | None, connect: str | None, fleet: str, *
     named = (name,) if name is not None else ()
     with open_client(connect, fleet, named) as client:
         found = collect(client)
-        if not any(each.state.present for each in found.values()) and (refused := why_refused(client)):
-            raise click.ClickException(refused)
         if not found:
             raise no_cars(client)
+        if not any(each.state.present for each in found.values()) and (refused := why_refused(client)):
+            raise click.ClickException(refused)
         if name is not None and name not in found:
             near = did_you_mean(name, found) or f"Cars: {', '.join(found)}."
             raise click.ClickException(f'No car or session "{name}". {near}')

@@ -80,9 +80,8 @@ def check_storage(host: str, port: int = 0) -> None:
     host: of the hub that this computer will use, empty if it must be found first. port: of that hub, if it is known.
     """
     default = int(SECURE_ENDPOINT.rpartition(":")[2])
-    directory = Credentials.of(f"tls/{host}:{port or default}").directory
-    of_all_hubs = directory_of(f"tls/{host}:{port or default}").parent
-    for place in (default_directory(), directory if host else of_all_hubs):
+    endpoint = f"tls/{host}:{port or default}"
+    for place in (default_directory(), Credentials.of(endpoint).directory if host else directory_of(endpoint).parent):
         _check_writable(place)
 
 

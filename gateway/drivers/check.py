@@ -355,7 +355,7 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
                 yield f"{topic} is measured in {sample!r}, which is listed in UNMEASURED"
     profile = family.profile_of(platform)
     measurable = {topic for mode in profile.modes for topic in profile.measurable(mode)}
-    for sample in getattr(family, "SAMPLES", ()):
+    for sample in _samples(family):
         events = [*driver.feed(sample, 200.0), *driver.flush(210.0)]
         found = [each for event in events for each in driver.measured(event).items()]
         if not found:
@@ -369,7 +369,7 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
 def check_hostile(family: Family, platform: str) -> Iterator[str]:
     """Check that the driver accepts `SAMPLES` with `HOSTILE` values for numbers, and measures nothing invalid."""
     bench = _connected(family, platform)
-    for sample in getattr(family, "SAMPLES", ()):
+    for sample in _samples(family):
         for number in re.finditer(rb"-?\d+(\.\d+)?", sample):
             for value in HOSTILE:
                 yield from dict.fromkeys(_take(bench, sample[: number.start()] + value + sample[number.end() :]))
@@ -381,7 +381,7 @@ def check_rest(family: Family, platform: str) -> Iterator[str]:
     `MOVING` of the module has bytes of a car that moves. It is required if `SAMPLES` show a stop, because then perhaps
     any report of such a car would show one.
     """
-    standing = _connected(family, platform, getattr(family, "SAMPLES", ()))
+    standing = _connected(family, platform, _samples(family))
     standing.ask(Stop())
     standing.run(30.0)
     moving: Sequence[bytes] = getattr(family, "MOVING", ())
@@ -419,7 +419,7 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
 
 def check_drive(family: Family, platform: str) -> Iterator[str]:
     """Check that a drive is sent or fails, ends with a stop, and is repeated in time for the car's dead-man timer."""
-    bench = _connected(family, platform, getattr(family, "SAMPLES", ()))
+    bench = _connected(family, platform, _samples(family))
     began, before = bench.now, len(bench.sent)
     dead_man_s = family.profile_of(platform).dead_man_s
     lasts_s = min(10.0, max(4.0, 2 * (dead_man_s or 0.0)))
@@ -430,7 +430,7 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
         yield "a drive waits for ever"
     moved = any(each.command.id == drive and each.phase is Phase.SENT for each in bench.records)
     if not moved:
-        if getattr(family, "SAMPLES", ()):
+        if _samples(family):
             waits = bench.control.driver.wait_words(bench.now)
             yield f"a drive is never sent while the car sends its SAMPLES{': it waits for ' if waits else ''}{waits}"
         return
@@ -498,7 +498,7 @@ def check_loss(family: Family, platform: str) -> Iterator[str]:
 def _check_dropped(family: Family, bench: Bench) -> Iterator[str]:
     """Check that a lost link makes the driver forget the bytes of an unfinished frame, so that the next one is read."""
     driver = bench.control.driver
-    samples: Sequence[bytes] = getattr(family, "SAMPLES", ())
+    samples = _samples(family)
     for sample in (*samples, b"x"):
         driver.feed(sample[: max(1, len(sample) // 2)], bench.now)
         dropped = driver.drop_bytes()
@@ -517,7 +517,7 @@ def _check_dropped(family: Family, bench: Bench) -> Iterator[str]:
 
 def check_kept(family: Family, platform: str) -> Iterator[str]:
     """Check that the result of `kept` survives JSON, and that the driver of the next gateway accepts it."""
-    kept = _connected(family, platform, getattr(family, "SAMPLES", ())).control.driver.kept()
+    kept = _connected(family, platform, _samples(family)).control.driver.kept()
     again = json.loads(json.dumps(kept))
     Controller("red", family.driver_of(platform, again))
     if again != kept:
@@ -564,6 +564,11 @@ def check(family: Family) -> Iterator[tuple[str, str, list[str]]]:
     for platform in names:
         for each in CHECKS:
             yield platform, each.__name__, list(_caught(each(family, platform)))
+
+
+def _samples(family: Family) -> Sequence[bytes]:
+    """Return the `SAMPLES` of a module: bytes of a real car. Empty if it has none."""
+    return getattr(family, "SAMPLES", ())
 
 
 def _is(value: object, *kinds: type) -> bool:

@@ -49,9 +49,9 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
                 now = time.monotonic()
                 if links is not None:
                     links.write(links_of(session), now)
-                if links is not None and now - asked >= RULES_POLL_S:
-                    asked = now
-                    _take_rules(links, session)
+                    if now - asked >= RULES_POLL_S:
+                        asked = now
+                        _take_rules(links, session)
                 if _has_clients(session):
                     last_link = now
                 elif now - last_link > idle_s:
