@@ -1,4 +1,4 @@
-"""What a console page may show besides the state of the cars.
+"""The base of the feeds: the data of a console page besides the state of the cars.
 
 Each feed registers the messages of its page, and answers them.
 """

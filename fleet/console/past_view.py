@@ -1,4 +1,4 @@
-"""What the pages show of a moment of a recording: the same views as live, from the messages that were known then.
+"""The views of the pages for a moment of a recording: the same as live, from the messages that were known then.
 
 The clock is that of the recorder: `now` is the moment, and the age of a message is the time since it was recorded.
 """

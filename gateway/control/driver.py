@@ -157,7 +157,7 @@ class Findings:
 
 
 class DriverClaims(Protocol):
-    """What may be claimed about the car now. The gateway publishes it, and refuses or delays commands because of it."""
+    """The current claims about the car. The gateway publishes them, and refuses or delays commands because of them."""
 
     name: str
     link_open: bool
@@ -168,7 +168,7 @@ class DriverClaims(Protocol):
 
     @property
     def profile(self) -> CarProfile:
-        """The profile of the car, as far as it is known now."""
+        """The profile of the car, which may change while the driver finds out the platform."""
 
     @property
     def mode(self) -> ModeClaims:

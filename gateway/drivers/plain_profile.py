@@ -1,4 +1,4 @@
-"""What cars of a plain family can do. Pure; the programs that only ask for it need no driver, which loads slowly."""
+"""The profile of cars of a plain family, in a module of its own: the driver loads slowly. Pure."""
 
 from dataclasses import dataclass
 

@@ -33,11 +33,11 @@ class UnshownStop:
     at_ns: int
     code: str
     asked: str
-    """Who asked for it, such as `stop by mia`. Empty if the gateway itself stopped the car."""
+    """The verb and the sender, such as `stop by mia`. Empty if the gateway itself stopped the car."""
     words: str
     """The words of the gateway."""
     cause: str
-    """What was known about the car just before, in words."""
+    """The state of the car just before, in words."""
 
     def describe(self) -> str:
         """Return car, time and cause."""

@@ -98,7 +98,7 @@ class _SchemaRefused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What became of the recorded messages. Each is either shown or left out."""
+    """The numbers of recorded messages that are shown and left out. Each message is one or the other."""
 
     shown: Counter[str]
     """Number of messages by key."""
