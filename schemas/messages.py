@@ -23,7 +23,7 @@ class Observation:
     message: Any
     at: float
     earlier: "tuple[Observation, ...]" = ()
-    """The observations before this one that somebody still needs, the newest last."""
+    """Earlier observations that are kept for conditions over several readings, the newest last."""
 
     def aged(self, by_s: float) -> "Observation":
         """Return this observation as if it were `by_s` older."""

@@ -58,8 +58,16 @@ class ThingEntry(Entry):
 
     # A field whose default means nothing has a default factory, so that the schema for editors shows no default.
     # `world_check` reports fields that are missing or not allowed.
-    x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of the car's middle")
-    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of the car's middle")
+    x_m: _Place = Field(
+        default=0.0,
+        description="where it stands, meters: required without path and carried_by; if carried, ahead of the car's "
+        "middle",
+    )
+    y_m: _Place = Field(
+        default=0.0,
+        description="where it stands, meters: required without path and carried_by; if carried, to the left of the "
+        "car's middle",
+    )
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
     radius_m: _Size = Field(default_factory=float, description="a disc with this radius, meters")
     width_m: _Size = Field(default_factory=float, description="a box with this width, meters, instead of a disc")
@@ -68,7 +76,7 @@ class ThingEntry(Entry):
         default_factory=list,
         min_length=2,
         max_length=_MAX_ITEMS,
-        description="points [x, y] that it moves along, and then begins again",
+        description="the points [x, y] of its path; after the last one it moves straight back to the first",
     )
     there_and_back: bool = Field(default=False, description="true: it turns round at the end of the path")
     speed_m_s: float = Field(default=0.0, ge=0, le=0.5, description="its speed along the path")
@@ -81,8 +89,14 @@ class ThingEntry(Entry):
 class LampEntry(Entry):
     """A lamp that the light sensors see, if nothing is in between."""
 
-    x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of its carrier's middle")
-    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, left of its carrier's middle")
+    x_m: _Place = Field(
+        default=0.0,
+        description="where it stands, meters: required without carried_by; if carried, ahead of its carrier's middle",
+    )
+    y_m: _Place = Field(
+        default=0.0,
+        description="where it stands, meters: required without carried_by; if carried, left of its carrier's middle",
+    )
     reach_m: float = Field(default=1.5, gt=0, le=100, description="how far away it is seen with brightness 1, meters")
     brightness: float = Field(default=1.0, ge=0, le=100, description="with 4, it is seen from twice as far as with 1")
     on: bool = Field(default=True, description="whether it is lit")

@@ -15,8 +15,8 @@ from schemas.words import Basis, Phase, Reason
 NO_ANSWER: Final = "no_answer"
 NO_RESULT: Final = "no_result"
 """Code of a command whose last event is missing."""
-_STAYS: Final = (Reason.ESTOPPED, Reason.HELD)
-"""Reasons of a resume after which the car is still stopped."""
+_STILL_STOPPED: Final = (Reason.ESTOPPED, Reason.HELD)
+"""If a resume completes with one of these reasons, the car is still stopped, so the resume has failed."""
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 OUTCOME_MARGIN_S: Final = 5.0
@@ -37,7 +37,7 @@ class Until(StrEnum):
     SENT = "sent"
     """The gateway has written the frame."""
     STOPPED = "stopped"
-    """The car's readings show the stop, or cannot show it."""
+    """The car's readings have shown that it stands, or the gateway has found that no reading can show it."""
     OVER = "over"
     """The drive has ended."""
 
@@ -152,7 +152,10 @@ class Progress:
 
     @property
     def _joined(self) -> bool:
-        """True if the command extends a drive of the same sender. The end is then recorded under the earlier id."""
+        """True if the command extends a running drive, whose end is then recorded under the earlier id.
+
+        A drive that begins is queued before it is sent, an extension is not.
+        """
         # Decide by the events, because they come in order. The answer may arrive long before them.
         return self._until is Until.OVER and self._sent_event and not self._queued
 
@@ -227,9 +230,10 @@ class Progress:
         self._foreign = words
 
     def on_query_failed(self, words: str, at: float) -> None:
-        """Give up if the query has ended without an answer.
+        """Handle the end of a query without an answer.
 
-        If a supervisor starts a new gateway, wait for that gateway.
+        A stop, or a command to a gateway that a supervisor restarts, waits until its deadline. Any other command is
+        given up.
         """
         if self._is_supervised and not self.answered:
             self.on_presence(at, alive=False)
@@ -302,7 +306,7 @@ class Progress:
         if phase in _FAILED_PHASES:
             self._end(phase, reason, words, at, ok=False)
         elif phase == Phase.COMPLETE or (phase == Phase.SENT and self._until is Until.SENT):
-            self._end(phase, reason, words, at, ok=reason not in _STAYS)
+            self._end(phase, reason, words, at, ok=reason not in _STILL_STOPPED)
 
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
@@ -319,8 +323,8 @@ class Progress:
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop that no reading shows is in force, too
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if is_in_force else ""
-            # When a command was carried out, the gateway's words say only what is odd, and are often empty. The effect
-            # contains them.
+            # When a command was carried out, the gateway's words are often empty, and the effect already contains them.
+            # So the effect comes first.
             told = (effect or words) if ok else (words or effect)
             told = told or f"{self._verb or 'command'} {phase}"
             self.outcome = Outcome(

@@ -22,7 +22,7 @@ class NotInTime(TimeoutError):
 
 
 @dataclass(slots=True)
-class _LastMatch:
+class _LastReading:
     """The newest reading of one key."""
 
     at: datetime
@@ -40,7 +40,7 @@ class ConditionWait:
     def __init__(self, condition: KeyCondition, for_s: float = 0.0) -> None:
         self._condition = condition
         self._for_s = for_s
-        self._seen: dict[str, _LastMatch] = {}
+        self._seen: dict[str, _LastReading] = {}
         self.last: Reading | None = None
         """The newest reading for which the condition is decidable."""
         self._undecided: Reading | None = None
@@ -63,7 +63,7 @@ class ConditionWait:
         else:
             key = reading.key
             holding = None if expression is None else Holding(expression, lambda _: key, _stale_after_ns)
-        self._seen[reading.key] = _LastMatch(reading.time, arrived_s, message, holding)
+        self._seen[reading.key] = _LastReading(reading.time, arrived_s, message, holding)
         holds = None
         if holding is not None:
             holds = holding.add(reading.key, compared_in(reading.value), _ns(reading.time)).value
@@ -79,7 +79,7 @@ class ConditionWait:
         return span is not None and span.length_s >= self._for_s
 
     def timeout_error(self, written: str, after_s: float, now: datetime) -> NotInTime:
-        """Return the error for a timeout."""
+        """Return the error for a timeout. `written` is the key expression of the wait."""
         lasting = f" for {self._for_s:g} s" if self._for_s else ""
         words = f"{self._condition} did not hold{lasting} within {after_s:g} s"
         last = self.last or self._undecided
@@ -90,7 +90,7 @@ class ConditionWait:
         return NotInTime(f"{words}: {last.key} had {values}, {age}", last)
 
 
-def _is_other_clock(reading: Reading, before: _LastMatch, arrived_s: float | None) -> bool:
+def _is_other_clock(reading: Reading, before: _LastReading, arrived_s: float | None) -> bool:
     """Return True if the clock of the stamps was set between two readings."""
     stamps_s = (reading.time - before.at).total_seconds()
     if arrived_s is None:

@@ -69,7 +69,7 @@ def serving_options(port: int) -> Callable[[_Function], _Function]:
 
 
 def with_client(function: _Function) -> _Function:
-    """Add the options of `bus_options` and call the command with an open client of a person."""
+    """Add the options of `bus_options`, and pass the command an open client, which acts for the person of --as."""
 
     @bus_options
     @functools.wraps(function)
@@ -96,7 +96,8 @@ class WrongFile(click.ClickException):
     """The errors of a file, one per line, each with its position."""
 
     exit_code = 2
-    own_form = True  # printed as it is: editors and CI read `FILE:LINE:COL: error: WORDS`
+    own_form = True
+    """True: the text is printed unchanged, because editors and CI read `FILE:LINE:COL: error: WORDS`."""
 
 
 @contextmanager
@@ -108,7 +109,8 @@ def cli_errors() -> Iterator[None]:
         vars(error)["message"] = complete_hints(error.message, hint_options())  # click declares `message` final
         raise
     except (BadEndpoint, ValueError) as error:  # BadKey is a ValueError
-        # A BadFile of schemas.yaml_document. Its import would slow down every other command.
+        # This is a BadFile of schemas.yaml_document, recognized by its attribute: importing the class would slow down
+        # every other command.
         if hasattr(error, "problems"):
             raise WrongFile(str(error)) from None
         raise click.UsageError(complete_hints(str(error), hint_options())) from None

@@ -13,8 +13,8 @@ from schemas.links import LinkUrl
 MIN_BYTES: Final = 200
 """Minimum bytes without a frame before the baud rate is doubted. A report of a car has 46."""
 _MIN_RUN_SHARE: Final = 0.5
-"""Share of bytes with at most two runs of equal bits from which on the baud rate counts as wrong. It is 0.06 in
-arbitrary bytes, 0 in a report, and 0.69 to 1 if the port is at least four times as fast as the car."""
+"""The baud rate counts as wrong if at least this share of the bytes has at most two runs of equal bits. In arbitrary
+bytes the share is 0.06, in a report 0, and if the port is at least four times as fast as the car, 0.69 to 1."""
 _MAX_TEXT_SHARE: Final = 0.8
 """Share of printable bytes above which the baud rate counts as right. It is 1 at the right rate, else at most 0.56."""
 _TEXT: Final = frozenset({*range(0x20, 0x7F), *b"\r\n\t"})
@@ -52,16 +52,16 @@ class BaudWatch:
         counts, self._counts = self._counts, None
         if _share(counts, _TEXT) > _MAX_TEXT_SHARE:
             return None
-        looks_so = _share(counts, _RUNS) >= _MIN_RUN_SHARE
-        return BaudDoubt("wrong_baud" if looks_so else "no_frames", self._words(total, looks_so=looks_so))
+        looks_wrong = _share(counts, _RUNS) >= _MIN_RUN_SHARE
+        return BaudDoubt("wrong_baud" if looks_wrong else "no_frames", self._words(total, looks_wrong=looks_wrong))
 
     def on_frame(self) -> None:
         """Stop watching, because a frame shows that the baud rate is right."""
         self._counts = None
 
-    def _words(self, total: int, *, looks_so: bool) -> str:
+    def _words(self, total: int, *, looks_wrong: bool) -> str:
         fact = f"{total} bytes came, but never a frame"
-        if looks_so:
+        if looks_wrong:
             fact += ": they look like a wrong baud rate"
         return f"{fact}. {self._url.doubt_baud()}"
 

@@ -98,9 +98,9 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
     truth, pose = car.truth, car.pose
     fields: dict[str, object]
     if truth is None or pose is None:
-        played = car.firmware
-        assert isinstance(played, CaptureCar)
-        fields = {"sent_bytes": played.sent_bytes, "ignored_bytes": played.ignored_bytes, "rounds": played.rounds}
+        capture = car.firmware
+        assert isinstance(capture, CaptureCar)
+        fields = {"sent_bytes": capture.sent_bytes, "ignored_bytes": capture.ignored_bytes, "rounds": capture.rounds}
     else:
         fields = {**asdict(truth), **pose._asdict()}
     return {"ok": True, "car": name, **fields, "lost_bytes": car.lost_bytes}

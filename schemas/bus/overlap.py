@@ -29,7 +29,8 @@ class Overlap:
         self._lock = threading.Lock()
         self._once: tuple[dict[Hashable, deque[float]], dict[Hashable, deque[float]]] = {}, {}
         self.older_is_deaf = False
-        """True once everything comes over the newer session. Whatever still comes over the older one is dropped."""
+        """True once the older session is ignored: everything comes over the newer one, and whatever still comes over
+        the older one is dropped."""
 
     def is_twin(self, what: Hashable, now: float, *, newer: bool, within_s: float = inf) -> bool:
         """Return True if the same message has come over the other session at most `within_s` ago.

@@ -36,14 +36,15 @@ _THREAD_END_TIMEOUT_S: Final = 2.0
 _DECLARE_LOCK: Final = threading.Lock()
 
 OVERLAP_S: Final = 0.5
-"""Time during which both sessions are used, until also the hubs of other sites know the second one. Then the first one
-stays for the same time, for messages that are still on their way."""
+"""Time during which the first and the second session are both used when `reopen` replaces one by the other: until then,
+also the hubs of other sites know the second one. Then the first one is used for the same time again, for messages that
+are still on their way."""
 ANSWERS_S: Final = 12.0
 """Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
 REOPEN_TIMEOUT_S: Final = 5.0
 TOKENS_OF_NOBODY: Final = "*/@hub"
-"""Tokens that everyone may ask for, and that do not exist. The answer shows that the hub has handled all earlier
-messages of the session."""
+"""A key for a query that is only a barrier. No such token exists, but everyone may ask for it: when the hub answers, it
+has handled all earlier messages of the session."""
 
 _MAX_QUEUED_ANSWERS: Final = 1 << 16
 """Maximum number of queued answers of one query. If the queue is full, the link stalls, and Zenoh drops answers."""
@@ -58,7 +59,7 @@ class Bus:
         """Owner of this session's certificate, such as `person.mia`. Empty on a bus without certificates."""
         self._declarations: list[Declared] = []
         self._publishers: list[Publisher] = []
-        self._declared = itertools.count()
+        self._next_declaration = itertools.count()
         self._number = 0
         """Number of the newest session: `reopen` opens the next one."""
         self._overlap: Overlap | None = None
@@ -181,8 +182,8 @@ class Bus:
         declared.add(self._declaring, self._number)
 
     def _on_a_daemon(self, declared: Declared) -> None:
-        # Zenoh starts a Python thread for each callback. At its exit, before any exit handler runs, the interpreter
-        # joins all threads but daemons. Zenoh's thread is a daemon if the thread that declares is one.
+        # Zenoh starts a Python thread for each callback. When the interpreter exits, it joins all threads but daemons,
+        # before any exit handler runs. Zenoh's thread is a daemon if the thread that declares is one.
         # A Future instead of the list would import logging, which is 4 ms of a gateway's start.
         errors: list[BaseException] = []
 
@@ -204,7 +205,10 @@ class Bus:
                 raise errors[0]
 
     def _is_twin(self, number: int, mark: Callable[[], Hashable], within_s: float = inf) -> bool:
-        """Return True if this message is handled over the other session. It came over the session with this number."""
+        """Return True if the other session handles this message, so that this copy must be dropped.
+
+        `number` is the session over which this copy came. `within_s`: see `Overlap.is_twin`.
+        """
         overlap, is_newest = self._overlap, number == self._number
         if overlap is None:
             return not is_newest
@@ -294,7 +298,7 @@ class Bus:
         `largest` is the maximum size of a payload in bytes (see `Sample.unread`). `admits` is called with the key of
         each message before anything else of it is read. If it returns False, the message is dropped.
         """
-        declaration = next(self._declared)
+        declaration = next(self._next_declaration)
 
         def declare(session: zenoh.Session, number: int) -> Any:
             def on_sample(sample: zenoh.Sample) -> None:
@@ -312,7 +316,7 @@ class Bus:
         # A channel costs half as much per message as a callback. The recorder needs that, because it reads everything.
         channel = SampleChannel(
             lambda session, _: session.declare_subscriber(expression, zenoh.handlers.FifoChannel(capacity)),
-            next(self._declared),
+            next(self._next_declaration),
         )
         self._keep(channel, self._on_this_thread)
         return channel
@@ -329,7 +333,7 @@ class Bus:
         If the callback returns False, the query is answered with BUSY. A query with a part that is too large is passed
         to `too_large` with the reason; without `too_large` it is refused.
         """
-        declaration = next(self._declared)
+        declaration = next(self._next_declaration)
 
         def declare(session: zenoh.Session, number: int) -> Any:
             def on_query(query: zenoh.Query) -> None:
@@ -444,7 +448,7 @@ class Bus:
         self.put_again(key, payload, encoding, sequence, Qos.COMMAND)
 
     def put_again(self, key: str, payload: bytes, encoding: str, sequence: int, qos: Qos) -> None:
-        """Publish a payload unchanged, with this sequence number, or without one if it is 0."""
+        """Publish an encoded payload as it is, with this sequence number, or without one if it is 0."""
         source = zenoh.SourceInfo(self._session.id, (sequence - 1) & 0xFFFFFFFF) if sequence else None
         self._session.put(key, payload, encoding=encoding, source_info=source, **ZENOH_QOS[qos])
 

@@ -24,7 +24,8 @@ if sys.platform == "win32":
 MIN_SLEEP_S: Final = 0.1
 """Minimum difference of the clocks that counts as a sleep. No computer sleeps for a shorter time."""
 MAX_READ_S: Final = 0.001
-"""Maximum duration of an undisturbed reading of the clocks. At its start, `SleepWatch` repeats a longer one."""
+"""Maximum duration of an undisturbed reading of the clocks. When a `SleepWatch` starts, it
+repeats a reading that took longer."""
 MAX_READS: Final = 10
 """Maximum readings at the start. If the scheduler disturbs all of them, the best one counts."""
 MONOTONIC_COUNTS_SLEEP: Final = sys.platform == "win32"

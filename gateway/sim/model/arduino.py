@@ -62,12 +62,12 @@ class ArduinoCar(ModeCar):
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
-                self._started = True
-            if self._started and len(self._string) < STRING_LIMIT:
+                self._in_frame = True
+            if self._in_frame and len(self._string) < STRING_LIMIT:
                 self._string += char
             if char == "#":
                 self._complete = True
-                self._started = False
+                self._in_frame = False
         self._buffer.clear()
 
     def _keep_last(self) -> None:
@@ -75,11 +75,11 @@ class ArduinoCar(ModeCar):
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
-                self._started, self._arriving = True, ""
-            if self._started and len(self._arriving) < STRING_LIMIT:
+                self._in_frame, self._arriving = True, ""
+            if self._in_frame and len(self._arriving) < STRING_LIMIT:
                 self._arriving += char
-            if char == "#" and self._started:
-                self._string, self._complete, self._started = self._arriving, True, False
+            if char == "#" and self._in_frame:
+                self._string, self._complete, self._in_frame = self._arriving, True, False
         self._buffer.clear()
 
     def _parse(self) -> Generator[Wait, None, bool]:

@@ -76,7 +76,7 @@ class ModeCar(Firmware):
 
     def _reset_variables(self) -> None:
         """Set the program's variables to their values after a start."""
-        self._started = False
+        self._in_frame = False
         self._complete = False
         self._pressed = None
         self._color_position = 0

@@ -80,7 +80,7 @@ class RaspberryPiCar(Firmware):
 
     def _reset_variables(self) -> None:
         self._cache = ""
-        self._started = False
+        self._in_frame = False
         self._speed = START_PERCENT
         self._cycle = 0
         self._turning: tuple[str, int, float] | None = None
@@ -150,11 +150,11 @@ class RaspberryPiCar(Firmware):
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
-                self._started = True
-            if self._started:
+                self._in_frame = True
+            if self._in_frame:
                 self._cache += char
                 if char == "#":
-                    last, self._cache, self._started = self._cache, "", False
+                    last, self._cache, self._in_frame = self._cache, "", False
         self._buffer.clear()
         return last
 
@@ -175,9 +175,12 @@ class RaspberryPiCar(Firmware):
             yield from self._turn_servo(servo)
 
     def _general_frame(self, text: str) -> Generator[Wait, None, int | None]:
-        """Set the motion after whistle and fan. Return the target of the front servo, which moves last, or None."""
+        """Whistle and run the fan, then set the motion.
+
+        Return the target of the front servo, which moves last, or None.
+        """
         if len(text) < 18:
-            raise _Died  # the program reads place 9 without a check whether it exists
+            raise _Died  # the program reads place 9, here text[17], without checking that it exists
         left, right = motion(text)
         if text[5] == "1":
             yield from self._busy(WHISTLE_S)

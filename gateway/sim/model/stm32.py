@@ -89,12 +89,12 @@ class Stm32Car(ModeCar):
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
-                self._started, self._index = True, 0
-            if self._started and self._index < FRAME_BUFFER:
+                self._in_frame, self._index = True, 0
+            if self._in_frame and self._index < FRAME_BUFFER:
                 self._memory[self._index] = char
                 self._index += 1
-            if char == "#" and self._started:
-                self._started, self._complete = False, True
+            if char == "#" and self._in_frame:
+                self._in_frame, self._complete = False, True
         self._buffer.clear()
 
     def _obey_buffer(self) -> None:

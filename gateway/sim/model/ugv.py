@@ -48,6 +48,7 @@ PAGE_OPEN_S: Final = 10.0
 """Time from the last press until the page is closed and its queries end."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
+"""Integral gain per step of the speed loop, which is one in SPEED_LOOP_S."""
 DEAD_DUTY: Final = 23.0
 """A smaller duty counts as zero."""
 _ROM: Final = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805e4\r\n"
@@ -62,7 +63,7 @@ _SETUP: Final = (
 UGV_BOOT_S: Final = 2.0
 """Time from a reset until the loop runs."""
 _PARTS: Final = re.compile(r'"(\w+)"\s*:\s*(-?\d+(?:\.\d+)?)')
-"""A field as the web interface reads it, also in a text that ends too early."""
+"""One field of a command to the web interface, which also accepts a truncated command."""
 UART_S: Final = 0.3
 """Time from a reset until the program has opened its UART. Bytes that arrive before that are lost."""
 
@@ -108,11 +109,11 @@ class UgvCar:
         self._options = options
         self._now = now
         self._arrivals: deque[tuple[float, bytes]] = deque()
-        self._free_at = now
+        self._rx_free_at = now
         self._out: deque[tuple[float, bytes]] = deque()
-        self._tx_free = now
+        self._tx_free_at = now
         self._kept_main = 2 if build.is_ros else 1
-        """The chassis after a reset. In the ROS firmware, a `T:900` still counts after it."""
+        """The chassis after a reset. The ROS firmware keeps that of the last `T:900`."""
         self._kept_module = 1 if "arm" in options else 2 if "gimbal" in options else 0
         """The number of the mounted module after a reset: 1 is an arm, 2 a gimbal, 0 none."""
         self._odometer = [0.0, 0.0]
@@ -123,9 +124,9 @@ class UgvCar:
         self.scheduler: EventScheduler | None = None
         self.alive: Final = True
         self.runaway_since: float | None = None
-        """Time since which a command drives the motors while the dead-man is not armed. None if this is not so now."""
+        """When the motors began to run on a command without an armed dead-man timer. None if they do not."""
         self.wrong_since: float | None = None
-        """Time since which a line of the host moves the car while it is set to a wrong chassis. None if not so now."""
+        """When a line of the host began to move the car with a wrong chassis set. None if none does."""
         self._reset(now, text=False)
         self._boot_until = self._uart_from = now  # the program has already run for a while
         self._mission: list[tuple[float, str]] = []
@@ -162,9 +163,9 @@ class UgvCar:
     def feed(self, data: bytes, now: float) -> None:
         """Put bytes on the link; they reach the car at the rate of its UART."""
         self._run(now)
-        self._free_at = max(now, self._free_at) + len(data) / UGV_BYTES_PER_S
-        if self._free_at >= self._uart_from:
-            self._arrivals.append((self._free_at, data))
+        self._rx_free_at = max(now, self._rx_free_at) + len(data) / UGV_BYTES_PER_S
+        if self._rx_free_at >= self._uart_from:
+            self._arrivals.append((self._rx_free_at, data))
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
         """Run up to `now`; return the pieces sent since the last call."""
@@ -255,8 +256,9 @@ class UgvCar:
         self._dead_man_s = UGV_DEAD_MAN_S
         self._fed_at = now
         self._timed_out = False
-        self._uncovered = False
-        """True if a `T:13` after a timeout drives a car with the ROS firmware: the dead-man timer does not stop it."""
+        self._unguarded = False
+        """True while the dead-man timer does not stop a drive: in the ROS firmware, a `T:13` after a timeout drives,
+        but does not restart the timer."""
         self._stream = ros
         self._gap_s = 0.05 if ros else 0.0
         self._echo = not ros
@@ -283,7 +285,7 @@ class UgvCar:
             self._print(_ROM)
             for at, words in _SETUP:
                 self._out.append((now + at, words))
-            self._tx_free = now + _SETUP[-1][0]
+            self._tx_free_at = now + _SETUP[-1][0]
 
     # ------------------------------------------------------------------ one turn of the loop
 
@@ -295,7 +297,7 @@ class UgvCar:
                 self._plays = False
             if now >= self._blocked_until and not self._mission and not self._plays:
                 self._take_lines(now)
-                self._press_on(now)
+                self._run_page(now)
                 self._control(now)
                 self._report(now)
                 self._check_dead_man(now)
@@ -322,7 +324,8 @@ class UgvCar:
             for number in (1, 2):
                 self._print(b'{"T":1005,"id":%d,"status":0}\r\n' % number)
 
-    def _press_on(self, now: float) -> None:
+    def _run_page(self, now: float) -> None:
+        """Repeat the command of the pressed button, and send the queries of the open page."""
         if self._page is not None and now >= self._page_at:
             self._page_at = now + PAGE_S
             self._obey({"T": 1, "L": 0.3 * self._page[0], "R": 0.3 * self._page[1]})
@@ -374,11 +377,11 @@ class UgvCar:
         So the next command drives the car again.
         """
         if not self._timed_out and 0.0 <= self._dead_man_s < now - self._fed_at:
-            self._timed_out, self._uncovered, self._raw = True, False, False
+            self._timed_out, self._unguarded, self._raw = True, False, False
             self._target = [0.0, 0.0]
 
     def _feed_dead_man(self) -> None:
-        self._fed_at, self._timed_out, self._uncovered = self._now, False, False
+        self._fed_at, self._timed_out, self._unguarded = self._now, False, False
 
     def _move(self, now: float) -> None:
         """Change the speed of the wheels towards the duty of the motors, and move the car by its wheels."""
@@ -390,7 +393,7 @@ class UgvCar:
             self._odometer[side] += abs(self._wheels[side]) * LOOP_S
         pwm = [round(255 * each / TOP_SPEED_M_S) for each in self._wheels]
         self._body.drive(now, pwm[0], pwm[1])
-        armed = self._dead_man_s >= 0.0 and not self._timed_out and not self._uncovered
+        armed = self._dead_man_s >= 0.0 and not self._timed_out and not self._unguarded
         drives = any(self._duty if self._raw else self._target)
         self.runaway_since = (self.runaway_since or now) if drives and not armed else None
 
@@ -440,7 +443,7 @@ class UgvCar:
             case 13:
                 forward, turn = _number(command, "X"), _number(command, "Z")
                 if self._build.is_ros:  # this command does not restart the dead-man timer
-                    self._uncovered = self._timed_out
+                    self._unguarded = self._timed_out
                 else:
                     self._feed_dead_man()
                 self._set_target(forward - turn * 0.0625, forward + turn * 0.0625)
@@ -480,7 +483,7 @@ class UgvCar:
                 pass
 
     def _set_target(self, left: float, right: float) -> None:
-        """Set the speeds of a closed loop, or the fractions of an open one. Too high a speed leaves the old ones."""
+        """Set the speeds of a closed loop, or the fractions of an open one. A closed loop ignores too high speeds."""
         if self._is_closed and max(abs(left), abs(right)) > UGV_LIMIT_M_S:
             return
         self._raw = False
@@ -489,7 +492,7 @@ class UgvCar:
     # ------------------------------------------------------------------ to the host
 
     def _report(self, now: float, *, asked: bool = False) -> None:
-        """Send a feedback, unless the last one was sent less than the gap ago. The gap counts for a query, too."""
+        """Send a feedback, unless the last one was sent less than `_gap_s` (`T:142`) ago. This also limits answers."""
         if not (asked or self._stream) or now < self._reported_at + max(self._gap_s, LOOP_S):
             return
         self._reported_at = now
@@ -504,10 +507,12 @@ class UgvCar:
             fields: dict[str, float] = {"T": 1001, **wheels, **imu, **way, "v": int(100 * volts)}
         else:
             if asked and not self._is_closed and self._raw:
-                wheels = {"L": round(self._duty[0]), "R": round(self._duty[1])}  # the command itself
+                # After `T:11`, the firmware reports the commanded duty here.
+                wheels = {"L": round(self._duty[0]), "R": round(self._duty[1])}
             yaw = round(degrees(self._body.pose(now).heading_rad), 2)
             fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
-        if self._module == 1:  # a real car sends both numbers under one name, of which the last one counts
+        if self._module == 1:
+            # A real car sends such a name twice, at last with the position of the arm. The last value counts.
             places = [f"a{each}" for each in "xyz"] if self._build.is_ros else list("xyz")
             fields |= dict(zip(places, (310.2, -194.1, 228.6), strict=True)) | {"torB": -56, "torS": 12}
         elif self._module == 2:
@@ -515,8 +520,8 @@ class UgvCar:
         self._print(json.dumps(fields, separators=(",", ":")).encode() + b"\r\n")
 
     def _print(self, data: bytes) -> None:
-        self._tx_free = max(self._now, self._tx_free) + len(data) / UGV_BYTES_PER_S
-        self._out.append((self._tx_free, data))
+        self._tx_free_at = max(self._now, self._tx_free_at) + len(data) / UGV_BYTES_PER_S
+        self._out.append((self._tx_free_at, data))
 
 
 def _is_number(command: Mapping[str, Any], name: str) -> bool:

@@ -181,9 +181,9 @@ def mode_table() -> str:
             others = ("any other",) if every else tuple("the same" if each == asked else each for each in true)
             alike.setdefault(others, []).append(asked)
         for others, named in alike.items():
-            limit = (
-                "never" if within == "-" and verdict == "assumed" else "its first" if within == "-" else f"{within} s"
-            )
+            limit = f"{within} s"
+            if within == "-":
+                limit = "never" if verdict == "assumed" else "the first reading"
             rows.append(f"| {', '.join(named)} | {', '.join(others)} | {verdict} | {by} | {limit} |".replace("_", " "))
     return "\n".join(rows)
 

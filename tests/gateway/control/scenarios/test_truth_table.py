@@ -23,7 +23,7 @@ BY = {
         "silent for 3.",
         "no reading as in mode manual for 3.",
     ),
-    "1 s without a reading of its own": ("silent for 1.", "no reading as in mode"),
+    "1 s without a reading of the asked mode": ("silent for 1.", "no reading as in mode"),
 }
 
 Row = dict[str, str]
