@@ -30,6 +30,13 @@ from schemas.topics import Qos, Topic
 # On a busy machine, existing tokens arrive late. A token that disappears meanwhile never arrives, so there is a limit.
 _TOKEN_HISTORY_TIMEOUT_S: Final = 2.0
 """Timeout for the existing tokens at the start of a watch."""
+_LINK_TIMEOUT_S: Final = 2.0
+"""Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
+_LINK_POLL_S: Final = 0.02
+_PROMPT_S: Final = 1.0
+"""Half the lease of a link. An answer that took longer may have ended with its link."""
+_END_OF_LINK_S: Final = 0.1
+"""Time within which a session notices that its link has ended."""
 
 _THREAD_END_TIMEOUT_S: Final = 2.0
 """Timeout for the end of a callback when the session is closed."""
@@ -71,6 +78,8 @@ class Bus:
         """Threads of Zenoh that run our callbacks."""
         self._alive: dict[str, set[str]] = {}
         """Existing tokens by watched expression."""
+        self._asked_over = ""
+        """Link over which an answer with tokens has come. Empty while tokens of a watch may still be on their way."""
         self.endpoint = endpoint
         self.boot_id = os.urandom(16).hex()
         self._pid = os.getpid()
@@ -357,16 +366,41 @@ class Bus:
         return token
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
-        """Return the existing tokens. Nothing is raised after a timeout: tokens that came later are missing then."""
-        # In a session with a watch, Zenoh may leave the watched tokens out of the answer to a get: of 300 sessions that
-        # watched `fleet/*`, ten got `*/*` without them. So take those from the watch.
-        wanted = zenoh.KeyExpr(expression)
-        with self._lock:
-            if expression in self._alive:
-                return sorted(self._alive[expression])
-            watched = {key for alive in self._alive.values() for key in alive if wanted.intersects(zenoh.KeyExpr(key))}
-        replies = self._session.liveliness().get(expression, timeout=timeout_s)
-        return sorted(watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+        """Return the existing tokens. Nothing is raised after a timeout: tokens that came later are missing then.
+
+        A link that was lost is awaited for up to 2 s, unless the session watches this expression.
+        """
+        # Zenoh answers a session without a link at once, as if there were no tokens. And it leaves out of an answer
+        # what is on its way to a watch of the session, right after the watch was declared or a new link was opened. So
+        # a session with watches asks twice over each new link: the second answer comes behind those tokens.
+        wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
+        link_end = min(end, monotonic() + _LINK_TIMEOUT_S)
+        while True:
+            asked_at, link, asked_over = monotonic(), self._link(), self._asked_over
+            with self._lock:
+                if expression in self._alive and link in ("", asked_over):
+                    return sorted(self._alive[expression])
+                is_watching = bool(self._alive)
+                watched = {
+                    key for each in self._alive.values() for key in each if wanted.intersects(zenoh.KeyExpr(key))
+                }
+            if not link and monotonic() < link_end:
+                self._closing.wait(_LINK_POLL_S)
+                continue
+            replies = self._session.liveliness().get(expression, timeout=max(end - asked_at, _LINK_POLL_S))
+            found = watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+            self._asked_over = link
+            now = monotonic()
+            is_prompt = now - asked_at < _PROMPT_S
+            is_whole = is_prompt and link == self._link() and (link == asked_over or not is_watching)
+            if is_whole or now >= (end if link else link_end):
+                return sorted(found)
+            if not is_prompt:
+                self._closing.wait(_END_OF_LINK_S)
+
+    def _link(self) -> str:
+        """Return the address of our end of the link to the hub, which no two links share. Empty if there is none."""
+        return next((str(link.src) for link in self._session.info.links()), "")
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
         """Call back with (key, alive) for every existing token and every change, on a Zenoh thread."""
@@ -391,8 +425,8 @@ class Bus:
             return session.liveliness().declare_subscriber(expression, on_token, history=True)
 
         self._declare(declare)
-        if awaited:
-            complete.wait(_TOKEN_HISTORY_TIMEOUT_S)
+        if awaited and not complete.wait(_TOKEN_HISTORY_TIMEOUT_S):
+            self._asked_over = ""
         with self._lock:
             self._alive[expression] = alive
 

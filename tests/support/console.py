@@ -4,8 +4,6 @@ import contextlib
 import os
 import re
 import shutil
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +17,7 @@ from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.ports import free_port
 from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
+from tests.support.stall_proxy import StallProxy
 
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 CARS = {"red": "arduino+arm", "blue": "stm32", "green": "raspberry_pi"}
@@ -49,53 +48,6 @@ def hold_until_driving(page: Page, judge: Judge) -> None:
 
 LEADS_ONLY = "Only a lead may (teacher)."
 """The one sample of the words for who is no lead, where teacher is the lead."""
-
-
-class StallProxy:
-    """A TCP proxy to a port of loopback. While cut, it passes nothing and closes nothing, as lost Wi-Fi does."""
-
-    def __init__(self, port: int) -> None:
-        self._target = ("127.0.0.1", port)
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
-        self._whole = threading.Event()
-        self._whole.set()
-        self._sockets: list[socket.socket] = []
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def cut(self) -> int:
-        """Pass nothing from now on. Return the time, ns since the epoch."""
-        self._whole.clear()
-        return time.time_ns()
-
-    def mend(self) -> None:
-        """Deliver all buffered bytes in a burst."""
-        self._whole.set()
-
-    def close(self) -> None:
-        """Close the proxy."""
-        self._whole.set()
-        for each in (self._listener, *self._sockets):
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-            each.close()
-
-    def _serve(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                far = socket.create_connection(self._target)
-                self._sockets += [near, far]
-                for pair in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass, args=pair, daemon=True).start()
-
-    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(65536):
-                self._whole.wait()
-                sink.sendall(data)
-        with contextlib.suppress(OSError):
-            sink.shutdown(socket.SHUT_WR)
 
 
 class ConsoleProcess:
