@@ -1,6 +1,5 @@
 """The directory of persisted state: e-stops, holds, runs with their logs, the state of coordinators."""
 
-import hashlib
 import os
 import re
 import sys
@@ -46,4 +45,6 @@ def directory_of(endpoint: str, directory: Path | None = None) -> Path:
         return directory
     # The hash distinguishes endpoints with the same readable part, such as [::1] and a host named 1.
     readable = _NO_NAME.sub("-", endpoint)[:_NAME_LENGTH]
+    import hashlib  # 3 ms, which a gateway's token would wait for
+
     return directory / "buses" / f"{readable}-{hashlib.sha256(endpoint.encode()).hexdigest()[:_HASH_LENGTH]}"

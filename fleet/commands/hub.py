@@ -24,7 +24,8 @@ from fleet.hub.hub_store import HubStore, KnownIdentity
 from fleet.hub.invitation import JOIN_PORT, Invitation, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import LOOPBACK, Bus, BusError, Credentials, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus import LOOPBACK, Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus.credentials import Credentials
 from schemas.bus.hub_links import LINKS_FILE
 from schemas.identity import IdentityRole, Service
 from schemas.printable import printable

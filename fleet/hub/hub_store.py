@@ -19,8 +19,18 @@ from fleet.hub.access_rules import access_control
 from fleet.hub.certificate_authority import BadRequestForCertificate, KeyPair
 from fleet.hub.x509_parts import LIFETIME
 from schemas.atomic_file import write_atomically
-from schemas.bus import BusError, Credentials, NoCredentials
-from schemas.bus.credentials import ACCESS_CONTROL, CA_FILE, HUB, HUB_FILE, LISTEN, ME_FILE, OF_SITES
+from schemas.bus import BusError
+from schemas.bus.credentials import (
+    ACCESS_CONTROL,
+    CA_FILE,
+    HUB,
+    HUB_FILE,
+    LISTEN,
+    ME_FILE,
+    OF_SITES,
+    Credentials,
+    NoCredentials,
+)
 from schemas.identity import parse
 from schemas.process.file_lock import FileLock
 

@@ -14,8 +14,8 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
-from schemas.bus import LOOPBACK, Credentials, is_secure
-from schemas.bus.credentials import CA_FILE, HUB, ME_FILE
+from schemas.bus import LOOPBACK, is_secure
+from schemas.bus.credentials import CA_FILE, HUB, ME_FILE, Credentials
 from schemas.identity import IdentityRole, Service, role_of
 from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, directory_of, joined_endpoint

@@ -6,7 +6,6 @@ threads to a loop.
 `hub_keeper` restarts a lost hub, `singleton` makes sure that there is only one service of a kind.
 """
 
-from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.bus.declared import Declared, SampleChannel
 from schemas.bus.endpoint import (
     ENDPOINT_VARIABLE,
@@ -52,14 +51,12 @@ __all__ = [
     "BadEndpoint",
     "Bus",
     "BusError",
-    "Credentials",
     "Declared",
     "Failure",
     "Handover",
     "HubKeeper",
     "HubUnreachable",
     "Latest",
-    "NoCredentials",
     "NoFleet",
     "Publisher",
     "Sample",

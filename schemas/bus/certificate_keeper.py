@@ -35,7 +35,7 @@ class CertificateKeeper(threading.Thread):
         credentials: Credentials,
         identity: str,
         *,
-        ask: Callable[[bytes], bytes],
+        ask: Callable[[bytes, float], bytes],
         reopen: Callable[[], object],
         closing: threading.Event,
         clock: Callable[[], datetime] = lambda: datetime.now(UTC),
@@ -79,7 +79,8 @@ class CertificateKeeper(threading.Thread):
 
     def _renew(self, now: datetime) -> str:
         """Fetch and store the next certificate. Return why that failed, or an empty text if it is stored."""
-        return renew_file(self._credentials, self._identity, self._identity, now, lambda _, request: self._ask(request))
+        me = self._identity
+        return renew_file(self._credentials, me, me, now, lambda _, asked: self._ask(asked, RENEWAL_QUERY_TIMEOUT_S))
 
     def _warn(self, found: CertificateDates, now: datetime, why: str) -> None:
         if not self._has_warned and found.ends - now < (found.ends - found.begins) * WARNED_SHARE:

@@ -16,8 +16,8 @@ from typing import Final
 import zenoh
 
 from schemas import keys
-from schemas.bus import DEFAULT_ENDPOINT, BusError, Credentials, check_listening, is_secure, router_config
-from schemas.bus.credentials import HUB, HUB_FILE, OF_SITES
+from schemas.bus import DEFAULT_ENDPOINT, BusError, check_listening, is_secure, router_config
+from schemas.bus.credentials import HUB, HUB_FILE, OF_SITES, Credentials
 from schemas.bus.hub_links import HubLinks, links_of
 from schemas.bus.hub_renewals import HubRenewals
 from schemas.identity import IdentityRole

@@ -14,10 +14,16 @@ from typing import Any, Final, Self
 
 import zenoh
 
-from schemas.bus.certificate_keeper import RENEWAL_QUERY_TIMEOUT_S, CertificateKeeper
-from schemas.bus.credentials import Credentials
 from schemas.bus.declared import Declare, Declared, SampleChannel
-from schemas.bus.endpoint import accepts, client_config, ensure_hub, is_loopback, is_secure, resolve_endpoint
+from schemas.bus.endpoint import (
+    accepts,
+    client_config,
+    credentials_of,
+    ensure_hub,
+    is_loopback,
+    is_secure,
+    resolve_endpoint,
+)
 from schemas.bus.errors import BusError, HubUnreachable, NoFleet
 from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
@@ -84,7 +90,7 @@ class Bus:
         self.boot_id = os.urandom(16).hex()
         self._pid = os.getpid()
         self._closing = threading.Event()
-        self._keeper: CertificateKeeper | None = None
+        self._keeper: threading.Thread | None = None
         atexit.register(self._close_at_exit)
 
     @classmethod
@@ -100,7 +106,7 @@ class Bus:
         """
         where = resolve_endpoint(endpoint)
         if is_secure(where):
-            identity = Credentials.of(where).identity(identity)
+            identity = credentials_of(where).identity(identity)
             # For a hub with TLS, the probe of `accepts` is a failed handshake, after which the hub accepts no link for
             # 0.1 s. So first try to connect without that probe.
             with signals.held_back(), suppress(zenoh.ZError):
@@ -125,7 +131,7 @@ class Bus:
             try:
                 session = zenoh.open(client_config(where, timeout_s, identity))
             except zenoh.ZError as error:
-                if identity and (why := Credentials.of(where).why_invalid(identity, datetime.now(UTC))):
+                if identity and (why := credentials_of(where).why_invalid(identity, datetime.now(UTC))):
                     raise BusError(why) from error
                 may_be = f", or refuses the certificate of {identity}" if identity else ""
                 raise BusError(
@@ -136,16 +142,18 @@ class Bus:
     def _with_keeper(self) -> Self:
         """Start to renew the certificate of this session, if it has one."""
         if self.identity:
-            own, me = Credentials.of(self.endpoint), self.identity
+            from schemas.bus.certificate_keeper import CertificateKeeper
+
+            own, me = credentials_of(self.endpoint), self.identity
             keeper = CertificateKeeper(own, me, ask=self._ask_hub, reopen=self.reopen, closing=self._closing)
             self._keeper = keeper
             keeper.start()
         return self
 
-    def _ask_hub(self, request: bytes) -> bytes:
+    def _ask_hub(self, request: bytes, timeout_s: float) -> bytes:
         """Return the hub's answer to a request for the next certificate. Empty if it does not answer, or refuses."""
         key = renewal_key(self.identity)
-        for answer in self.query(key, payload=request, timeout_s=RENEWAL_QUERY_TIMEOUT_S):
+        for answer in self.query(key, payload=request, timeout_s=timeout_s):
             if isinstance(answer, Sample):
                 return answer.payload
         return b""

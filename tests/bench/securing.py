@@ -16,7 +16,7 @@ import zenoh
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, join
 from schemas import keys
-from schemas.bus import Credentials
+from schemas.bus.credentials import Credentials
 from schemas.identity import car, person
 from tests.bench.commands import COMMANDS, GAP_S, TURNS
 from tests.bench.measured import Measured, Scale, in_turns

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.bus import Credentials
+from schemas.bus.credentials import Credentials
 from schemas.bus.hub_links import MAX_SITE_LINKS_BYTES, SITE_LINKS_S, HubLinks, parse_site_links
 
 TOLD = {"site": "north", "links": {"car.blue": ["10.0.0.7:4711"], "person.eve": []}}

@@ -13,7 +13,8 @@ import zenoh
 
 from fleet.hub.hub_store import HubStore
 from schemas import keys, messages
-from schemas.bus import Credentials, accepts, router_settings
+from schemas.bus import accepts, router_settings
+from schemas.bus.credentials import Credentials
 from schemas.commands import COMMANDS
 from schemas.identity import Service, service
 from schemas.state_dir import STATE_VARIABLE, directory_of

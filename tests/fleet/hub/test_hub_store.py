@@ -13,7 +13,7 @@ import pytest
 from fleet.hub import certificate_authority
 from fleet.hub.hub_store import BrokenHub, HubStore
 from fleet.hub.x509_parts import LIFETIME
-from schemas.bus import Credentials, NoCredentials
+from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.identity import car, person
 
 ENDPOINT = "tls/127.0.0.1:7447"

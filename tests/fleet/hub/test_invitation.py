@@ -13,7 +13,7 @@ import pytest
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
-from schemas.bus import Credentials
+from schemas.bus.credentials import Credentials
 from schemas.identity import car, person, site
 from schemas.state_dir import STATE_VARIABLE, directory_of
 from tests.support import in_process

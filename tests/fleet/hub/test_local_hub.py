@@ -7,7 +7,7 @@ import pytest
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Joined
 from fleet.hub.local_hub import SECURE_ENDPOINT, store_joined
-from schemas.bus import Credentials, NoCredentials
+from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.identity import Service, service
 from schemas.running_cars import RunningMark
 from schemas.state_dir import directory_of

@@ -15,8 +15,8 @@ from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, join
 from fleet.hub.local_hub import ensure_hub_here, store_joined
 from schemas import identity, keys
-from schemas.bus import Bus, BusError, Credentials, hub, hub_renewals
-from schemas.bus.credentials import HUB
+from schemas.bus import Bus, BusError, hub, hub_renewals
+from schemas.bus.credentials import HUB, Credentials
 from schemas.bus.hub import serve
 from tests.support import in_process
 from tests.support.ports import free_port
