@@ -20,7 +20,7 @@ GENERATED = ROOT / "schemas" / "gen"
 TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 """Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
 
-LAZY_IMPORTS = 142
+LAZY_IMPORTS = 143
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
 
 

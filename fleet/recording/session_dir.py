@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fnmatch import fnmatch
-from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
@@ -51,6 +50,8 @@ _VERSIONED_PACKAGES: Final = ("zenoh-car-fleet", "eclipse-zenoh", "mcap", "proto
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, our package and the packages that affect the format."""
+    from importlib.metadata import version  # a tenth of the start of `fleet list`, which writes no session
+
     return {"python": platform.python_version(), **{name: version(name) for name in _VERSIONED_PACKAGES}}
 
 
