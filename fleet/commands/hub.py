@@ -264,9 +264,9 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         addresses = own_addresses()
         own = (*addresses, *own_names())
         if name:
-            joined = join(name, parsed, port, addresses=own)
+            joined = join(name, parsed, port, addresses=own, own_authority=local_hub.is_authority_here)
         else:
-            name, joined = join_one_of(hubs_found(addresses or [LOOPBACK]), parsed, own)
+            name, joined = join_one_of(hubs_found(addresses or [LOOPBACK]), parsed, own, local_hub.is_authority_here)
         endpoint = local_hub.store_joined(name, joined, at, at_port)
         if joined.rules:
             click.echo(

@@ -186,8 +186,13 @@ def join(
     port: int = JOIN_PORT,
     clock: Callable[[], float] = time.time,
     addresses: Iterable[str] = (),
+    own_authority: Callable[[bytes], bool] = lambda _: False,
 ) -> Joined:
-    """Join the hub on another computer. Raises NotJoined. `addresses` are this computer's, in case it becomes a hub."""
+    """Join the hub on another computer. Raises NotJoined.
+
+    `addresses` are this computer's, in case it becomes a hub. own_authority: return True for the certificate of an
+    authority whose key this computer has, so that it sends no code to itself.
+    """
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     anyone.check_hostname, anyone.verify_mode = False, ssl.CERT_NONE  # the code shows whether it is the right hub
@@ -203,6 +208,11 @@ def join(
         raise NotThisHub(
             f"{where} is not the hub that made this code, or the code is mistyped. Nothing was sent. If the code is "
             "right, somebody in this network pretends to be the hub."
+        )
+    if own_authority(ca):
+        raise NotJoined(
+            "this computer is the hub that made this code, so it needs none: type the command on the other computer. "
+            "The code was not sent, and is still good"
         )
     known = ssl.create_default_context(cadata=ca.decode())
     key, request = certificate_authority.new_request("joins")
@@ -221,16 +231,21 @@ def join(
         raise NotJoined(f"{where} gave no certificate") from None
 
 
-def join_one_of(found: Iterable[str], code: JoinCode, addresses: Iterable[str] = ()) -> tuple[str, Joined]:
+def join_one_of(
+    found: Iterable[str],
+    code: JoinCode,
+    addresses: Iterable[str] = (),
+    own_authority: Callable[[bytes], bool] = lambda _: False,
+) -> tuple[str, Joined]:
     """Join the hub that made a code, and return its host, too. found: host:port of any hubs. Raises NotJoined.
 
-    Hubs that did not make the code do not learn it (see `join`).
+    Hubs that did not make the code do not learn it. The other arguments are as for `join`.
     """
     own, tried = list(addresses), 0
     for each in found:
         host, _, port = each.rpartition(":")
         with suppress(NotThisHub):
-            return host, join(host, code, int(port), addresses=own)
+            return host, join(host, code, int(port), addresses=own, own_authority=own_authority)
         tried += 1
     others = f" {tried} other{'s' * (tried != 1)} did not make this code." if tried else ""
     raise NotJoined(

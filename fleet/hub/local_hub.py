@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Final
 
 from fleet.hub.addresses import own_addresses, own_names
-from fleet.hub.hub_store import HubStore
+from fleet.hub.hub_store import CA_KEY_FILE, HubStore
 from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
 from schemas.bus import LOOPBACK, is_secure
-from schemas.bus.credentials import CA_FILE, HUB, ME_FILE, Credentials
+from schemas.bus.credentials import CA_FILE, DIRECTORY, HUB, ME_FILE, Credentials
 from schemas.identity import IdentityRole, Service, role_of
 from schemas.keys import is_name
 from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, directory_of, joined_endpoint
@@ -65,6 +65,12 @@ def everywhere(endpoint: str) -> str:
 def is_hub_here(endpoint: str) -> bool:
     """Return True if this computer is the hub with certificates at `endpoint`."""
     return is_secure(endpoint) and HubStore(Credentials.of(endpoint)).is_hub
+
+
+def is_authority_here(ca: bytes) -> bool:
+    """Return True if this computer has the key of the authority with this certificate, so that it is its hub."""
+    stores = directory_of(SECURE_ENDPOINT).parent.glob(f"*/{DIRECTORY}/{CA_FILE}")
+    return any(each.read_bytes() == ca for each in stores if (each.parent / CA_KEY_FILE).is_file())
 
 
 def use(endpoint: str) -> None:

@@ -89,6 +89,24 @@ def test_join_spends_no_code_if_disk_is_full(
     assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1:{port}", ""], ids=["named", "found"])
+def test_join_on_the_hubs_own_computer_spends_no_code(
+    host: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    own = made(directory_of("tls/127.0.0.1:7447") / "tls")
+    opened = Invitation(own, person("mia"), hub_port=7447, address="127.0.0.1", port=free_port(), fleet_file="cars: {}")
+    monkeypatch.setattr("fleet.commands.hub.hubs_found", lambda addresses: [f"127.0.0.1:{opened.port}"])
+    try:
+        words = [host.format(port=opened.port)] if host else []
+        done = in_process.fleet("join", *words, opened.code, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "still good" in done.stderr
+        assert join("127.0.0.1", opened.code, opened.port).identity == person("mia")
+    finally:
+        opened.close()
+
+
 def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> None:
     joined = join("127.0.0.1", invitation.code, invitation.port)
     assert (joined.identity, joined.port, joined.fleet_file) == (person("mia"), 7447, "cars: {}")
