@@ -28,7 +28,7 @@ def _time_decides(patch: Patch) -> None:
 
 def _no_second_try(patch: Patch) -> None:
     patch(StopExecutor, "_try_again", lambda self, running, now: setattr(running, "last_at", now))
-    patch(StopExecutor, "_may_probe", lambda self, running: False)
+    patch(StopCase, "probes", lambda self, facts: False)
 
 
 def _one_pause(patch: Patch) -> None:
@@ -40,7 +40,7 @@ def _pauses_of_any_length(patch: Patch) -> None:
 
 
 def _damaged_frames_count(patch: Patch) -> None:
-    patch(evidence, "SETTLED_S", -1.0)
+    patch(evidence, "SETTLED_S", 0.001)
     patch(StopEvidence, "on_noise", lambda self, at, damaged=True: None)
 
 

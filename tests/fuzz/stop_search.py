@@ -18,6 +18,7 @@ from typing import Any
 from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Signal, Stop
 from gateway.control.control_output import CommandRecord
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
+from gateway.drivers.yahboom.estimate.mode import MAX_FADE_EXCUSE_S
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.stops.stop_in_progress import EVIDENCE_INTERVALS, evidence_s
@@ -47,6 +48,8 @@ READY_S = 25.0
 another time than the vendor's, it takes longer to learn what they can show."""
 KEPT_SHARE = 0.25
 """Share of the episodes in which the gateway knows the car from before."""
+STREAM_SHARE = 0.12
+"""Share of the episodes in which somebody sends one action after the other from the stop on."""
 EARLY_S = 3.0
 """Time before the request of a mode in which the link may already fail."""
 
@@ -139,6 +142,8 @@ class EpisodePlan:
     """Additional rest before the load. A mode then opens at any moment between two reports, not only after one."""
     kept: bool = False
     """True if the gateway knows the car from an earlier session with an echo."""
+    stream_s: float = 0.0
+    """Interval of actions on parts of the car, such as colors, from the stop on. 0 for none."""
 
 
 @dataclass(slots=True)
@@ -163,6 +168,9 @@ def draw(seed: int) -> EpisodePlan:
     moments = random.Random(f"episode {seed}")
     plan = _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
     plan = replace(plan, kept=random.Random(f"kept {seed}").random() < KEPT_SHARE)
+    stream = random.Random(f"stream {seed}")
+    if stream.random() < STREAM_SHARE:
+        plan = replace(plan, stream_s=stream.uniform(0.08, 1.2))
     if seed // 2 % 2 == seed // 2 // len(THEMES) % 2:
         return plan
     car = draw_car(random.Random(f"car {seed}"), modes=plan.load in _MODE_WORDS)
@@ -502,6 +510,7 @@ class Episode:
         self._down, self._up = SearchedDirection(down, moments), SearchedDirection(up, moments)
         self.whole_s = max((fault.end_s for fault in plan.faults), default=0.0)
         self._next_tick = 0.0
+        self._next_action = float("inf")
         self._linked = False
         self._number = 0
         self._ends: dict[str, list[str]] = {}
@@ -539,6 +548,8 @@ class Episode:
         self._load()
         self._run_to(self.zero)
         self._end()
+        if plan.stream_s:
+            self._next_action = self.now + plan.stream_s
         if plan.again_s:
             self._run(plan.again_s)
             self._ask(Stop(), stop=True)
@@ -572,10 +583,7 @@ class Episode:
                     self._run(0.05 + 0.2 * moments.random())
             case "acts":
                 self._ask(Drive(Motion.FORWARD, 10.0))
-                acts: list[Action] = [Signal(Verb.WHISTLE)]
-                if plan.platform == "arduino" and plan.told != "unknown":
-                    acts += [AimServo(moments.randrange(181)), Led(255, 2, 3)]
-                for what in acts:
+                for what in self._actions:
                     self._ask(what)
             case mode:
                 if plan.driven:
@@ -682,7 +690,7 @@ class Episode:
     def _turn(self, end: float) -> None:
         """Advance to the next event."""
         zero = self.zero if self.zero < float("inf") else 0.0
-        wake = min(end, self.car.next_event(), self._up.next_at + zero, self._down.next_at + zero)
+        wake = min(end, self.car.next_event(), self._up.next_at + zero, self._down.next_at + zero, self._next_action)
         if self._linked:
             deadline = self.decoder.deadline()
             wake = min(
@@ -700,7 +708,18 @@ class Episode:
                 self._next_tick = self.now + TICK_S
                 self.control.tick(self.now)
             self._pump()
+        if self.now >= self._next_action:
+            self._next_action = self.now + self.plan.stream_s
+            self._ask(self._moments.choice(self._actions))
         self._judge()
+
+    @property
+    def _actions(self) -> list[Action]:
+        """The actions on parts of the car that this platform has."""
+        acts: list[Action] = [Signal(Verb.WHISTLE)]
+        if self.plan.platform == "arduino" and self.plan.told != "unknown":
+            acts += [AimServo(self._moments.randrange(181)), Led(255, 2, 3)]
+        return acts
 
     def _carry(self, zero: float) -> None:
         now = self.now
@@ -861,7 +880,7 @@ class Episode:
             return
         if mode.verdict is Verdict.CONFIRMED and mode.inferred is None:
             self._violate("(3) confirmed, inferred unknown")
-        verdict_s = mode.manual_silence_s + VERDICT_S
+        verdict_s = mode.manual_silence_s + VERDICT_S + (MAX_FADE_EXCUSE_S if self.plan.stream_s else 0.0)
         if mode.verdict is Verdict.CONFIRMED and self.now - (mode.evidence_at or 0.0) > verdict_s:
             self._violate("(3) confirmed by old evidence")
         if mode.verdict is not Verdict.CONFIRMED or mode.asked is true or not self.car.alive:

@@ -93,6 +93,26 @@ FOUND = (
         ),
         traits=CarTraits(interval_s=1.493, spread_s=0.05243534881069913, last_frame_wins=True, text=True),
     ),
+    # The stop was lost, and a stream of colors, whistles and servos put off each repeat of it.
+    EpisodePlan(
+        64, "arduino", "arduino", "echo", "light_seeking", 2.1155810649302937, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_HOST, -0.13905653814536215, 1.709375),
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, 4.760316107996886),
+        ),
+        stream_s=1.0469932075369608,
+    ),
+    # The stop ended as sent by a late report. The blocks of the stream excused the silence that followed, for ever.
+    EpisodePlan(
+        54, "stm32", "arduino", "echo", "obstacle_avoidance", 0.3010419380200732, Ending.STOP,
+        (
+            LinkFault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2),
+            LinkFault(Kind.SLOW, Way.TO_HOST, -1.5, 28.5, delay_s=2.123971231010005),
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, 5.351133351191306),
+        ),
+        opening=True, early=True, stream_s=0.2,
+        traits=CarTraits(interval_s=1.0, spread_s=0.0, timer=True, close_s=0.0, last_frame_wins=True),
+    ),
 )  # fmt: skip
 
 

@@ -21,9 +21,13 @@ from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
-from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
+from gateway.drivers.yahboom.stops.stop_in_progress import FREE_ACTIONS, StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
+LISTEN_LIMITS: Final = 2.0
+"""Time without a report after which a stream of actions waits for one, in silences that would contradict the mode."""
+NOTICE_S: Final = 0.2
+"""Time within which a silence is noticed: some ticks."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Time before the end of a drive in which its motion is not repeated. A report of the car takes 43 ms, and if an stm32
 car sends one then, it loses the stop that follows the repeated motion."""
@@ -40,6 +44,9 @@ class Executor(Driver):
         """A mode command whose effect was not seen yet, and the time of its frame."""
         self._source: StopInProgress | HeldMotion | Pending | None = None
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
+        self._actions = 0
+        """Number of frames of actions on parts of the car since the report at `_actions_since_report`."""
+        self._actions_since_report = float("-inf")
 
     @property
     def model(self) -> CarModel:
@@ -79,7 +86,8 @@ class Executor(Driver):
     def accepts_commands(self, now: float) -> bool:
         """Return True if a command's frame may be written: no stop is in progress, or a new command may replace it.
 
-        Missing evidence of a stop delays no command. Only the stop's first frames do, until their worst case is over.
+        Missing evidence of a stop delays no single command. Only the stop's first frames do, until their worst case is
+        over. What delays a stream of actions: `_stop_goes_first`.
         """
         running = self.stops.running
         if running is None:
@@ -102,7 +110,9 @@ class Executor(Driver):
             stops.give_up(running, now)
             return None
         if running is not None:
-            stops.fail_late(running, now)
+            stops.settle(running, now)
+            if stops.running is running:
+                stops.fail_late(running, now)
             if stops.running is not running:
                 return None
             # A new command goes before the repeats of a stop, but never before its first frames. While the command
@@ -128,7 +138,7 @@ class Executor(Driver):
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
-        pending = queue.next_part(now)
+        pending = None if self._actions_wait(now) else queue.next_part(now)
         if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._is_new(pending):
             frame = model.believed.with_motion(pending.next_frame)
             return self._write(frame, FrameOrigin.COMMAND, pending, pending)
@@ -181,9 +191,53 @@ class Executor(Driver):
     def _has_new_command(self, now: float) -> bool:
         """Return True if a command waits that may go before the repeats of the running stop."""
         held, change = self.queue.held, self.queue.mode_change
-        waiting = [change, self.queue.next_part(now)]
+        waiting = [self._next_mode] if self._actions_wait(now) else [change, self.queue.next_part(now)]
         waiting += [held.pending] if held is not None and not held.pending.sent else []
         return any(pending is not None and self._is_new(pending) for pending in waiting)
+
+    def _actions_wait(self, now: float) -> bool:
+        """Return True if actions on parts of the car wait, because a stream of them is in the way of something else."""
+        return self._stop_goes_first(now) or self._renewal_goes_first(now) or self._is_listening(now)
+
+    def _renewal_goes_first(self, now: float) -> bool:
+        """Return True if a stream of actions has held up the renewal of a stop that the car has not shown."""
+        return self._renews and now >= self.stops.renewal.goes_first_at
+
+    @property
+    def _renews(self) -> bool:
+        """Return True if the car is at rest, and its stop is repeated because nothing has shown it."""
+        model = self.model
+        return model.at_rest and not model.trust.shown and self.stops.running is None
+
+    def _is_listening(self, now: float) -> bool:
+        """Return True if a stream of actions has blocked the car for so long that it must send a report first.
+
+        A block excuses a silence. So during an endless stream nobody would notice that a car drives that lost its stop.
+        """
+        mode = self.model.mode
+        limit_s = mode.silence_limit(fan=self.model.believed.fan_may_run)
+        if limit_s is None or self._actions_since(mode.heard_at) < FREE_ACTIONS:
+            return False
+        is_due = now - mode.heard_at > LISTEN_LIMITS * limit_s
+        return is_due and mode.unheard_s(now) <= limit_s + NOTICE_S
+
+    def _actions_since(self, heard_at: float) -> int:
+        """Return the number of frames of actions since the last report."""
+        return self._actions if heard_at == self._actions_since_report else 0
+
+    def _stop_goes_first(self, now: float) -> bool:
+        """Return True if a stream of actions on parts of the car waits for the running stop.
+
+        It waits for the repeats. Otherwise a color every 0.3 s would put off the repeats of a lost stop for ever, and
+        the car would drive on. It also waits for evidence, because each action changes the times of the reports that
+        would show the stop; if a mode waits behind the actions, only as long as the next report may complete it.
+        """
+        running = self.stops.running
+        if running is None or not running.has_stream:
+            return False
+        may_show = self.model.can_show and not (running.is_soft or running.repeats or running.overdue)
+        is_short = self.queue.mode_change is None or self.model.evidence.is_awaited
+        return now >= running.goes_first_at or (may_show and is_short)
 
     def _is_new(self, pending: Pending) -> bool:
         """Return True if a command may go before the rest of the running stop: it is newer, or waits for that stop."""
@@ -204,8 +258,8 @@ class Executor(Driver):
 
     def _renew_stop(self, now: float) -> OutgoingFrame | None:
         """Repeat the stop of a car at rest that has not shown it, because its frames may have been lost."""
-        model, renewal = self.model, self.stops.renewal
-        if now < renewal.due_at or not model.at_rest or model.trust.shown or self.stops.running is not None:
+        renewal = self.stops.renewal
+        if now < renewal.due_at or not self._renews:
             return None
         if renewal.is_full_stop:
             renewal.schedule(now)
@@ -258,6 +312,8 @@ class Executor(Driver):
             case Pending():
                 if self.stops.running is not None:
                     self.stops.running.on_other_written(now)
+                self._actions = self._actions_since(model.mode.heard_at) + 1
+                self._actions_since_report = model.mode.heard_at
                 self.queue.on_part_written(source, now)
             case None:
                 model.believed.repeat = False
@@ -384,6 +440,8 @@ class Executor(Driver):
         if running is not None:
             waits = self._has_new_command(now) and self.accepts_commands(now)
             times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
+            if waits and not self._actions_wait(now):
+                times.append(running.goes_first_at)
         times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))
 
@@ -395,19 +453,21 @@ class Executor(Driver):
         if running is not None and self.stops.shutting_down:
             return times
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
+        actions_wait = self._actions_wait(now)
         times.extend(
             max(each.due_at, model.pacing.act_at(each.next_frame), model.left_until, free_at)
-            for each in (queue.turns if self._next_mode is None else ())
+            for each in (queue.turns if self._next_mode is None and not actions_wait else ())
             if self._is_new(each)
         )
         if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
             times.append(max(model.ready_at, free_at))
-        if queue.mode_change is not None and self._is_new(queue.mode_change):
+        change = self._next_mode if actions_wait else queue.mode_change
+        if change is not None and self._is_new(change):
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
         if stopped and self._repeats(model.pacing.repeat_at):
             times.append(max(model.pacing.repeat_at, model.left_until))
-        if model.at_rest and not model.trust.shown and stopped and queue.mode_change is None:
+        if self._renews and queue.mode_change is None:
             times.append(max(self.stops.renewal.due_at, model.ready_at))
         return times

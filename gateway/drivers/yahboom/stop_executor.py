@@ -172,11 +172,13 @@ class StopExecutor:
 
     # ------------------------------------------------------------------ tries
 
-    def is_step_due(self, running: StopInProgress, now: float) -> bool:
-        """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
+    def settle(self, running: StopInProgress, now: float) -> None:
+        """End the stop if no reading has followed its last pause too early, which shows it."""
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
-            return False
+
+    def is_step_due(self, running: StopInProgress, now: float) -> bool:
+        """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
         if running.frames_sent:
             self._await(running, now)
             if self.running is not running or running.frames_sent:
@@ -242,6 +244,8 @@ class StopExecutor:
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence. Continue the stop."""
+        if self.model.evidence.settles_at is not None:
+            return  # the silence that shows the stop takes 2 s at most
         car = self.model.name
         is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
         if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
@@ -411,6 +415,8 @@ class StopExecutor:
         times = [pending.received_at + running.timeout_s for pending in running.commands]
         if not running.overdue:
             times.append(running.gives_up_at)
+        if (settles_at := self.model.evidence.settles_at) is not None:
+            times = [max(each, settles_at) for each in times]
         if self.shutting_down:
             times.append(self._shutdown_until)
         return times

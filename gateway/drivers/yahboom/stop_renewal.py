@@ -7,6 +7,7 @@ from gateway.drivers.yahboom.pacing import Gate
 from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops.sequences import STOP_FRAME
+from gateway.drivers.yahboom.stops.stop_in_progress import HELD_UP_S
 
 RENEWAL_INTERVALS_S: Final = (2.2, 4.0, 6.0)
 """Intervals between renewals. The last one repeats."""
@@ -23,6 +24,8 @@ class StopRenewal:
         self._model = model
         self._count = 0
         self._next_at = float("inf")
+        self._cleared_at = float("-inf")
+        """When the last renewal by `MODE00` was written."""
         self._general_stop_follows = False
         """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop must follow."""
 
@@ -55,6 +58,12 @@ class StopRenewal:
         return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
 
     @property
+    def goes_first_at(self) -> float:
+        """Return when the next frame of a renewal goes before a stream of actions; inf if never."""
+        follows_at = self._cleared_at + REPEAT_INTERVAL_S
+        return (follows_at if self._general_stop_follows else self._next_at) + HELD_UP_S
+
+    @property
     def is_full_stop(self) -> bool:
         """Return True if the whole stop must be sent again, because the car may still be in the mode."""
         return not self._general_stop_follows and self._model.rest_case.renews_whole and self.left_mode
@@ -65,6 +74,7 @@ class StopRenewal:
             self._general_stop_follows = False
             return STOP_FRAME
         self._general_stop_follows = self._clears
+        self._cleared_at = now
         self.schedule(now)
         return ModeClose() if self._general_stop_follows else STOP_FRAME
 

@@ -28,6 +28,9 @@ SILENCE_MARGIN_S: Final = 0.75
 """How much longer than the car's longest normal interval a silence must be to contradict mode 0."""
 CORRUPTED_MATCH_S: Final = 0.5
 """Period after a reading of another mode in which a single match may be a corrupted frame, so three are required."""
+MAX_FADE_EXCUSE_S: Final = 0.65
+"""Maximum time by which blocks of our frames prolong a confirmation: that of a servo. A stream of actions must not keep
+a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256
 """Maximum number of blocking frames that are remembered to excuse a silence, such as that of endless whistling."""
 
@@ -200,7 +203,7 @@ class ModeEstimator:
             return
         limit = self.manual_silence_s if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
         since_s = now - max(self.evidence_at or self._own_at, self._excused_at)
-        blocked_s = sum(block_s for at, block_s in self._blocks if at > now - since_s)
+        blocked_s = min(MAX_FADE_EXCUSE_S, sum(block_s for at, block_s in self._blocks if at > now - since_s))
         if self.inferred is None or since_s > limit + blocked_s + MODE_CLOSE_S:
             self._conclude(Verdict.ASSUMED, f"no reading as in mode {self.asked} for {since_s:.1f} s", now)
 

@@ -214,6 +214,11 @@ class StopEvidence:
         return min(latest_s + EARLY_S, self.profile.reopened_s + WIRE_S)
 
     @property
+    def is_awaited(self) -> bool:
+        """Return True if the next report, or the silence after the last one, decides about a `MODE00`."""
+        return self._pending is not None or self.settles_at is not None
+
+    @property
     def settling_s(self) -> float:
         """Return the time after the last pause within which a report follows if the link had held the one before."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S

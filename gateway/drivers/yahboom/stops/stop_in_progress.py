@@ -36,6 +36,10 @@ SLOWEST_S: Final = 3.0
 """Interval of the slowest car. It is used until the interval of this car is known."""
 REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
+FREE_ACTIONS: Final = 3
+"""Number of actions on parts of the car that are written at once during one stop. A stream of more waits for it."""
+HELD_UP_S: Final = REPEAT_INTERVAL_S
+"""Maximum time for which such a stream holds up the next frame of a stop that is being repeated."""
 IN_TIME_S: Final = 0.2
 """Minimum time between writing a frame and the end of a block, so that the frame arrives before the end on any link."""
 
@@ -123,6 +127,11 @@ class StopInProgress:
     first_at: float | None = None
     """When the first frame of the stop was written."""
     last_at: float = float("-inf")
+    """When its last frame was written."""
+    other_at: float = float("-inf")
+    """When the last frame of another command was written during the stop."""
+    actions: int = 0
+    """Number of frames of actions on parts of the car that were written during the stop."""
     closed_at: float = float("-inf")
     """When the newest `MODE00` was written."""
     tries: int = 1
@@ -173,7 +182,7 @@ class StopInProgress:
     def due_at(self, pacing: Pacing) -> float:
         """Return when the next step is due."""
         step = self.sequence.steps[self.index]
-        due = (self.try_at if self.index == 0 else self.last_at) + step.after_s
+        due = (self.try_at if self.index == 0 else max(self.last_at, self.other_at)) + step.after_s
         self.due = max(due, pacing.ready_at(step.gate), pacing.named_at(step.frame))
         return self.due
 
@@ -186,7 +195,26 @@ class StopInProgress:
     def next_try_at(self) -> float:
         """Return the time of the next try, if the car has not shown the stop before."""
         after = self.closed_at if self.closed_at > float("-inf") else self.last_at
-        return max(self.last_at + self.reported_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+        # The frame of another command may delay the report. But a stream of them must not delay the next try for ever.
+        last_at = max(self.last_at, min(self.other_at, self.last_at + HELD_UP_S))
+        return max(last_at + self.reported_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+
+    @property
+    def has_stream(self) -> bool:
+        """Return True if so many actions on parts of the car were written during the stop that the next ones wait."""
+        return self.actions >= FREE_ACTIONS
+
+    @property
+    def goes_first_at(self) -> float:
+        """Return when the next frame of the stop goes before a stream of actions; inf if there is no stream."""
+        if not self.has_stream:
+            return float("inf")
+        if self.frames_sent:
+            return self.next_try_at
+        if self.tries > 1 and self.index > 0:
+            return float("-inf")  # in a recovery, the car must read nothing else before the lone `MODE00`
+        began = self.try_at if self.index == 0 else self.last_at
+        return began + self.sequence.steps[self.index].after_s + HELD_UP_S
 
     @property
     def gives_up_at(self) -> float:
@@ -197,8 +225,8 @@ class StopInProgress:
     def gives_way_at(self) -> float:
         """Return when a new command may replace the repeats; inf if the first frames are not all written.
 
-        Missing evidence delays no command. The first frames delay it until the announced worst case is over, or until a
-        report shows that the car is in mode 0 and reads frames.
+        Missing evidence delays no single command. The first frames delay it until the announced worst case is over, or
+        until a report shows that the car is in mode 0 and reads frames.
         """
         if self.repeats:
             return self.began_at
@@ -236,7 +264,8 @@ class StopInProgress:
 
     def on_other_written(self, now: float) -> None:
         """Delay the rest of the stop, so that its frames keep their distance from the command that was sent now."""
-        self.last_at = now
+        self.other_at = now
+        self.actions += 1
         if self.index == 0 and self.tries > 1:  # a try that still waits for the end of a block
             self.try_at = max(self.try_at, now + FLIGHT_S)
 

@@ -10,14 +10,16 @@ from itertools import product
 
 import pytest
 
-from gateway.control.commands import Drive, Led, SetMode, Stop
+from gateway.control.commands import Action, AimServo, Drive, Led, SetMode, Signal, Stop
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
+from gateway.drivers.yahboom.stops.stop_in_progress import FREE_ACTIONS
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
+from schemas.commands import Verb
 from schemas.words import Basis, Mode, Motion, Phase, Platform
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
@@ -102,6 +104,45 @@ def test_recovery_of_car_that_wakes_for_one_millisecond() -> None:
     pair.run(20.0)
     assert pair.control.driver.model.motors == "off"
     assert pair.off_for_good_at() < pair.now
+
+
+@pytest.mark.parametrize("interval_s", [0.1, 0.3, 0.8])
+@pytest.mark.parametrize(
+    "act", [lambda at: Led(1, 2, 3), lambda at: AimServo(90 + int(7 * at) % 40), lambda at: Signal(Verb.WHISTLE)],
+    ids=["colors", "servo", "whistles"],
+)  # fmt: skip
+def test_stream_of_actions_puts_off_no_lost_stop(act: Callable[[float], Action], interval_s: float) -> None:
+    """A color every 0.3 s once put off the repeats of a lost stop for ever, and the car drove on."""
+    pair = Pair(world=World.room(), start_s=2.0).ready()
+    pair.run(4.0)
+    pair.ask(Drive(Motion.FORWARD, 60.0))
+    pair.run(1.0)
+    whole = pair.car.feed
+    pair.lose_frames()
+    pair.ask(Stop(), verb="stop", identity="stop")
+    asked_at = pair.now
+    pair.run(2.5)
+    pair.car.feed = whole  # type: ignore[method-assign]
+    while pair.now < asked_at + 30.0:
+        pair.ask(act(pair.now))
+        pair.run(interval_s)
+    assert pair.off_for_good_at() < asked_at + 8.0
+    ended = pair.last_of("stop")
+    assert ended is not None
+    assert (ended.phase, ended.basis) == (Phase.COMPLETE, Basis.SHOWN)
+
+
+def test_single_actions_wait_for_no_evidence() -> None:
+    pair = Pair(world=World.room(), start_s=2.0).ready()
+    pair.run(4.0)
+    pair.lose_frames()
+    pair.ask(Stop(), verb="stop")
+    pair.run(4.0)
+    for number in range(FREE_ACTIONS):
+        pair.ask(Led(1, 2, number), identity=f"led{number}")
+        pair.run(0.3)
+        assert Phase.SENT in pair.phases(f"led{number}")
+        pair.run(0.7)
 
 
 def test_a_recovery_keeps_the_color_that_is_set_during_it() -> None:
