@@ -108,7 +108,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sensor/grayscale",
         "fleet.v1.Grayscale",
-        "reflected light, raw ADC",
+        "reflected light, as the raw number of the sensor (ADC)",
         Qos.READING,
         1.0,
         _READING,
@@ -130,7 +130,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sensor/imu",
         "fleet.v1.Imu",
-        "gyroscope and accelerometer, raw",
+        "gyroscope and accelerometer, as raw numbers",
         Qos.READING,
         1.0,
         _READING,
@@ -228,7 +228,7 @@ CAR_TOPICS: Final = (
     Topic(
         "state/safety",
         "fleet.v1.Safety",
-        "e-stops, hold, lease, motors",
+        "e-stops, hold and lease in force, and whether the motors are off",
         Qos.STATE,
         1.0,
         _STATE,
@@ -239,7 +239,7 @@ CAR_TOPICS: Final = (
     Topic(
         "state/health",
         "fleet.v1.Health",
-        "the gateway's process",
+        "the gateway's process, and what it knows of its car",
         Qos.STATE,
         1.0,
         _STATE,
@@ -251,7 +251,7 @@ CAR_TOPICS: Final = (
     Topic(
         "event/command",
         "fleet.v1.CommandEvent",
-        "the life of a command",
+        "what became of a command: a record for each phase",
         Qos.STATE,
         units={"age_s": "s", "worst_case_s": "s", "took_s": "s"},
         entity="command",
@@ -260,7 +260,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sim/truth",
         "fleet.v1.Truth",
-        "simulated cars: the true state",
+        "the true state of a simulated car",
         Qos.READING,
         10.0,
         1.0,
@@ -296,7 +296,9 @@ SERVICE_TOPICS: Final = (
         {"bytes": "B", "free_bytes": "B"},
         entity="recorder",
     ),
-    Topic("@recorder/mark", "foxglove.Log", "what somebody marked in the recording", Qos.STATE, entity="recorder/mark"),
+    Topic(
+        "@recorder/mark", "foxglove.Log", "a mark that somebody set in the recording", Qos.STATE, entity="recorder/mark"
+    ),
     Topic(
         "@supervisor/status",
         "fleet.v1.Supervision",
@@ -310,7 +312,7 @@ SERVICE_TOPICS: Final = (
     Topic(
         "@sim/world",
         "fleet.v1.World",
-        "a simulated world with lamps, things or cars that meet: where everything is except the cars",
+        "where everything but the cars is in a simulated world, if it has lamps, things or cars that meet",
         Qos.READING,
         10.0,
         _STATE,

@@ -135,23 +135,34 @@ class LimitsEntry(Entry):
     """The limits of a car."""
 
     longest_drive_s: float = Field(
-        default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of a drive, seconds"
+        default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of one drive command, seconds"
     )
-    speed_max: float = Field(default=1.0, gt=0, le=1, description="1 is the car's top speed, 0.5 half of it")
-    battery_low_v: _Volts = Field(default=LOW_V, description="below this the battery is low, volts at rest")
-    battery_critical_v: _Volts = Field(default=CRITICAL_V, description="below this it is critical, volts at rest")
-    on_battery_low: BatteryAction = Field(default=BatteryAction.WARN, description="reaction to a low battery")
+    speed_max: float = Field(default=1.0, gt=0, le=1, description="highest speed, as a share of the car's top speed")
+    battery_low_v: _Volts = Field(
+        default=LOW_V,
+        description="the battery is low below this voltage with the motors off, volts; for three cells, half more",
+    )
+    battery_critical_v: _Volts = Field(
+        default=CRITICAL_V,
+        description="the battery is critical below this voltage with the motors off, volts; for three cells, half more",
+    )
+    on_battery_low: BatteryAction = Field(
+        default=BatteryAction.WARN,
+        description="reaction to a low battery. warn: log it; refuse: also refuse new drives and modes; stop: also "
+        "stop the car",
+    )
     on_battery_critical: BatteryAction = Field(
-        default=BatteryAction.REFUSE, description="reaction to a critical battery"
+        default=BatteryAction.REFUSE, description="reaction to a critical battery, likewise"
     )
 
 
 class CommonEntry(Entry):
-    """Fields of defaults, types and cars."""
+    """Fields that `defaults`, each type and each car can have."""
 
     # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
     platform: _Platform = Field(
-        default=AUTO, description="the car's program, with options (arduino+arm); auto: its gateway detects it"
+        default=AUTO,
+        description="the program that runs on the car, with options, such as arduino+arm; auto: the gateway detects it",
     )
     color: _Color = Field(
         default_factory=str,
@@ -159,18 +170,18 @@ class CommonEntry(Entry):
     )
     without: list[Capability] = Field(
         default_factory=list,
-        description="modes and parts that the plan does not use, because they are broken or absent",
+        description="modes and parts of the car that are broken or absent, so that the plan does not use them",
     )
-    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of the car")
+    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of speed, time and battery")
     roles: list[_Name] = Field(
-        default_factory=list, description="roles of the plan that the car may have; left out: any"
+        default_factory=list, description="the only roles of the plan that the car may have; left out: any"
     )
 
 
 class CarEntry(CommonEntry):
     """One car."""
 
-    type: str = Field(default_factory=str, description="one of the types above")
+    type: str = Field(default_factory=str, description="name of one of the `types`")
     link: _Link = Field(default_factory=str, description="address of the car; `fleet scan` shows links")
 
 
@@ -178,10 +189,12 @@ class PersonEntry(Entry):
     """The rights of a person. Everyone may watch, stop and emergency-stop every car."""
 
     rank: PersonRank = Field(
-        default=PersonRank.PERSON, description="lead: drives every car, outranks all others, pauses and lends"
+        default=PersonRank.PERSON,
+        description="lead: drives every car, outranks all others, and may pause the fleet and lend cars",
     )
     drives: list[_Driven] = Field(
-        default_factory=list, description='cars and groups that they may drive, `[red, "@a"]`; left out: all cars'
+        default_factory=list,
+        description='cars and groups that this person may drive, such as `[red, "@a"]`; left out: all cars',
     )
 
 
@@ -191,7 +204,7 @@ class RecordEntry(Entry):
     to: _Path = Field(default_factory=str, description="the directory of sessions, relative to this file")
     quota: _Size = Field(
         default_factory=str,
-        description="maximum size of all sessions there, such as 20GB; beyond it, the oldest are removed",
+        description="maximum size of all sessions in that directory, such as 20GB; beyond it, the oldest are removed",
     )
 
     @property
@@ -201,48 +214,66 @@ class RecordEntry(Entry):
 
 
 class PinEntry(Entry):
-    """A condition. Recordings of the time around it are the last that the quota removes."""
+    """A condition. The quota removes the recordings of the times around it last."""
 
-    when: str = Field(description="the condition, true for any car, as in plans: `mode.verdict == 'contradicted'`")
-    before: _PinTime = Field(default="30s", description="pinned time before the condition is true: 1s to 1h")
-    after: _PinTime = Field(default="30s", description="pinned time after the condition was true: 1s to 1h")
+    when: str = Field(
+        description="the condition, true for at least one car, as in plans: `mode.verdict == 'contradicted'`"
+    )
+    before: _PinTime = Field(
+        default="30s", description="how long before the condition became true the pin begins: 1s to 1h"
+    )
+    after: _PinTime = Field(
+        default="30s", description="how long after the condition was last true the pin ends: 1s to 1h"
+    )
 
 
 class ConsoleEntry(Entry):
     """The web page of `fleet up`."""
 
-    port: int = Field(default=0, ge=0, le=65535, description="port of the page; 0 or left out: 7480")
+    port: int = Field(default=0, ge=0, le=65535, description="port at which the page is served; 0: 7480")
 
 
 class FileEntry(Entry):
     """A fleet of cars, for `fleet up`."""
 
-    name: _Name = Field(default=keys.DEFAULT_FLEET, description="the first part of every key")
+    name: _Name = Field(
+        default=keys.DEFAULT_FLEET, description="name of the fleet, the first part of every key on the bus"
+    )
     endpoint: Annotated[str, AfterValidator(validate_endpoint)] = Field(
-        default_factory=str, description="the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or loopback"
+        default_factory=str,
+        description="address of the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or else a hub on this computer",
     )
     plan: _Path = Field(default_factory=str, description="the file with the plan: what the cars do together")
     record: bool | RecordEntry = Field(
-        default=True, description="false: `fleet up` does not record; or where it records, and how much is kept"
+        default=True,
+        description="true: `fleet up` records; false: it does not; or a Record, which says where, and how much is kept",
     )
     pin: list[PinEntry] = Field(
         default_factory=list,
         max_length=MAX_PIN_RULES,
-        description="times that the quota removes last, `[{when: range_m < 0.1}]`, besides stops and marks",
+        description="conditions, such as `[{when: range_m < 0.1}]`: the quota removes the time around them last, as it "
+        "does for stops and marks",
     )
     console: bool | ConsoleEntry = Field(
-        default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`"
+        default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`, which also sets its port"
     )
-    world: _Path = Field(default_factory=str, description="the file with the world of the simulated cars")
-    defaults: CommonEntry = Field(default_factory=CommonEntry, description="values for every car")
+    world: _Path = Field(default_factory=str, description="the world file: where simulated cars drive")
+    defaults: CommonEntry = Field(
+        default_factory=CommonEntry, description="values for every car that does not set them itself"
+    )
     types: dict[_Name, CommonEntry] = Field(
-        default_factory=dict, description="kinds of cars, which override the defaults"
+        default_factory=dict,
+        description="kinds of cars: values for every car with this `type`, which override the defaults",
     )
     groups: dict[_Name, list[_Name]] = Field(
-        default_factory=dict, description="groups of cars, `a: [red, blue]`, for commands: `fleet stop @a`"
+        default_factory=dict,
+        description="groups of cars, such as `a: [red, blue]`, which commands can name: `fleet stop @a`",
     )
     people: dict[_Name, PersonEntry] = Field(
         default_factory=dict,
-        description="who may drive, `group_a: {drives: [red]}`; left out: everyone. Others watch and stop.",
+        description="the people who may drive, such as `group_a: {drives: [red]}`; all others may only watch and stop. "
+        "Left out: everyone may drive",
     )
-    cars: dict[_CarName, CarEntry] = Field(description="at least one car, as `red: {link: /dev/ttyUSB0}`", min_length=1)
+    cars: dict[_CarName, CarEntry] = Field(
+        description="the cars, at least one, such as `red: {link: /dev/ttyUSB0}`", min_length=1
+    )

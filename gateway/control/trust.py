@@ -36,7 +36,7 @@ class TrustEvent(StrEnum):
     LINK_OPENED = "the link was opened"
     LINK_LOST = "the link was lost"
     STOP_BEGUN = "a stop began"
-    DOUBTED = "readings contradict the known state"
+    DOUBTED = "readings contradict what the gateway believed"
     STOP_SHOWN = "the car showed that it stopped"
     STOP_SENT = "the stop was sent to a car that cannot confirm it"
     NOT_SHOWN = "the car did not show its stop in time"

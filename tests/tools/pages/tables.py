@@ -87,16 +87,16 @@ def _field(field: FieldDescriptor) -> str:
 
 _STATES = {
     "manual, nothing unread": "driving or at rest",
-    "manual, a frame may be unread": "the same, just after another command",
-    "manual, in a block of ours": "a whistle or a servo is under way",
-    "in a mode that reads pins": "tracking, light seeking, following, infrared remote",
+    "manual, a frame may be unread": "driving or at rest, just after another command",
+    "manual, in a block of ours": "sounding the whistle or moving a servo",
+    "in a mode that reads pins": "in tracking, light seeking, following or infrared remote mode",
     "in color_led": "color LED mode",
-    "in obstacle_avoidance": "obstacle avoidance, in a pen at worst",
-    "opening": "a mode is being opened (the longest)",
-    "link just restored": "the link has just come back, after half of any frame",
-    "raspberry_pi": "a Raspberry Pi car (the longest)",
-    "stm32": "an stm32 car (the longest)",
-    "unknown": "a car whose platform is not known, in mode 0 (the longest)",
+    "in obstacle_avoidance": "in obstacle avoidance, at worst with obstacles all around",
+    "opening": "opening a mode (the slowest mode)",
+    "link just restored": "just connected again, after the link broke in the middle of a frame",
+    "raspberry_pi": "a Raspberry Pi car (its slowest state)",
+    "stm32": "an stm32 car (its slowest state)",
+    "unknown": "a car whose platform is not known, in mode 0 (its slowest state)",
 }
 """Name of each state of the distribution on the page. Of several rows with this beginning, the longest time counts."""
 

@@ -126,31 +126,31 @@ def _probes_in_mode_0(facts: StopFacts) -> bool:
 
 LEFT_SHAPE: Final = StopCase(
     "left_shape",
-    "full, out of a mode in which the car reported",
-    "a mode-0 report that begins after `MODE00` was obeyed and comes within its block and one interval, when "
-    "`MODE00` was the only frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in "
-    "mode 0",
+    "full stop, out of a mode in which the car sent readings",
+    "one report of mode 0 that the car began after it obeyed `MODE00`, and that comes within the block and one "
+    "interval. No other frame was sent since the mode was seen. A report that comes up to 0.2 s later counts as one "
+    "pause. In all other cases as in mode 0",
     "the stop goes on",
 )
 LEFT_SILENT: Final = StopCase(
     "left_silent",
-    "full, out of a silent mode",
-    "the same, after the silence of the opening, when the mode was opened from a rest that was shown; else as in "
-    "mode 0",
+    "full stop, out of a silent mode",
+    "the same report, if the car had shown that it was at rest before the mode was opened, and was silent from then "
+    "on. Otherwise as in mode 0",
     "the stop goes on",
 )
 MANUAL: Final = StopCase(
     "manual",
-    "full or recovery, in mode 0 with a sonar echo",
-    "two pauses, each around a `MODE00` and longer than this car's interval by just its block. Three, if one is "
-    "in doubt. No reading comes too early after the last, and no frame of ours follows its `MODE00`",
-    "the stop goes on, and a command may take its place",
+    "full stop or recovery, in mode 0 with a sonar echo",
+    "two pauses, each after a `MODE00` of its own; three if one of them is in doubt. After the last one, no reading "
+    "comes too early, and the gateway has sent no frame since its `MODE00`",
+    "the stop goes on, but a command may take its place",
     rule=_ends_in_mode_0,
     probes=_probes_in_mode_0,
 )
 NO_REACTION: Final = StopCase(
     "no_reaction",
-    "full or recovery, the reports of this car do not react to frames",
+    "full stop or recovery; the reports of this car do not react to frames",
     "",
     "`sent` after a report; a general stop every 6 s",
     "{car}'s reports do not react to frames: nothing shows that a stop arrived",
@@ -158,7 +158,7 @@ NO_REACTION: Final = StopCase(
 )
 NO_READINGS: Final = StopCase(
     "no_readings",
-    "any, a car that sends no readings",
+    "any stop; the car sends no readings",
     "",
     "`sent`; a general stop every 6 s",
     "{car} sends no readings: nothing shows that a stop arrived",
@@ -166,23 +166,23 @@ NO_READINGS: Final = StopCase(
 )
 NO_ECHO: Final = StopCase(
     "no_echo",
-    "full or recovery, in mode 0 without an echo",
+    "full stop or recovery, in mode 0 without a sonar echo",
     "",
-    "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
+    "`sent` after a report; then four more `MODE00` within 18 s, and a general stop every 6 s",
     "{car} has no sonar echo, so its readings cannot show a stop now",
     clears=True,
 )
 FAN: Final = StopCase(
     "fan",
-    "full or recovery, the fan runs (not Raspberry Pi)",
+    "full stop or recovery while the fan runs (not Raspberry Pi)",
     "",
-    "`sent`; the stop again every 6 s",
+    "`sent`; then the whole stop every 6 s",
     "{car} sends nothing while its fan runs",
     renews_whole=True,
 )
 SOFT: Final = StopCase(
     "soft",
-    "soft (a drive's end, or its sender lost)",
+    "soft stop: a drive has ended, or its sender has disappeared",
     "",
     "`sent`; a general stop every 6 s",
     "readings do not show the end of a drive; `fleet stop {car}` checks it",
@@ -191,14 +191,14 @@ SOFT: Final = StopCase(
 )
 ACTED: Final = StopCase(
     "acted",
-    "none: a light, servo, whistle or LED frame at a rest that was shown",
+    "no stop, but a light, servo, whistle or LED frame to a car that has shown that it is at rest",
     "",
     "`sent`; a general stop every 6 s",
     "{car} got another frame after its confirmed stop; a link that loses bytes can turn it into a motion",
 )
 RASPBERRY_PI: Final = StopCase(
     "raspberry_pi",
-    "any, Raspberry Pi",
+    "any stop of a Raspberry Pi car",
     "",
     "`sent` after a report; a general stop every 6 s",
     "a Raspberry Pi car never confirms a stop",
@@ -206,7 +206,7 @@ RASPBERRY_PI: Final = StopCase(
 )
 UNKNOWN_PLATFORM: Final = StopCase(
     "unknown_platform",
-    "any, platform unknown",
+    "any stop of a car whose platform is not known",
     "",
     "`sent` after a report; a general stop every 6 s",
     "the platform of {car} is not known, so it got general stops only, which stop it in mode 0",
@@ -214,9 +214,9 @@ UNKNOWN_PLATFORM: Final = StopCase(
 )
 WRONG_PLATFORM: Final = StopCase(
     "wrong_platform",
-    "full or recovery, readings contradict the platform",
+    "full stop or recovery; the readings contradict the platform",
     "as in mode 0",
-    "`sent` if it reports on in mode 0; then as without an echo",
+    "`sent` if the car continues to report in mode 0; then as without an echo",
     "the readings of {car} contradict its platform, and nothing in them shows the stop",
     rule=_ends_on_probes,
     probes=_probes_wrong,
@@ -225,9 +225,9 @@ WRONG_PLATFORM: Final = StopCase(
 )
 NOT_KNOWN: Final = StopCase(
     "not_known",
-    "full or recovery, it is not known yet whether the reports of this car react to frames",
+    "full stop or recovery; it is not known yet whether the reports of this car react to frames",
     "as in mode 0",
-    "the stop goes on until it has taken too long; then `sent`, and a general stop every 6 s",
+    "the stop goes on until its time is over; then `sent`, and a general stop every 6 s",
     "it is not known yet whether {car}'s reports show that a stop arrived",
 )
 
