@@ -60,26 +60,26 @@ class ThingEntry(Entry):
     # `world_check` reports fields that are missing or not allowed.
     x_m: _Place = Field(
         default=0.0,
-        description="where it stands, meters: required without path and carried_by; if carried, ahead of the car's "
-        "middle",
+        description="where it stands, meters, required unless it has a path or is carried; if carried, how far ahead "
+        "of the car's middle",
     )
     y_m: _Place = Field(
         default=0.0,
-        description="where it stands, meters: required without path and carried_by; if carried, to the left of the "
-        "car's middle",
+        description="where it stands, meters, required unless it has a path or is carried; if carried, how far to the "
+        "left of the car's middle",
     )
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
-    radius_m: _Size = Field(default_factory=float, description="a disc with this radius, meters")
-    width_m: _Size = Field(default_factory=float, description="a box with this width, meters, instead of a disc")
-    depth_m: _Size = Field(default_factory=float, description="a box with this depth, meters")
+    radius_m: _Size = Field(default_factory=float, description="radius of a disc, meters")
+    width_m: _Size = Field(default_factory=float, description="width of a box, meters, instead of `radius_m`")
+    depth_m: _Size = Field(default_factory=float, description="depth of a box, meters, with `width_m`")
     path: list[_Point] = Field(
         default_factory=list,
         min_length=2,
         max_length=_MAX_ITEMS,
         description="the points [x, y] of its path; after the last one it moves straight back to the first",
     )
-    there_and_back: bool = Field(default=False, description="true: it turns round at the end of the path")
-    speed_m_s: float = Field(default=0.0, ge=0, le=0.5, description="its speed along the path")
+    there_and_back: bool = Field(default=False, description="true: at the end of its path it goes back the same way")
+    speed_m_s: float = Field(default=0.0, ge=0, le=0.5, description="its speed along the path, m/s")
     waits_for_m: float = Field(
         default_factory=float, ge=0, le=100, description="it moves only while a car is within this distance, meters"
     )
@@ -91,41 +91,52 @@ class LampEntry(Entry):
 
     x_m: _Place = Field(
         default=0.0,
-        description="where it stands, meters: required without carried_by; if carried, ahead of its carrier's middle",
+        description="where it stands, meters, required unless it is carried; if carried, how far ahead of its "
+        "carrier's middle",
     )
     y_m: _Place = Field(
         default=0.0,
-        description="where it stands, meters: required without carried_by; if carried, left of its carrier's middle",
+        description="where it stands, meters, required unless it is carried; if carried, how far to the left of its "
+        "carrier's middle",
     )
-    reach_m: float = Field(default=1.5, gt=0, le=100, description="how far away it is seen with brightness 1, meters")
-    brightness: float = Field(default=1.0, ge=0, le=100, description="with 4, it is seen from twice as far as with 1")
-    on: bool = Field(default=True, description="whether it is lit")
+    reach_m: float = Field(
+        default=1.5, gt=0, le=100, description="distance from which it is seen with brightness 1, meters"
+    )
+    brightness: float = Field(
+        default=1.0, ge=0, le=100, description="how bright it is: with 4, it is seen from twice as far as with 1"
+    )
+    on: bool = Field(default=True, description="true: it is lit")
     overhead: bool = Field(default=False, description="true: nothing blocks its light")
     carried_by: _Name = Field(default_factory=str, description="the thing or car that it moves with")
 
 
 class WorldEntry(Entry):
-    """Where simulated cars drive. Meters, m/s, and degrees counter-clockwise from x; the room's middle is (0, 0)."""
+    """Where simulated cars drive, in meters, m/s, and degrees counter-clockwise from x. The middle is (0, 0)."""
 
     room: RoomEntry = Field(
         default_factory=RoomEntry.model_construct, description="four walls around (0, 0); left out: no walls"
     )
     walls: list[_Wall] = Field(
-        default_factory=list, max_length=_MAX_ITEMS, description="single walls, each [x1, y1, x2, y2]"
+        default_factory=list,
+        max_length=_MAX_ITEMS,
+        description="single walls, each from one point to another: [x1, y1, x2, y2]",
     )
     boxes: list[BoxEntry] = Field(default_factory=list, max_length=_MAX_ITEMS, description="boxes that do not move")
     line: Annotated[list[_Point], Field(min_length=3, max_length=_MAX_ITEMS)] | LineEntry = Field(
-        default_factory=list, description="the line on the floor: a closed loop of points, or a round rectangle"
+        default_factory=list,
+        description="the line on the floor: the points of a closed loop, or a rectangle with round corners",
     )
-    cars_meet: bool = Field(default=True, description="cars see each other and are in each other's way")
+    cars_meet: bool = Field(default=True, description="true: cars see each other, and bump into each other")
     cars: dict[_Name, StartEntry] = Field(
         default_factory=dict,
         max_length=_MAX_ITEMS,
-        description="where each car begins; a car that is not named begins on the line",
+        description="where each car begins; a car that is not listed begins on the line",
     )
     lamps: dict[_Name, LampEntry] = Field(
         default_factory=dict, max_length=_MAX_ITEMS, description="lamps that light sensors see"
     )
     things: dict[_Name, ThingEntry] = Field(
-        default_factory=dict, max_length=_MAX_ITEMS, description="discs and boxes, which cars see, bump into and follow"
+        default_factory=dict,
+        max_length=_MAX_ITEMS,
+        description="discs and boxes that cars see, bump into and follow; they may move",
     )

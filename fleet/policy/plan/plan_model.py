@@ -38,14 +38,16 @@ class WithoutRole(StrEnum):
 
 
 class ConditionEntry(Entry):
-    """A condition, and the cars for which it must be true: exactly one of any_car, all_cars, car."""
+    """A condition, and the cars for which it must be true: exactly one of the fields any_car, all_cars and car."""
 
-    any_car: str | None = Field(None, description="an expression that must be true for at least one car: light.left")
+    any_car: str | None = Field(
+        None, description="an expression that must be true for at least one car, such as light.left"
+    )
     all_cars: str | None = Field(None, description="an expression that must be true for every car")
     car: _Name | None = Field(None, description="the car for which `is` must be true")
-    is_: str | None = Field(None, alias="is", description="an expression over the readings of `car`")
+    is_: str | None = Field(None, alias="is", description="with `car`: an expression that must be true for this car")
     with_role: _Name | None = Field(None, description="with any_car or all_cars: look only at cars that have this role")
-    for_s: _Seconds = Field(0.0, description="minimum time without a break, s")
+    for_s: _Seconds = Field(0.0, description="minimum time for which it must be true without a break, s")
 
 
 Condition = str | ConditionEntry
@@ -56,32 +58,33 @@ class BlinkEntry(Entry):
     """A blinking LED."""
 
     color: _Color = Field(description='the color while the LED is on: red, or "#ff0000" in quotes')
-    blink_s: float = Field(0.5, ge=0.5, le=60, description="time for which the LED is on, and then off, s")
+    blink_s: float = Field(0.5, ge=0.5, le=60, description="time for which the LED is on, and then off for as long, s")
 
 
 class EffectEntry(Entry):
     """An effect of a rule on some cars."""
 
     who: _Name | None = Field(
-        None, description="this_car (the car that made the rule true), other_cars, all_cars, a car or a role"
+        None,
+        description="the cars: this_car (for which the condition is true), other_cars, all_cars, or the name of a car "
+        "or role",
     )
     role: _Name | None = Field(None, description="the role that these cars get")
     mode: Mode | None = Field(None, description="the mode that these cars get, whatever their roles say")
     led: _Color | BlinkEntry | None = Field(
-        None, description='the color LED, set once: red, or "#ff0000"; it blinks with {color: red, blink_s: 0.5}'
+        None,
+        description='color of their color LEDs, set once: red, or "#ff0000"; or {color: red, blink_s: 0.5}, to blink',
     )
-    phase: _Name | None = Field(None, description="the phase that begins")
+    phase: _Name | None = Field(None, description="the phase that begins; it stands alone in an effect")
 
 
 class RuleEntry(Entry):
-    """Effects (`then`) that count while `when` is true.
+    """A rule: its effects (`then`) are in force while `when` is true. With `until`, they stay until that is true."""
 
-    With `until`: from the time at which `when` is true until `until` is.
-    """
-
-    name: str = Field("", max_length=60, description="name of the rule in explanations")
+    name: str = Field("", max_length=60, description="name of the rule, which `fleet why` shows")
     when: Condition = Field(
-        description="the condition: a text, which must be true for any car, or `{any_car: light.left, for_s: 1}`"
+        description="the condition: an expression, which must be true for at least one car, or such as "
+        "`{any_car: light.left, for_s: 1}`"
     )
     until: Condition | None = Field(None, description="the condition that ends the rule; left out: `when` ends it")
     then: EffectEntry | list[EffectEntry] = Field(
@@ -91,34 +94,36 @@ class RuleEntry(Entry):
 
 
 class FixedEntry(Entry):
-    """The only role, or the only mode, of a certain car."""
+    """The only role or the only mode that a certain car gets."""
 
     role: _Name | None = Field(None, description="a role of this plan")
-    mode: Mode | None = Field(None, description="a mode, without a role")
+    mode: Mode | None = Field(None, description="a mode, instead of a role")
 
 
 class RoleEntry(Entry):
-    """A mode for some cars."""
+    """A role: a mode for some cars."""
 
-    mode: Mode = Field(description=f"the mode of a car with this role, one of {', '.join(Mode)}")
+    mode: Mode = Field(description=f"the mode of the cars with this role, one of {', '.join(Mode)}")
     needs: str | None = Field(None, description="an expression that must be true for a car to get this role")
-    count: Annotated[int, Field(ge=1, le=1000)] | Literal["all"] = Field(1, description="how many cars, or all")
+    count: Annotated[int, Field(ge=1, le=1000)] | Literal["all"] = Field(
+        1, description="how many cars get this role; all: as many as there are"
+    )
     priority: int = Field(0, ge=-100, le=100, description="roles with a higher number are filled first")
     cars: list[_Name] | None = Field(
-        None, min_length=1, description="the only cars that may have this role, best first"
+        None, min_length=1, description="the only cars that may have this role, the preferred one first"
     )
-    capabilities: list[str] = Field(default=[], description="capabilities that a car must have")
+    capabilities: list[str] = Field(default=[], description="what a car must be able to do, such as arm")
     platforms: list[str] | None = Field(None, min_length=1, description="the only platforms that may have this role")
     if_none: _Name | None = Field(
-        None, description="the role that gets an additional place for each place of this role that no car can fill"
+        None, description="another role: for each car that is missing in this role, that role gets one car more"
     )
     given_by: GivenBy = Field(GivenBy.PLAN, description="plan: the best car gets the role; rules: only a rule gives it")
 
 
 class PhaseEntry(Entry):
-    """A part of the job. It lasts until a condition is true or its time is over."""
+    """A part of the plan. It lasts until a condition is true or its time is over."""
 
-    roles: list[_Name] | None = Field(None, description="the roles that count in this phase; left out: all")
+    roles: list[_Name] | None = Field(None, description="the roles that are given in this phase; left out: all")
     until: Condition | None = Field(None, description="the condition that ends the phase; then `next` begins")
     timeout_s: float | None = Field(
         None,
@@ -126,25 +131,27 @@ class PhaseEntry(Entry):
         le=86_400,
         description="maximum duration of the phase, counted from when its cars are in their modes, s",
     )
-    next: _Name | None = Field(None, description="the phase that follows")
+    next: _Name | None = Field(None, description="the phase that follows; required with `until`")
     on_timeout: _Name | None = Field(
         None, description="the phase that follows if timeout_s has passed; left out: `next`"
     )
 
 
 class PlanEntry(Entry):
-    """A plan: roles for cars, cars with a fixed role or mode, rules, phases (the first one begins)."""
+    """A plan: roles for cars, cars with a fixed role or mode, rules, and phases."""
 
-    roles: dict[_Name, RoleEntry] = Field(default={}, description="the roles for cars, by name")
+    roles: dict[_Name, RoleEntry] = Field(default={}, description="the roles that the plan gives to cars")
     fixed: dict[_Name, FixedEntry] = Field(
-        default={}, description="the only role, or the only mode, of a certain car: `blue: {mode: manual}`"
+        default={}, description="the only role or mode of certain cars, such as `blue: {mode: manual}`"
     )
     rules: list[RuleEntry] = Field(
         default=[],
         max_length=200,
-        description="changes while a condition is true; if several are about one car, the first counts",
+        description="changes while a condition is true; if several apply to one car, the first one counts",
     )
-    phases: dict[_Name, PhaseEntry] = Field(default={}, description="parts of the job, the first one begins")
+    phases: dict[_Name, PhaseEntry] = Field(
+        default={}, description="parts of the plan; the plan begins with the first one"
+    )
     without_role: WithoutRole = Field(
         WithoutRole.MANUAL,
         description="manual: a car without a role goes to mode manual; leave_alone: it stays as it is",

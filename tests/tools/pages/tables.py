@@ -231,8 +231,8 @@ def platform_table() -> str:
         ("silent modes", lambda each: each.silent_modes),
         ("lights", lambda each: each.lights),
         ("servo actions", lambda each: each.servos),
-        ("constant readings", lambda each: [name for name, _ in each.constants]),
-        ("not observed on a running car", lambda each: each.not_observed),
+        ("readings that are constants, so not published", lambda each: [name for name, _ in each.constants]),
+        ("not observed on a running program", lambda each: each.not_observed),
     ):
         cells = [", ".join(sorted(str(name) for name in names(each))).replace("_", " ") for each in profiles.values()]
         rows.append(f"| {title} | {' | '.join(cell or '-' for cell in cells)} |")
