@@ -312,7 +312,7 @@ SERVICE_TOPICS: Final = (
     Topic(
         "@sim/world",
         "fleet.v1.World",
-        "where everything but the cars is in a simulated world, if it has lamps, things or cars that meet",
+        "where everything but the cars is in a simulated world, unless the world is empty",
         Qos.READING,
         10.0,
         _STATE,
