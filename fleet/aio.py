@@ -214,7 +214,7 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
 
 
 class Lease:
-    """A lease, made by `Car.lease`. Use it with `async with`. If another sender has the car, that raises LeaseLost."""
+    """The lease of a car, from `Car.lease`. Use it with `async with`. Raises LeaseLost if another has the car."""
 
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet

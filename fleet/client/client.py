@@ -98,18 +98,19 @@ def certified_sender(identity: str, sender: str | None = None, person: str | Non
 
 
 class Fleet:
-    """One operator on the bus. Use it with `with`. Its methods may be called from several threads.
+    """A connection to one fleet: `with Fleet() as fleet`. Several threads may call its methods.
 
-    endpoint: `tcp/HOST:PORT` of the bus. The default is FLEET_ENDPOINT, else loopback port 7447.
-    `name` is the fleet's name. `person` is the person who drives, such as `group_a` (default: FLEET_AS, else the user's
-    login). `sender` is the name shown to others, person@host-pid by default.
-    kind: `script`, `person` (outranks scripts) or `coordinator`.
-    identity: the owner of the certificate to use, such as `service.coordinator` (default: the user). On a hub with
-    certificates, the person who drives is the owner of the certificate. Another `person` or `sender` raises
-    keys.BadKey.
+    `endpoint` is the address of the bus, `tcp/HOST:PORT`. The default is FLEET_ENDPOINT, else port 7447 on this
+    computer. `name` is the fleet's name. `person` is the person in whose name commands are sent, such as `group_a`
+    (default: FLEET_AS, else the user's login). `sender` is the full name of the sender, `person@host-pid` by default.
+    `kind` is the rank of the sender: `script`, `person` (outranks scripts) or `coordinator`. `start_hub`: start a hub
+    on this computer if none runs. `identity` is the owner of the certificate to use, such as `service.coordinator`
+    (default: the user). On a hub with certificates, the person is the owner of the certificate, and another `person` or
+    `sender` raises keys.BadKey.
 
-    While a Fleet is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars
-    that this client drives. A script that does not close its Fleet ends with a ResourceWarning.
+    While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
+    for example because the program has crashed, gateways stop the cars that this client drives. So close a Fleet that
+    you do not use with `with`. Otherwise the script ends with a ResourceWarning.
     Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
 
@@ -163,7 +164,7 @@ class Fleet:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus. Pending commands end with an unknown outcome, and every watch ends."""
+        """Leave the bus. Every watch ends. The outcome of a command that is still under way is unknown then."""
         self._closed = True
         for watch in list(self._watches):
             watch.close()
@@ -197,17 +198,20 @@ class Fleet:
         return canon(keys.expand(expression, self.name))
 
     def get(self, expression: str) -> list[Reading]:
-        """Return the latest value of every matching key, sorted by key. Accepts short forms as the command line does.
+        """Return the latest value of every matching key, sorted by key.
 
-        Raises keys.BadKey for a key that no topic has. A car that is not on the bus has no readings.
+        `expression` is a key or a key expression. Short forms work as on the command line, such as `red/sensor/range`,
+        `*/sensor/battery` or `red`. Raises keys.BadKey for a key that no topic has. A car that is not on the bus has no
+        readings.
         """
         return self._read(self.expression(expression), ANSWER_TIMEOUT_S)
 
     def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
-        """Return the last `last` values of every matching key, or those of the last `since_s` seconds, or both.
+        """Return the newest `last` values of every matching key, or those of the last `since_s` seconds.
 
-        They are sorted by key and time. A gateway stores 1500 values of each reading and the latest of each state.
-        `history_query.describe_shortfalls` says what is missing. Raises ValueError.
+        With both, return the newest `last` values of that time. They are sorted by key and time. A gateway stores 1500
+        values of each sensor, and only the latest value of each state. `fleet.client.history_query.describe_shortfalls`
+        says what is missing. Raises ValueError.
         """
         selector = history_query.selector(self.expression(expression), last=last, since_s=since_s)
         found: list[Reading] = []
@@ -237,9 +241,9 @@ class Fleet:
     def watch(self, expression: str, *, when: str | None = None) -> Watch:
         """Subscribe to readings: `for reading in fleet.watch("*/sensor/range")`.
 
-        `when` is a condition on the fields of one message, such as `range_m < 0.3`. Raises conditions.BadExpression.
-        Use it with `with` if you need it for a shorter time than the fleet. Otherwise it receives readings until the
-        fleet is closed.
+        With `when`, a condition on the fields of one message such as `range_m < 0.3`, it yields only messages for which
+        the condition is true. It receives readings until the fleet is closed. To end it earlier, use it with `with`.
+        Raises conditions.BadExpression.
         """
         written = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, written).holds
@@ -253,9 +257,9 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until `when` holds for a fresh reading and return that reading. The current reading counts, too.
+        """Wait until the condition `when` is true for a reading, and return that reading. The current one counts, too.
 
-        With `for_s`, the condition must have held for this time in all readings, measured by their stamps. Without
+        With `for_s`, the condition must have been true for this time in all readings, by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
         """
         written = self.expression(expression)
@@ -291,10 +295,11 @@ class Fleet:
     ) -> None:
         """Publish where a car is, as this program has measured it from outside the car: `sensor/pose` (REP-103).
 
-        Cars of one `frame` are on one map. heading_rad: counter-clockwise from the x axis, any number. at: the time of
-        the measurement (default: now), with its time zone. xy_std_m, heading_std_rad: standard deviations, if they are
-        known. Raises ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with
-        certificates, unless this client has the certificate of `service.locator`.
+        `frame` is the coordinate frame: cars with the same frame are on the same map. `heading_rad` is
+        counter-clockwise from the x axis, and may be any number. `at` is the time of the measurement, with its time
+        zone (default: now). `xy_std_m` and `heading_std_rad` are standard deviations, if they are known. Raises
+        ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with certificates,
+        unless this client has the certificate of `service.locator`.
         """
         self._check_open()
         message = pose_message(x_m, y_m, heading_rad, frame, xy_std_m, heading_std_rad)
@@ -313,7 +318,7 @@ class Fleet:
     # ------------------------------------------------------------------ commands
 
     def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Stop these cars, or one car (a str). Without an argument, stop every car with one query."""
+        """Stop these cars; a str is one car. Without an argument, stop every car with one query."""
         return self.ask(stop_request(), cars)
 
     def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
@@ -321,7 +326,7 @@ class Fleet:
         return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
-        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do so for every car.
+        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do this for every car.
 
         With `everything`, end the hold and every e-stop that this sender may end. If an e-stop or a hold remains, the
         outcome is not ok.
@@ -329,15 +334,15 @@ class Fleet:
         return self.ask(resume_request(ids, everything=everything), cars)
 
     def pause(self, why: str = "") -> list[Outcome]:
-        """Stop every car, and let only leads move cars until `unpause`. Without leads nobody moves a car."""
+        """Stop every car. Until `unpause`, only leads can move cars; if the fleet has no leads, nobody can."""
         return self.ask(pause_request(why))
 
     def unpause(self) -> list[Outcome]:
-        """End the pause of the fleet. No car starts to move by that."""
+        """End the pause of the fleet. This moves no car."""
         return self.ask(plain_request(Verb.UNPAUSE))
 
     def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
-        """Lend these cars to a person for `duration_s`: only that person and leads can drive them meanwhile."""
+        """Lend these cars to a person. For `duration_s`, only that person and leads can drive them."""
         return self.ask(lend_request(to, duration_s), cars)
 
     def end_loan(self, cars: Iterable[str]) -> list[Outcome]:
@@ -352,7 +357,7 @@ class Fleet:
         return self.outcomes(self.send(request, cars))
 
     def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
-        """Send a command and return at once. Pass the result to `outcomes`."""
+        """Send a command and return at once. To get its outcomes, pass the result to `outcomes`."""
         self._check_open()
         cars = [cars] if isinstance(cars, str) else cars  # a str is an iterable of letters
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
@@ -380,7 +385,7 @@ class Fleet:
         return command
 
     def outcomes(self, command: PendingCommand) -> list[Outcome]:
-        """Wait for the outcomes of a command that was sent, and return them."""
+        """Wait for the outcomes of a command that `send` has sent, and return them."""
         try:
             command.wait()
             for query in command.queries:
@@ -470,7 +475,7 @@ class Fleet:
 
 
 class Car(CarCommands[Outcome]):
-    """One car of a Fleet: `fleet.car("red").drive("forward", 2.0)`. Made by `Fleet.car`."""
+    """One car of a fleet, which `Fleet.car` returns: `fleet.car("red").drive("forward", 2.0)`."""
 
     def __init__(self, fleet: Fleet, name: str) -> None:
         super().__init__(name)
@@ -483,9 +488,9 @@ class Car(CarCommands[Outcome]):
     def lease(self, *, take: bool = False) -> "Lease[LeasedCar]":
         """Reserve the car for a block: `with fleet.car("red").lease() as car: car.drive("forward", 1.5)`.
 
-        At the end of the block, the car is stopped and released. Within the block, nobody of the same rank can drive
-        the car. A command that is not carried out raises NotCarriedOut. After another sender has taken or stopped the
-        car, every command raises LeaseLost. Entering the block raises both, too.
+        Within the block, nobody of the same rank can drive the car. At its end, the car is stopped and released. In the
+        block, a command that is not carried out raises NotCarriedOut. Once another sender has taken or stopped the car,
+        every command raises LeaseLost. Entering the block can raise both, too.
         With `take`, a person (`Fleet(kind="person")`) takes the car over from another person.
         """
         return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)

@@ -188,18 +188,18 @@ class CarCommands(ABC, Generic[R]):
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:
         """Drive `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
 
-        The duration is more than 0 s and at most 10, unless the gateway was started with a longer `--longest-drive`.
-        The gateway stops the car at the end. The call returns at the end of the drive. With `wait=False`, it returns
+        The duration is more than 0 s and at most 10 s, unless the gateway was started with a longer `--longest-drive`.
+        At the end of the drive, the gateway stops the car, and the call returns. With `wait=False`, the call returns
         when the motion was sent. A further drive replaces the running one without a stop in between.
         """
         return self.do(drive_request(motion, duration_s, wait=wait))
 
     def mode(self, mode: str) -> R:
-        """Set the mode, a word of `schemas.words.Mode`: `manual` to steer the car, or another such as `tracking`."""
+        """Put the car into a mode (`schemas.words.Mode`): `manual` to drive it, or another such as `tracking`."""
         return self.do(mode_request(mode))
 
     def led(self, r: int, g: int, b: int) -> R:
-        """Set the color LED, 0..255 each."""
+        """Set the color LED: red, green and blue, 0..255 each."""
         return self.do(led_request(r, g, b))
 
     def light(self, light: str) -> R:
@@ -207,9 +207,10 @@ class CarCommands(ABC, Generic[R]):
         return self.do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
-        """Move a servo: `front` and `horizontal` left, right or reset; `vertical` up, down or reset.
+        """Move a servo by one step, or to its middle (`reset`).
 
-        `deg` is the angle (0..180) of `front`, instead of an action.
+        `servo` is `front` or `horizontal`, with the actions left, right and reset; or `vertical`, with up, down and
+        reset. Instead of an action, `front` accepts an angle: `deg`, 0..180.
         """
         return self.do(servo_request(servo, action, deg))
 
@@ -218,34 +219,34 @@ class CarCommands(ABC, Generic[R]):
         return self.do(arm_request(joint_deg))
 
     def whistle(self) -> R:
-        """Sound once."""
+        """Sound the whistle once."""
         return self.do(plain_request(Verb.WHISTLE))
 
     def speed(self, step: str) -> R:
-        """Change the speed by one step `up` or `down`. The car does not accept an absolute speed."""
+        """Change the speed by one step, `up` or `down`. Cars accept no absolute speed."""
         return self.do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
-        """Toggle the fan. `on` and `off` work only while the gateway knows its state."""
+        """Toggle the fan, or turn it `on` or `off`. These two work only while the gateway knows its state."""
         return self.do(fan_request(state))
 
     def stop(self) -> R:
-        """Stop the car and hold it against the coordinator. Wait until the stop is complete."""
+        """Stop the car, and keep the coordinator from moving it. Wait until the stop is complete."""
         return self.do(stop_request())
 
     def estop(self, why: str = "") -> R:
-        """E-stop this car."""
+        """Emergency-stop the car: it refuses everything until `resume`."""
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
         """End the e-stops with these ids. Without ids, end the hold.
 
-        With `everything`, end all that the sender may end.
+        With `everything`, end the hold and every e-stop that this sender may end.
         """
         return self.do(resume_request(ids, everything=everything))
 
     def lend(self, to: str, duration_s: float) -> R:
-        """Lend the car to a person for `duration_s`: only that person and leads can drive it meanwhile."""
+        """Lend the car to a person. For `duration_s`, only that person and leads can drive it."""
         return self.do(lend_request(to, duration_s))
 
     def end_loan(self) -> R:
@@ -253,5 +254,5 @@ class CarCommands(ABC, Generic[R]):
         return self.do(end_loan_request())
 
     def find(self) -> R:
-        """Blink, and beep if the car can, without moving."""
+        """Let the car blink, and beep if it can, to see which one it is. It does not move."""
         return self.do(plain_request(Verb.FIND))

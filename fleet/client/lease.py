@@ -91,7 +91,7 @@ class LeasingFleet(Protocol):
 
 
 class Lease(Generic[C_co]):
-    """A lease, made by `Car.lease`. Use it with `with`: entering raises LeaseLost if another sender has the car."""
+    """The lease of a car, which `Car.lease` returns. Use it with `with`. Raises LeaseLost if another has the car."""
 
     def __init__(self, fleet: LeasingFleet, name: str, leased: "Callable[[Lease[C_co]], C_co]", *, take: bool) -> None:
         """`leased` makes the car that the block gets."""

@@ -48,15 +48,15 @@ class Outcome:
 
     car: str
     ok: bool
-    """True if the command was carried out: `sent`, or `complete` for commands that last."""
+    """True if the command was carried out: it was sent to the car, or completed if it lasts."""
     phase: str
     """The last phase (`sent, complete, superseded, expired, failed, rejected, queued`), or `no_answer`."""
     reason: str = ""
-    """The gateway's reason (`held, wrong_mode, link_down, ...`). Empty if there is none."""
+    """The gateway's reason if it was not carried out (`held, wrong_mode, link_down, ...`), else empty."""
     words: str = ""
     """Text for a person, never empty: what was done, or the cause and what to do."""
     worst_case_s: float | None = None
-    """Maximum time until the motors are off, as the gateway announced for a stop. None for other commands."""
+    """For a stop: the maximum time until the motors are off, as the gateway announced. None for other commands."""
     took_s: float = 0.0
     """Time from the request until the outcome was known."""
     basis: str = ""
@@ -67,17 +67,17 @@ class Outcome:
     effect: str = ""
     """The effect of the command in words: `LED color sent`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""
     next_step: str = ""
-    """How to end what the command began, such as the release of an e-stop. Empty if there is nothing to end."""
+    """How to end what the command began, such as an e-stop. Empty if there is nothing to end."""
 
     @property
     def code(self) -> str:
-        """The reason, or `no_answer` or `no_result`. Empty if the command was carried out."""
+        """Why it was not carried out: the reason, `no_answer` or `no_result`. Empty if it was carried out."""
         if self.ok or self.reason:
             return self.reason
         return self.phase if self.phase in (NO_ANSWER, *_FAILED_PHASES) else NO_RESULT
 
     def check(self) -> Self:
-        """Return the outcome itself. Raises NotCarriedOut if the command was not carried out."""
+        """Return this outcome. Raises NotCarriedOut if the command was not carried out."""
         if not self.ok:
             raise NotCarriedOut(self)
         return self

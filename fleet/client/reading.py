@@ -60,13 +60,14 @@ class Reading:
 
     @property
     def car(self) -> str:
-        """The car's name. Empty for messages of the whole fleet."""
+        """The car's name, or that of a service such as `@coordinator`. Empty for logs, which have no such field."""
         return getattr(self.value, "car", "")
 
     def __getitem__(self, field: str) -> Any:
-        """Return a field by name, such as `range_m` or `hold.by`. None if it was not measured or is not set.
+        """Return the value of a field, such as `range_m` or `hold.by`. None if it was not measured or is not set.
 
-        For a repeated field or a submessage, return whether it is set. Raises KeyError, which lists the fields.
+        For a list or a part of a message, such as `hold`, return whether it is there. Raises KeyError for another name;
+        the error lists the fields.
         """
         known = fields_of(type(self.value))
         if field not in known:
@@ -74,11 +75,11 @@ class Reading:
         return value_in(self.value)(field)
 
     def age_s(self, now: datetime | None = None) -> float:
-        """Return the age, s, by this machine's clock. At least 0, since clocks differ."""
+        """Return the age, s, by this machine's clock. If the clocks differ so that it would be negative, return 0."""
         return max(0.0, ((now or datetime.now(UTC)) - self.time).total_seconds())
 
     def stale(self, now: datetime | None = None) -> bool:
-        """Return True if it is older than `stale_after_s` of its topic, or if its stamp is far in the future."""
+        """Return True if the reading is too old for its topic, or if its stamp is far in the future."""
         topic = topics.of_key(self.key)
         if topic is None or topic.stale_after_s is None:
             return False
@@ -128,7 +129,10 @@ def reading_of(sample: Sample) -> Reading:
 
 
 class Watch:
-    """A stream of readings to iterate over. `close` (or `with`) ends it. A full queue drops the oldest samples."""
+    """A stream of readings to iterate over. `close` (or `with`) ends it.
+
+    If readings arrive faster than you take them, the oldest ones are dropped.
+    """
 
     def __init__(self, accept: ReadingFilter | None = None) -> None:
         self._accept = accept
@@ -162,7 +166,7 @@ class Watch:
         raise StopIteration
 
     def within(self, seconds: float) -> Reading | None:
-        """Return the next reading. None if none comes within this time."""
+        """Return the next reading, or None if none arrives within this time."""
         deadline = time.monotonic() + seconds
         while not self._closed.is_set():
             try:

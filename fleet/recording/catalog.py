@@ -55,17 +55,19 @@ _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_ta
 
 
 class BadQuery(ValueError):
-    """A question that has no meaning. The text is that of DuckDB, on one line."""
+    """A question that DuckDB does not understand. The text is DuckDB's, on one line."""
 
 
 class QueryFailed(RuntimeError):
-    """A question that failed because of memory, disk or files. The text is that of DuckDB, on one line."""
+    """A question that failed because of memory, disk or files. The text is DuckDB's, on one line."""
 
 
 class Catalog:
-    """All sessions of a directory. `damage` lists the parts that could not be read.
+    """The sessions of a directory, for SQL questions: `Catalog().query("SELECT min(range_m) FROM sensor_range")`.
 
-    Raises FormatMissing without DuckDB, and QueryFailed without a directory for temporary files.
+    Each topic is a view, such as `sensor_range`. `directory` is `./sessions` by default. `on_session` is called for
+    each session that is looked at. `damage` lists the parts that could not be read. Raises FormatMissing without
+    DuckDB, and QueryFailed without a directory for temporary files.
     """
 
     def __init__(
@@ -150,7 +152,7 @@ class Catalog:
                 self._views.add(view)
 
     def tables(self) -> dict[str, list[str]]:
-        """Return the columns of each view, by its name."""
+        """Return the names of all views, each with its columns."""
         self._define(None)
         found = self._database.execute(
             "SELECT table_name, column_name FROM information_schema.columns "
@@ -162,7 +164,7 @@ class Catalog:
         return columns
 
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> "pa.Table":
-        """Return the answer to a question as a pyarrow.Table. Raises BadQuery, QueryFailed."""
+        """Return the answer to a question in SQL as a pyarrow.Table. Raises BadQuery, QueryFailed."""
         attempts = MAX_QUERY_ATTEMPTS
         while True:
             try:
@@ -186,7 +188,10 @@ class Catalog:
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
     def left_out(self) -> dict[str, LeftOut]:
-        """Return by session the messages of the topics asked so far that are in no table: they cannot be decoded."""
+        """Return by session the messages that no view has, because they cannot be decoded.
+
+        Only topics for which a question has asked so far are counted.
+        """
         found: dict[str, LeftOut] = {}
         for cached in self.sessions:
             with suppress(OSError):  # deleted since the question
@@ -197,9 +202,9 @@ class Catalog:
         return found
 
     def nulled(self) -> dict[str, list[str]]:
-        """Return by session, in words, how many values are null because they had another type.
+        """Return by session how many values are null because they had another type, in words for each column.
 
-        Only columns of topics that were asked for so far are listed, each on its own line.
+        Only topics for which a question has asked so far are counted.
         """
         found: dict[str, list[str]] = {}
         for cast in self._casts:
@@ -210,7 +215,7 @@ class Catalog:
         return found
 
     def close(self) -> None:
-        """Free the memory."""
+        """Close the database, which frees its memory."""
         self._database.close()
 
     def _add_view(self, topic: Topic) -> None:

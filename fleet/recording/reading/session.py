@@ -82,9 +82,9 @@ class Recorded:
 class Session:
     """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
-    `path` is a session's directory, an .mcap file, the name of a session in `./sessions` (or in the directory that the
-    fleet file here names), or `latest` (`latest~1` is the one before). Raises NoSession. Reading never changes a
-    session. `damage_words` describes the damage that was found.
+    `path` is the directory of a session, an .mcap file, the name of a session, or `latest` (`latest~1` is the one
+    before). Names are looked up in `./sessions`, or where the fleet file in the current directory records. Raises
+    NoSession. Reading never changes a session. `damage_words` describes the damage that was found.
     """
 
     def __init__(self, path: str | PathLike[str] = LATEST) -> None:
@@ -260,13 +260,13 @@ class Session:
     ) -> Iterator[Recorded] | Iterator[Reading]:
         """Yield every intact message in the order of the file. `damage_words` then describes the damage.
 
-        keys: one or several topics (`sensor/range`, `sensor/*`), messages (`fleet.v1.Range`), keys or key expressions
-        (`red/sensor/range`, `fleet/red/**`). start_ns (included), end_ns (excluded): times of the recorder's clock, ns
-        since the epoch. With an index, only the chunks in question are read. So reading the last minute of a long
-        session takes no longer than reading a session of one minute.
-        decode: True to yield readings, as `Fleet.watch` does. Messages that cannot be decoded are counted in
-        `left_out`. False to yield payloads as they were on the bus.
-        Raises NoTable if `keys` is one name without wildcards that neither we nor this session have.
+        `keys` selects one or several topics (`sensor/range`, `sensor/*`), messages (`fleet.v1.Range`), keys or key
+        expressions (`red/sensor/range`, `fleet/red/**`). `start_ns` (included) and `end_ns` (excluded) are times of the
+        recorder's clock, ns since the epoch. If the files have an index, only the parts with these times are read. So
+        reading the last minute of a long session takes no longer than reading a session of one minute.
+        With `decode`, yield readings, as `Fleet.watch` does; messages that cannot be decoded are counted in `left_out`.
+        Without it, yield payloads as they were on the bus.
+        Raises NoTable if `keys` is one name without wildcards that is no known topic and not in this session.
         """
         selection = self.selection(keys, start_ns, end_ns)
         if isinstance(keys, str) and not is_known(keys) and self._lacks(selection):
@@ -293,22 +293,22 @@ class Session:
     def to_arrow(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pa.Table":
         """Return the messages of one type as a pyarrow.Table, one row for each message, in the order of publish_time.
 
-        of: a topic (`sensor/range`), a message (`fleet.v1.Range`), or a key expression that matches one type of message
-        (`red/sensor/range`). start_ns, end_ns: as for `messages`.
-        Columns: key, car, log_time (recorder's clock) and publish_time (publisher's clock) as timestamp[ns, UTC],
-        sequence, then the fields. A unit is in the column's name and in the field's metadata (`unit`). A value is null
-        if it was not measured. The request of a command has a column for each field (`request_motion`).
-        Messages of other types on these keys are left out. A warning counts them, and `stray_tables` has them. Times
-        beyond the year 2262 are null, with a warning.
-        Raises NoTable, and FormatMissing (an ImportError) without the extra `analysis`.
+        `of` is a topic (`sensor/range`), a message (`fleet.v1.Range`), or a key expression that matches one type of
+        message (`red/sensor/range`). `start_ns` and `end_ns` are as for `messages`.
+        The columns are key, car, log_time (recorder's clock), publish_time (publisher's clock), sequence, and then the
+        fields. The times have the type timestamp[ns, UTC]. The unit of a field is in the column's name and in the
+        field's metadata (`unit`). A value that was not measured is null. For commands, each field of the request has a
+        column (`request_motion`). Messages of another type under these keys are left out; a warning counts them, and
+        `stray_tables` has them. Times beyond the year 2262 are null, with a warning. Raises NoTable, and FormatMissing
+        (an ImportError) without the extra `analysis`.
         """
         return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
 
     def stray_tables(self, *, start_ns: int | None = None, end_ns: int | None = None) -> "dict[str, pa.Table]":
-        """Return the messages that are not of the type of their key, one pyarrow.Table for each type.
+        """Return the messages that have another type than their key should have, one pyarrow.Table for each type.
 
-        The names are `stray.fleet.v1.Range`, and `other` for messages that are not protobuf. start_ns, end_ns: as for
-        `messages`. Raises FormatMissing without the extra `analysis`.
+        The names are such as `stray.fleet.v1.Range`, and `other` for messages that are not protobuf. `start_ns` and
+        `end_ns` are as for `messages`. Raises FormatMissing without the extra `analysis`.
         """
         return stray_tables(self.rows(Selection(None, start_ns, end_ns)))
 
@@ -323,12 +323,11 @@ class Session:
         """Return the table of the first topic, with the latest values that the same car had published in the others.
 
         `session.joined("sensor/range", "state/mode")` adds the columns `mode.asked`, `mode.verdict`, ... to those of
-        the distances. They are null in rows for which no value is young enough. With `state/mode` there are two more
-        columns: `mode` is the commanded mode, `mode_seen` is the mode that the car's readings show. Both are null if
-        not known.
-        A warning says how long cars were in modes in which this reading does not exist: see `times_without`.
-        tolerance_s: maximum age of a value, s, by publish_time. The default is the time after which its topic is stale
-        (3 s for readings and states). Values of topics that are never stale have no limit. Raises the errors of
+        the distances. They are null in rows for which there is no value, or only one that is too old. `tolerance_s` is
+        the maximum age, s, by publish_time. The default is the time after which the topic is stale (3 s for readings
+        and states); topics that are never stale have no limit. With `state/mode` there are two more columns: `mode` is
+        the commanded mode, and `mode_seen` the mode that the car's readings show. They are null if not known. A warning
+        says how long cars were in modes in which this reading does not exist: see `times_without`. Raises the errors of
         `to_pandas`.
         """
         if tolerance_s is not None and not tolerance_s >= 0:
@@ -344,9 +343,9 @@ class Session:
     def times_without(self, of: str) -> "pd.DataFrame":
         """Return when cars were in modes in which a reading does not exist: car, mode, begin and end of each time.
 
-        of: as for `to_pandas`, about one sensor (`sensor/range`, `red/sensor/range`). For example, a car sends no
-        distance in obstacle avoidance. A plot that marks these times shows why there are no dots. The mode is the
-        commanded one, or the one that the car's readings show if they contradict it. Manual mode has all readings.
+        For example, a car sends no distances in obstacle avoidance. If a plot marks these times, it shows why there are
+        no points. `of` is as for `to_pandas`, but about one sensor (`sensor/range`, `red/sensor/range`). The mode is
+        the commanded one, or the one that the car's readings show if they contradict it. Manual mode has all readings.
         Raises NoTable for another name, and FormatMissing without the extra `analysis`.
         """
         if not sensor_of(of):

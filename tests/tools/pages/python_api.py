@@ -20,15 +20,16 @@ from schemas import bus, keys
 
 _HEAD = """# Python
 
-This page has every name of the Python client. Times are in seconds, distances in meters and angles in degrees, unless
-a name says otherwise. A value that was not measured is None.
+This page has every public name of the Python client. Times are in seconds, distances in meters and angles in degrees,
+unless a name says otherwise. A value that was not measured is None.
 
 ```python
 from fleet import Fleet, LeaseLost, NotCarriedOut, Session
 ```
 
-`from fleet.aio import Fleet` has the same names for asyncio, and each call is awaited.
-The guide "Drive from Python" has examples.
+`from fleet.aio import Fleet` has the same names for asyncio; there you await each call.
+[Drive from Python](../how-to/drive-from-python.md) has examples. The [glossary](glossary.md) explains words such as
+lease and hold.
 """
 _CLASSES: tuple[tuple[str, type], ...] = (
     ("Fleet", client.Fleet),
