@@ -28,8 +28,7 @@ from fleet import Fleet, LeaseLost, NotCarriedOut, Session
 ```
 
 `from fleet.aio import Fleet` has the same names for asyncio; there you await each call.
-[Drive from Python](../how-to/drive-from-python.md) has examples. The [glossary](glossary.md) explains words such as
-lease and hold.
+The guide "Drive from Python" has examples. The glossary explains words such as lease and hold.
 """
 _CLASSES: tuple[tuple[str, type], ...] = (
     ("Fleet", client.Fleet),
