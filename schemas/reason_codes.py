@@ -50,7 +50,7 @@ EVENTS: Final[dict[str, EventCode]] = {
     "platform_settled": EventCode(Level.INFO, "The readings show which program the car runs."),
     "platform_contradicted": EventCode(Level.WARNING, "The readings do not fit the platform in the fleet file."),
     "mode_contradicted": EventCode(Level.WARNING, "The readings do not fit the commanded mode."),
-    "not_obeyed": EventCode(Level.WARNING, "A car that has shown its stops before did not get a stop."),
+    "not_obeyed": EventCode(Level.WARNING, "A car that has shown its stops before did not react to one."),
     "hears": EventCode(Level.INFO, "The car reacts to stops again."),
     "cannot_show": EventCode(
         Level.INFO, "The car's reports do not react to frames, so nothing shows that a stop arrived."
