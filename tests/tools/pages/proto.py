@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas import topics
+from schemas.commands import COMMANDS
 from tests.tools.pages.command_line import cell, escape
 
 PROTO = Path(__file__).parents[3] / "schemas/proto/fleet_v1.proto"
@@ -44,6 +45,7 @@ def read() -> list[ProtoMessage]:
 def message_tables() -> str:
     """Return a section for each message with its own fields, type, unit and meaning."""
     by_message = {topic.message: topic for topic in topics.TOPICS.values()}
+    commands = {row.message: f"The command `{verb}`: {row.about}" for verb, row in COMMANDS.items()}
     parts = []
     for message in read():
         topic = by_message.get(f"fleet.v1.{message.name}")
@@ -51,7 +53,8 @@ def message_tables() -> str:
         left_out = COMMON_OF_COMMANDS if is_command else COMMON if topic else frozenset()
         fields = [each for each in message.fields if each[0] not in left_out]
         under = f"Under `{topic.name}`." if topic else ""
-        about = f"{message.about[:1].upper()}{message.about[1:].rstrip('.')}." if message.about else ""
+        words = message.about or commands.get(f"fleet.v1.{message.name}", "")
+        about = f"{words[:1].upper()}{words[1:].rstrip('.')}." if words else ""
         lines = [f"### {message.name}", " ".join(part for part in (under, escape(about)) if part)]
         if fields:
             rows = ["| field | type | unit | what |", "|---|---|---|---|"]
