@@ -152,7 +152,7 @@ class LimitsEntry(Entry):
         "stop the car",
     )
     on_battery_critical: BatteryAction = Field(
-        default=BatteryAction.REFUSE, description="reaction to a critical battery, likewise"
+        default=BatteryAction.REFUSE, description="reaction to a critical battery, with the same words"
     )
 
 

@@ -90,7 +90,7 @@ class RuleEntry(Entry):
     then: EffectEntry | list[EffectEntry] = Field(
         description="the effect: `{who: this_car, role: rest}`, or a list of effects"
     )
-    during: list[_Name] | None = Field(None, description="the phases in which the rule counts; left out: all")
+    during: list[_Name] | None = Field(None, description="the phases in which the rule is looked at; left out: all")
 
 
 class FixedEntry(Entry):
@@ -147,7 +147,7 @@ class PlanEntry(Entry):
     rules: list[RuleEntry] = Field(
         default=[],
         max_length=200,
-        description="changes while a condition is true; if several apply to one car, the first one counts",
+        description="changes while a condition is true; if several apply to one car, the first one is used",
     )
     phases: dict[_Name, PhaseEntry] = Field(
         default={}, description="parts of the plan; the plan begins with the first one"
