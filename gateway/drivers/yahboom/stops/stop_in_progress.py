@@ -266,7 +266,7 @@ class StopInProgress:
         """Delay the rest of the stop, so that its frames keep their distance from the command that was sent now."""
         self.other_at = now
         self.actions += 1
-        if self.index == 0 and self.tries > 1:  # a try that still waits for the end of a block
+        if self.index == 0:  # a try that has not begun
             self.try_at = max(self.try_at, now + FLIGHT_S)
 
     def begin_try(self, sequence: StopSequence, now: float) -> None:
