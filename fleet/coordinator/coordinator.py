@@ -142,9 +142,10 @@ class Coordinator:
     # ------------------------------------------------------------------ one step
 
     def _step(self, observer: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
-        for ask, outcome in self._commands.outcomes():
-            assert ask.mode is not None
-            observer.on_outcome(ask.car, None if outcome.ok else Refusal(ask.mode, outcome.reason, outcome.words, now))
+        for command, outcome in self._commands.outcomes():
+            assert command.mode is not None
+            refusal = None if outcome.ok else Refusal(command.mode, outcome.reason, outcome.words, now)
+            observer.on_outcome(command.car, refusal)
         observer.forget(now, {*self.plan.named, *self._memory.held_roles, *self._commands.busy})
         result = step(self.plan, observer.snapshot(self._commands.busy), self._memory, now)
         before, self._memory = self._memory, result.memory
@@ -161,7 +162,7 @@ class Coordinator:
             self.on_decision(decision)
         if result.changed or in_force(before) != in_force(result.memory):
             self._publications.publish("assignment", assignment_message(self.plan, result))
-        self._commands.send(result.asks, pool)
+        self._commands.send(result.commands, pool)
 
     # ------------------------------------------------------------------ the plan
 

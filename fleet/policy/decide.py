@@ -10,9 +10,10 @@ barrier has a sentence for the person who asks why nothing happens. A car that i
 while, because links come back within seconds. A fleet that reshuffles at every hiccup of a radio is worse than one role
 that is vacant for a moment.
 
-Second: what is true? Rules are evaluated in every step. But their conditions must be true for a time before they count,
-and must not be true for a time before they end (`debounce`, `rules`). A comparison with a value that was not measured
-is unknown, and unknown does not count as true: nothing is done because of something that nobody has seen.
+Second: what is true? Rules are evaluated in every step. But a rule comes into force only when its condition has been
+true for a time, and ends only when it has not been true for a time (`debounce`, `rules`). A comparison with a value
+that was not measured is unknown, and unknown does not count as true: nothing is done because of something that nobody
+has seen.
 
 Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
 most, then cars that keep their role, then few changes of mode. A car may be replaced if it has twice failed to change
@@ -71,7 +72,7 @@ ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class CarCommand:
     """A command for one car: a mode, or the color of its LED."""
 
     car: str
@@ -92,40 +93,39 @@ class DecisionStep:
     """The decisions with a new cause."""
     reworded: tuple[Decision, ...] = ()
     """The decisions with the same cause, but other words for the reason or for what would change them."""
-    asks: tuple[Ask, ...] = ()
+    commands: tuple[CarCommand, ...] = ()
     roles: Mapping[str, str] = field(default_factory=dict)
 
 
 def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -> DecisionStep:
     """Decide what each car should do. The same arguments give the same result."""
-    memory = memory if memory.started_at is not None else replace(memory, started_at=now)
+    started_at = now if memory.started_at is None else memory.started_at
+    memory = replace(memory, started_at=started_at)
     subjects = _cars_of(plan, snapshot)
-    barrier_of = {car: _find_barrier(car, snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects}
+    barriers = _find_barriers(subjects, snapshot)
     if memory.stopped_by:
-        return _step_stopped(plan, snapshot, barrier_of, memory, now)
-    barriers = {car: barrier[0] for car, barrier in barrier_of.items() if barrier is not None}
+        return _step_stopped(plan, snapshot, subjects, barriers, memory, now)
     gone_since = {car: memory.gone_since.get(car, now) for car in barriers}
-    lately = {car for car, since in gone_since.items() if now - since < HYSTERESIS_S}
+    gone_lately = {car for car, since in gone_since.items() if now - since < HYSTERESIS_S}
     roles_before = memory.roles
     reserved = {
         car: roles_before[car]
-        for car, barrier in barrier_of.items()
-        if barrier is not None and not barrier[1] and car in roles_before and car in lately
+        for car, barrier in barriers.items()
+        if not barrier.ends_role and car in roles_before and car in gone_lately
     }
     free = tuple(car for car in subjects if car not in barriers)
-    cars = CarSets(subjects, frozenset(free), frozenset({*free, *lately}), roles_before)
+    cars = CarSets(subjects, frozenset(free), frozenset({*free, *gone_lately}), roles_before)
     phase = memory.phase
     # The first phase begins before the rules are evaluated, because some rules count only in this phase.
     if not phase.name:
         phase = follow_phase(plan, snapshot, cars, phase, {}, now, ready=False)
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
-    phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, barrier_of, memory))
+    phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, subjects, barriers, memory))
     needs = follow_needs(plan, snapshot, subjects, memory.needs, now)
-    # The words for what would change a decision depend on the phase.
-    words_before = memory.decisions if phase.name == memory.phase.name else {}
+    # The words for what would change a decision depend on the phase, so keep none of another phase.
+    reusable = memory.decisions if phase.name == memory.phase.name else {}
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
-    assert memory.started_at is not None
-    if now - memory.started_at < FIRST_STATE_TIMEOUT_S and any(
+    if now - started_at < FIRST_STATE_TIMEOUT_S and any(
         _has_no_state(snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects
     ):
         return DecisionStep(memory)
@@ -151,84 +151,79 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     decisions = [explain_phase(plan, phase, snapshot)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            # A time in the future was set by on_hub_back.
+            # `on_hub_back` sets a time in the future: its longer grace period applies until that time has come.
             kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain_rule(car, overrides[car], allocation.roles.get(car)))
         elif car in held_roles:
-            decisions.append(
-                explain_role(car, held_roles[car], candidates, allocation, phase.name, words_before.get(car))
-            )
+            decisions.append(explain_role(car, held_roles[car], candidates, allocation, phase.name, reusable.get(car)))
         else:
             decisions.append(explain_idle(car, candidates, allocation))
     decisions = [_note_contradiction(decision, snapshot) for decision in decisions]
-    decisions += _decide_places(candidates, allocation, barriers, phase.name)
+    decisions += _explain_roles(candidates, allocation, barriers, phase.name)
     decisions = [each.after(memory.decisions.get(each.subject), now) for each in decisions]
-    mode_attempts, asks = _command_modes(decisions, snapshot, memory.mode_attempts, now)
+    mode_attempts, mode_commands = _command_modes(decisions, snapshot, memory.mode_attempts, now)
     led_requests, led_commands = _command_leds(plan, snapshot, rules, candidates, allocation, memory)
     blinks, blink_commands = _command_blinks(plan, snapshot, rules, candidates, allocation, memory.blinks)
-    return DecisionStep(
-        replace(
-            memory,
-            held_roles=held_roles,
-            mode_attempts=mode_attempts,
-            led_requests=led_requests,
-            blinks=blinks,
-            decisions={each.subject: each for each in decisions},
-        ),
-        tuple(decisions),
-        tuple(each for each in decisions if is_new(each, memory.decisions)),
-        tuple(each for each in decisions if is_reworded(each, memory.decisions)),
-        (*asks, *blink_commands, *led_commands),
-        allocation.roles,
+    memory = replace(
+        memory, held_roles=held_roles, mode_attempts=mode_attempts, led_requests=led_requests, blinks=blinks
     )
+    return _conclude(memory, decisions, (*mode_commands, *blink_commands, *led_commands), allocation.roles)
 
 
 def _step_stopped(
     plan: Plan,
     snapshot: FleetSnapshot,
-    barrier_of: Mapping[str, tuple[Barrier, bool] | None],
+    subjects: tuple[str, ...],
+    barriers: Mapping[str, Barrier],
     memory: PolicyState,
     now: float,
 ) -> DecisionStep:
     """Bring the cars of a stopped plan to rest, without a hold, and leave all other cars alone."""
-    attempts, asks, decisions = dict[str, ModeAttempts](), list[Ask](), list[Decision]()
-    for car, barrier in barrier_of.items():
-        tried = memory.mode_attempts.get(car, ModeAttempts(Mode.MANUAL))
-        known = snapshot.cars.get(car, UNKNOWN_CAR)
-        # A mode command may have been on its way when the plan was stopped. Only the outcome of a later command shows
-        # that the earlier one is over.
-        rests = (
-            tried.count
-            and known.mode == Mode.MANUAL
-            and known.verdict != Verdict.CONTRADICTED
-            and known.refused is None
-        )
-        taken = known.taken_by is not None or known.driven_by is not None
-        waits = car in memory.to_rest and not taken and (barrier is not None or known.busy or not rests)
-        if waits:
-            if barrier is None and not known.busy and now >= tried.again_at:
-                tried = replace(tried, mode=Mode.MANUAL).after(now)
-                asks.append(Ask(car, Mode.MANUAL))
-            attempts[car] = tried
+    mode_attempts, commands, decisions = dict[str, ModeAttempts](), list[CarCommand](), list[Decision]()
+    for car in subjects:
+        known, barrier = snapshot.cars.get(car, UNKNOWN_CAR), barriers.get(car)
+        attempts = memory.mode_attempts.get(car, ModeAttempts(Mode.MANUAL))
+        must_rest = car in memory.to_rest and _must_rest(known, attempts, barrier)
+        if must_rest:
+            if barrier is None and not known.busy and now >= attempts.again_at:
+                attempts = replace(attempts, mode=Mode.MANUAL).after(now)
+                commands.append(CarCommand(car, Mode.MANUAL))
+            mode_attempts[car] = attempts
         if barrier is not None:
-            decisions.append(explain_alone(car, barrier[0], None, 0.0))
+            decisions.append(explain_alone(car, barrier, None, 0.0))
         else:
-            decisions.append(explain_stopped(car, memory.stopped_by, rests=not waits))
+            decisions.append(explain_stopped(car, memory.stopped_by, rests=not must_rest))
     decisions += [explain_stopped_role(name, memory.stopped_by) for name in plan.roles]
     decisions = [each.after(memory.decisions.get(each.subject), now) for each in decisions]
+    to_rest = frozenset(mode_attempts) | (memory.to_rest - set(subjects))
+    return _conclude(replace(memory, mode_attempts=mode_attempts, to_rest=to_rest), decisions, commands, {})
+
+
+def _must_rest(known: CarSnapshot, attempts: ModeAttempts, barrier: Barrier | None) -> bool:
+    """Return True if a car of a stopped plan must still be brought to rest. False if a person has taken it."""
+    if known.taken_by is not None or known.driven_by is not None:
+        return False
+    # A mode command may have been on its way when the plan was stopped. Only the outcome of a later command shows that
+    # the earlier one is over.
+    was_obeyed = attempts.count > 0 and not known.busy and known.refused is None
+    is_at_rest = known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED
+    return barrier is not None or not (was_obeyed and is_at_rest)
+
+
+def _conclude(
+    memory: PolicyState, decisions: Iterable[Decision], commands: Iterable[CarCommand], roles: Mapping[str, str]
+) -> DecisionStep:
+    """Return the step with these decisions. `memory` still has the decisions of the step before."""
+    before, decided = memory.decisions, tuple(decisions)
     return DecisionStep(
-        replace(
-            memory,
-            mode_attempts=attempts,
-            to_rest=frozenset(attempts) | (memory.to_rest - barrier_of.keys()),
-            decisions={each.subject: each for each in decisions},
-        ),
-        tuple(decisions),
-        tuple(each for each in decisions if is_new(each, memory.decisions)),
-        tuple(each for each in decisions if is_reworded(each, memory.decisions)),
-        tuple(asks),
+        memory=replace(memory, decisions={each.subject: each for each in decided}),
+        decisions=decided,
+        changed=tuple(each for each in decided if is_new(each, before)),
+        reworded=tuple(each for each in decided if is_reworded(each, before)),
+        commands=tuple(commands),
+        roles=roles,
     )
 
 
@@ -249,67 +244,79 @@ def _is_recovering(known: CarSnapshot) -> bool:
 
 
 def _is_ready(
-    snapshot: FleetSnapshot, barrier_of: Mapping[str, tuple[Barrier, bool] | None], memory: PolicyState
+    snapshot: FleetSnapshot, subjects: tuple[str, ...], barriers: Mapping[str, Barrier], memory: PolicyState
 ) -> bool:
     """Return True if the state of every car is known, and every car is in the mode that was decided for it last.
 
     Cars that are lost, doubted, absent or taken by a person count as ready, unless no car is present yet.
     """
-    for car, barrier in barrier_of.items():
-        known = snapshot.cars.get(car, UNKNOWN_CAR)
-        if barrier is not None:
-            if _has_no_state(known) or (
-                not barrier[1]
-                and known.present
-                and known.link != LinkState.LOST
-                and not known.doubted
-                and _is_recovering(known)
-            ):
-                return False
-            continue
-        decision = memory.decisions.get(car)
-        if decision is None or decision.kind is DecisionKind.ALONE:  # this car can be commanded only since this step
-            return False
-        if decision.mode is not None and (
-            known.mode != decision.mode or known.verdict == Verdict.CONTRADICTED or known.busy
-        ):
-            return False
-    return any(snapshot.cars.get(car, UNKNOWN_CAR).present for car in barrier_of)
+    cars = {car: snapshot.cars.get(car, UNKNOWN_CAR) for car in subjects}
+    return any(known.present for known in cars.values()) and all(
+        _is_in_decided_mode(known, memory.decisions.get(car))
+        if car not in barriers
+        else not _may_be_free_soon(known, barriers[car])
+        for car, known in cars.items()
+    )
 
 
-def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
-    """Return why the car is left alone, or None, and whether a person caused that. If so, it loses its role at once."""
+def _may_be_free_soon(known: CarSnapshot, barrier: Barrier) -> bool:
+    """Return True if this barrier should end by itself: the first state or the first reading of the car is missing."""
+    if _has_no_state(known):
+        return True
+    is_reachable = known.present and known.link != LinkState.LOST and not known.doubted
+    return is_reachable and not barrier.ends_role and _is_recovering(known)
+
+
+def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
+    """Return True if a car is in the mode that was decided for it last, or if none was because a rule wants none."""
+    if last is None or last.kind is DecisionKind.ALONE:  # this car can be commanded only since this step
+        return False
+    return last.mode is None or (known.mode == last.mode and known.verdict != Verdict.CONTRADICTED and not known.busy)
+
+
+def _find_barriers(subjects: tuple[str, ...], snapshot: FleetSnapshot) -> dict[str, Barrier]:
+    """Return the cars that are left alone, and why."""
+    found = {car: _find_barrier(car, snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects}
+    return {car: barrier for car, barrier in found.items() if barrier is not None}
+
+
+def _find_barrier(car: str, known: CarSnapshot) -> Barrier | None:
+    """Return why the car is left alone. None if it is not."""
     if not known.present:
-        return Barrier(f"{car} is not on the bus", "its gateway comes up"), False
-    if not known.mode:  # nor is it known whether the car is on hold
-        return Barrier(f"{car} has published no state yet", "its gateway publishes its first states"), False
+        return Barrier(f"{car} is not on the bus", "its gateway comes up")
+    if not known.mode:  # without a state, it is not known either whether the car is on hold
+        return Barrier(f"{car} has published no state yet", "its gateway publishes its first states")
     if known.estopped_by is not None:
         return Barrier(
             f"{car} is e-stopped by {name_of(known.estopped_by)}",
             f"a person or script ends it (`fleet resume {car} --estops`)",
-        ), True
+            ends_role=True,
+        )
     if known.paused_by is not None:
         return Barrier(
-            f"{car} is paused with the whole fleet by {name_of(known.paused_by)}", "somebody ends it (`fleet unpause`)"
-        ), True
+            f"{car} is paused with the whole fleet by {name_of(known.paused_by)}",
+            "somebody ends it (`fleet unpause`)",
+            ends_role=True,
+        )
     if known.lent_to is not None:
-        return Barrier(f"{car} is lent to {known.lent_to}", f"the loan ends (`fleet lend {car} --end`)"), True
+        return Barrier(f"{car} is lent to {known.lent_to}", f"the loan ends (`fleet lend {car} --end`)", ends_role=True)
     if known.held_by is not None:
         return Barrier(
             f"{car} is on hold by {name_of(known.held_by)}",
             f"a person or script drives it, gives it a mode, or resumes it (`fleet resume {car}`)",
-        ), True
+            ends_role=True,
+        )
     if known.driven_by is not None:
-        return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends"), False
+        return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends")
     if known.link == LinkState.LOST:
-        return Barrier(f"the link of {car} is lost", "its link is back"), False
+        return Barrier(f"the link of {car} is lost", "its link is back")
     if known.doubted:  # people may command the car, because they see what it does
         ends = (
             f"it shows a stop (`fleet stop {car}`), or a person who has looked at it resumes it (`fleet resume {car}`)"
         )
-        return Barrier(f"{car} is in doubt: it has not shown its last stop", ends), False
+        return Barrier(f"{car} is in doubt: it has not shown its last stop", ends)
     if _is_recovering(known):
-        return Barrier(f"{car} is not in a known state yet", "its recovery ends: a reading comes from it"), False
+        return Barrier(f"{car} is not in a known state yet", "its recovery ends: a reading comes from it")
     return None
 
 
@@ -325,7 +332,10 @@ def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tu
 
 
 def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, tuple[str, str]]:
-    """Return by car the only role that a rule in force lets it have, and that rule. The first rule counts."""
+    """Return the cars to which a rule in force leaves only one role: that role and the rule, by car.
+
+    If several rules do so for a car, the first one counts.
+    """
     result: dict[str, tuple[str, str]] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:
@@ -355,6 +365,7 @@ def _overrides(
                     decided.add(car)
                     result[car] = Override(rule, state, effect)
         elif effect.role is not None:
+            # The first rule in force counts for a car, also if it gives a role: later rules cannot give it a mode.
             decided |= {car for car in targets(effect, state, subjects, roles) if pinned[car][1] == rule.name}
     return result
 
@@ -400,9 +411,10 @@ def _explain_loss(
     return f"{car} has role {other} now" if other is not None else f"{car} fits it less"
 
 
-def _decide_places(
+def _explain_roles(
     candidates: Candidates, allocation: RoleAllocation, barriers: Mapping[str, Barrier], phase: str
 ) -> list[Decision]:
+    """Explain each role of the plan: whether it is filled, vacant, or not wanted in this phase."""
     result = []
     for name in candidates.plan.roles:
         role, places = candidates.plan.roles[name], allocation.places.get(name, 0)
@@ -431,10 +443,10 @@ def _note_contradiction(decision: Decision, snapshot: FleetSnapshot) -> Decision
 
 def _command_modes(
     decisions: Iterable[Decision], snapshot: FleetSnapshot, before: Mapping[str, ModeAttempts], now: float
-) -> tuple[dict[str, ModeAttempts], list[Ask]]:
+) -> tuple[dict[str, ModeAttempts], list[CarCommand]]:
     """Command each car that is in the wrong mode into the right one, with backoff."""
     result: dict[str, ModeAttempts] = {}
-    asks = []
+    commands = []
     for decision in decisions:
         car, mode = decision.car, decision.mode
         if car is None or mode is None:
@@ -444,6 +456,8 @@ def _command_modes(
         if attempts.mode != mode:
             attempts = ModeAttempts(mode)
         if known.mode == mode and known.verdict != Verdict.CONTRADICTED:
+            # Forget failures only after the mode has lasted. Otherwise a car that leaves its mode again and again would
+            # be commanded without a delay each time, and would never be replaced.
             fine_since = now if attempts.fine_since is None else attempts.fine_since
             result[car] = (
                 ModeAttempts(mode) if now - fine_since >= MODE_RETRY_MAX_S else replace(attempts, fine_since=fine_since)
@@ -455,8 +469,8 @@ def _command_modes(
             result[car] = replace(attempts, fine_since=None)
         else:
             result[car] = attempts.after(now)
-            asks.append(Ask(car, mode))
-    return result, asks
+            commands.append(CarCommand(car, mode))
+    return result, commands
 
 
 def _command_leds(
@@ -466,26 +480,26 @@ def _command_leds(
     candidates: Candidates,
     allocation: RoleAllocation,
     memory: PolicyState,
-) -> tuple[frozenset[LedRequest], list[Ask]]:
+) -> tuple[frozenset[LedRequest], list[CarCommand]]:
     """Set each color of a rule once, as soon as the car is in mode manual. Cars ignore colors in other modes."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
-    result, asks = set[LedRequest](), []
+    result, commands = set[LedRequest](), []
     for index, state in rules.items():
         for position, effect in enumerate(plan.rules[index].effects):
             if not state.on or effect.led is None or effect.blink_s is not None:
                 continue
-            before = LedRequest(index, position, state.trigger, None)
-            if before in memory.led_requests:
-                result.add(before)
+            of_any_car = LedRequest(index, position, state.trigger, None)
+            if of_any_car in memory.led_requests:  # the coordinator before its restart has set this color
+                result.add(of_any_car)
                 continue
             for car in targets(effect, state, subjects, allocation.roles):
-                one, known = replace(before, car=car), snapshot.cars.get(car, UNKNOWN_CAR)
-                if one in memory.led_requests:
-                    result.add(one)
-                elif _obeys_led(known) and car in candidates.free:
-                    result.add(one)
-                    asks.append(Ask(car, led=effect.led))
-    return frozenset(result), asks
+                request = replace(of_any_car, car=car)
+                if request in memory.led_requests:
+                    result.add(request)
+                elif car in candidates.free and _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR)):
+                    result.add(request)
+                    commands.append(CarCommand(car, led=effect.led))
+    return frozenset(result), commands
 
 
 def _command_blinks(
@@ -495,10 +509,10 @@ def _command_blinks(
     candidates: Candidates,
     allocation: RoleAllocation,
     before: Mapping[str, BlinkState],
-) -> tuple[dict[str, BlinkState], list[Ask]]:
+) -> tuple[dict[str, BlinkState], list[CarCommand]]:
     """Switch each blinking LED when its time is over, and switch off LEDs that no longer blink."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
-    now, result, asks = candidates.now, dict[str, BlinkState](), list[Ask]()
+    now, result, commands = candidates.now, dict[str, BlinkState](), list[CarCommand]()
     for _, _, state, effect in _effects_in_force(plan, rules):
         if effect.led is None or effect.blink_s is None:
             continue
@@ -510,10 +524,10 @@ def _command_blinks(
                 result[car] = last
                 continue
             result[car] = BlinkState(effect.led, last is None or last.color != effect.led or not last.on, now)
-            asks.append(Ask(car, led=effect.led if result[car].on else COLORS["off"], blink=True))
+            commands.append(CarCommand(car, led=effect.led if result[car].on else COLORS["off"], blink=True))
     ended = [car for car, last in before.items() if last.on and car not in result and car in candidates.free]
-    asks += [Ask(car, led=COLORS["off"]) for car in ended if _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR))]
-    return result, asks
+    commands += [CarCommand(car, led=COLORS["off"]) for car in ended if _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR))]
+    return result, commands
 
 
 def _obeys_led(known: CarSnapshot) -> bool:

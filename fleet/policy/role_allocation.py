@@ -37,6 +37,8 @@ class Barrier:
     change: str
     looks_at: Expression | None = None
     """The expression from which the barrier follows."""
+    ends_role: bool = False
+    """True if a person has taken the car for longer, so that the car loses its role at once."""
 
 
 @dataclass(frozen=True, slots=True)

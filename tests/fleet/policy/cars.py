@@ -46,11 +46,11 @@ class PolicyRun:
         self.now = now
         self.last = step(self.plan, FleetSnapshot(dict(self.cars), dict(self.readings)), self.memory, now)
         self.memory = self.last.memory
-        for ask in self.last.asks:
-            if ask.mode is not None:
-                self.asked.append((now, ask.car, str(ask.mode)))
+        for command in self.last.commands:
+            if command.mode is not None:
+                self.asked.append((now, command.car, str(command.mode)))
                 if self.obey:
-                    self.change(ask.car, mode=str(ask.mode), verdict="assumed")
+                    self.change(command.car, mode=str(command.mode), verdict="assumed")
         return self.last
 
     def until(self, now: float, every: float = 0.1) -> DecisionStep:

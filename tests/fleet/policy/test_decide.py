@@ -59,7 +59,7 @@ def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str 
     result = step(FIXED, FleetSnapshot({"red": car}), PolicyState(started_at=-9.0), 0.0)
     (decision, *_) = result.decisions
     assert decision.mode == mode
-    assert bool(result.asks) is asks
+    assert bool(result.commands) is asks
 
 
 def test_doubted_car_is_left_alone_and_delays_no_phase() -> None:
@@ -326,7 +326,7 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
         while run.now < end:
             run.sees("green", light={"left": True})
             result = run.at(round(run.now + 0.1, 6))
-            coloured.extend(run.now for ask in result.asks if ask.led is not None)
+            coloured.extend(run.now for ask in result.commands if ask.led is not None)
 
     run.change("red", mode="tracking")
     until(1.0)
@@ -352,7 +352,7 @@ rules: [{when: {car: red, is: light.left}, then: {who: this_car, led: {color: re
     def until(end: float, light: bool) -> None:
         while run.now < end:
             run.sees("red", light={"left": light})
-            for ask in run.at(round(run.now + 0.1, 6)).asks:
+            for ask in run.at(round(run.now + 0.1, 6)).commands:
                 if ask.led is not None:
                     told.append((run.now, format_color(ask.led)))
 
@@ -549,7 +549,7 @@ def test_decisions_are_deterministic_for_random_courses(plan: Any, course: list[
         if not {"light", "voltage"} & set(fields):
             run.change(car, **fields)
         run.at(round(run.now + wait_s, 6))
-        assert not {ask.car for ask in result.asks} & {
+        assert not {ask.car for ask in result.commands} & {
             name for name, known in run.cars.items() if known.held_by or known.estopped_by
         }
         for name, known in run.cars.items():
@@ -572,11 +572,11 @@ def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, co
     for _ in range(20):
         run.at(run.now + 0.5)
         assert run.last.changed == ()
-        assert run.last.asks == ()
+        assert run.last.commands == ()
 
 
 def test_gone_is_gone() -> None:
-    assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(started_at=-9.0), 0.0).asks == ()
+    assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(started_at=-9.0), 0.0).commands == ()
 
 
 EXAMPLE = parse((EXAMPLES / "plans" / "2-line-guide.yaml").read_text(encoding="utf-8"))
@@ -605,7 +605,7 @@ def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
     asked = []
     while run.now < 8.0:
         run.sees("red", battery={"voltage_v": 6.8, "level": "low"})
-        asked += [(ask.car, ask.led) for ask in run.until(run.now + 0.5, every=0.5).asks if ask.led is not None]
+        asked += [(ask.car, ask.led) for ask in run.until(run.now + 0.5, every=0.5).commands if ask.led is not None]
     assert asked[:2] == [("red", (255, 0, 0)), ("red", (0, 0, 0))]
     assert run.roles == {"blue": "patrol"}
 
