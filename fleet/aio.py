@@ -111,16 +111,16 @@ class Fleet:
         If the fleet stays open longer than you need the watch, use the watch with `async with`. Otherwise it receives
         readings until the fleet is closed.
         """
-        written = check_key(self.sync.expression(expression))
-        watch = Watch(None if when is None else KeyCondition.of(when, written).holds)
-        watch.begin(self.sync.bus.subscribe(written, watch.hand_over).undeclare)
+        key_expression = check_key(self.sync.expression(expression))
+        watch = Watch(None if when is None else KeyCondition.of(when, key_expression).holds)
+        watch.begin(self.sync.bus.subscribe(key_expression, watch.hand_over).undeclare)
         self._watches.add(watch)
         return watch
 
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
         """Wait until `when` holds of a fresh reading and return that reading. Raises wait.NotInTime."""
-        written = self.sync.expression(expression)
-        waiting = ConditionWait(KeyCondition.of(when, written), for_s)
+        key_expression = self.sync.expression(expression)
+        waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         try:
             async with asyncio.timeout(timeout_s), self.watch(expression) as stream:
                 for reading in await self.get(expression):
@@ -131,7 +131,7 @@ class Fleet:
                         return reading
         except TimeoutError:
             pass
-        raise waiting.timeout_error(written, timeout_s or 0.0, datetime.now(UTC))
+        raise waiting.timeout_error(key_expression, timeout_s or 0.0, datetime.now(UTC))
 
     async def publish_pose(
         self,

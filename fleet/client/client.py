@@ -222,10 +222,10 @@ class Fleet:
         return found
 
     def _read(self, selector: str, timeout_s: float) -> list[Reading]:
-        written = selector.partition("?")[0]
-        if "@cmd" in written.split("/"):
-            raise keys.BadKey(f"{written} is a command, not a reading: a query of it would be carried out")
-        check_key(written)
+        key_expression = selector.partition("?")[0]
+        if "@cmd" in key_expression.split("/"):
+            raise keys.BadKey(f"{key_expression} is a command, not a reading: a query of it would be carried out")
+        check_key(key_expression)
         self._check_open()
         found = []
         for answer in self.bus.query(selector, timeout_s=timeout_s, qos=Qos.STATE):
@@ -245,12 +245,12 @@ class Fleet:
         the condition is true. It receives readings until the fleet is closed. To end it earlier, use it with `with`.
         Raises conditions.BadExpression.
         """
-        written = check_key(self.expression(expression))
-        accept = None if when is None else KeyCondition.of(when, written).holds
+        key_expression = check_key(self.expression(expression))
+        accept = None if when is None else KeyCondition.of(when, key_expression).holds
         self._check_open()
 
         def subscribe(on_sample: Callable[[Sample], None]) -> Callable[[], object]:
-            return self.bus.subscribe(written, on_sample).undeclare
+            return self.bus.subscribe(key_expression, on_sample).undeclare
 
         watch = Watch(accept).begin(subscribe)
         self._watches.add(watch)
@@ -262,22 +262,22 @@ class Fleet:
         With `for_s`, the condition must have been true for this time in all readings, by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
         """
-        written = self.expression(expression)
-        waiting = ConditionWait(KeyCondition.of(when, written), for_s)
+        key_expression = self.expression(expression)
+        waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         began = time.monotonic()
 
         def left_s() -> float:
             return _NO_TIMEOUT_POLL_S if timeout_s is None else began + timeout_s - time.monotonic()
 
         with self.watch(expression) as stream:  # before the query of the current values: none is missed
-            for reading in self._read(written, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
+            for reading in self._read(key_expression, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
                 if waiting.ends(reading, datetime.now(UTC)):
                     return reading
             while (left := left_s()) > 0:
                 coming = stream.within(left)
                 if coming is not None and waiting.ends(coming, datetime.now(UTC), time.monotonic()):
                     return coming
-        raise waiting.timeout_error(written, timeout_s or 0.0, datetime.now(UTC))
+        raise waiting.timeout_error(key_expression, timeout_s or 0.0, datetime.now(UTC))
 
     # ------------------------------------------------------------------ poses
 

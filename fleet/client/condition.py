@@ -16,6 +16,7 @@ from schemas import keys, messages, topics
 from schemas.bus import intersects
 from schemas.suggestion import nearest
 
+# Keys of a service are `<fleet>/@recorder/status`: its topic names the service. Others are `<fleet>/<car>/<topic>`.
 _PATTERNS: Final = {
     topic.name: f"*/{topic.name}" if topic.name.startswith("@") else f"*/*/{topic.name}"
     for topic in topics.TOPICS.values()
@@ -23,16 +24,16 @@ _PATTERNS: Final = {
 _SERVICES: Final = {topic.family for topic in topics.SERVICE_TOPICS}
 
 
-def topics_under(written: str) -> list[topics.Topic]:
+def topics_under(key_expression: str) -> list[topics.Topic]:
     """Return the topics that a key expression can match, in the table's order."""
-    return [topic for topic in topics.TOPICS.values() if intersects(written, _PATTERNS[topic.name])]
+    return [topic for topic in topics.TOPICS.values() if intersects(key_expression, _PATTERNS[topic.name])]
 
 
-def known_topics_under(written: str) -> list[topics.Topic]:
+def known_topics_under(key_expression: str) -> list[topics.Topic]:
     """Return the topics that a key expression can match. Raises BadKey with the likely key if there are none."""
-    if under := topics_under(written):
-        return under
-    short = written.partition("/")[2]
+    if matched := topics_under(key_expression):
+        return matched
+    short = key_expression.partition("/")[2]  # without the fleet, as people write it
     car, _, name = short.partition("/")
     begin = f"{car}/"
     if car.startswith("@"):
@@ -44,11 +45,11 @@ def known_topics_under(written: str) -> list[topics.Topic]:
     raise keys.BadKey(f"No key {short}. {near}")
 
 
-def check_key(written: str) -> str:
+def check_key(key_expression: str) -> str:
     """Return the key expression if it can match a topic or a command. Raises BadKey with the likely key."""
-    if "@cmd" not in written.split("/"):
-        known_topics_under(written)
-    return written
+    if "@cmd" not in key_expression.split("/"):
+        known_topics_under(key_expression)
+    return key_expression
 
 
 def check_car(name: str) -> str:
@@ -66,31 +67,30 @@ class KeyCondition:
     by_message: Mapping[str, Expression]
 
     @classmethod
-    def of(cls, text: str, written: str) -> Self:
-        """Parse a condition on the messages under `written`. Raises BadExpression, or BadKey if it matches no topic."""
-        under = known_topics_under(written)
-        names = {topic.message: fields_of(messages.message_class(topic.message)) for topic in under}
+    def of(cls, text: str, key_expression: str) -> Self:
+        """Parse a condition on the messages that `key_expression` can match.
+
+        Raises BadExpression, or BadKey if it matches no topic.
+        """
+        matched = known_topics_under(key_expression)
+        topic_names = {topic.message: topic.name.rpartition("/")[2] for topic in matched}
+        fields_of_message = {message: fields_of(messages.message_class(message)) for message in topic_names}
         found: dict[str, Expression] = {}
-        never: list[str] = []
-        short = {topic.message: topic.name.rpartition("/")[2] for topic in under}
-        for message, fields in names.items():
+        impossible: list[str] = []
+        for message, fields in fields_of_message.items():
             try:
-                found[message] = parse(text, fields, topic_aliases_of(short[message], fields))
-                never += filter(None, [explain_impossible(found[message], short[message])])
+                found[message] = parse(text, fields, topic_aliases_of(topic_names[message], fields))
             except BadExpression:
-                if len(names) == 1:
+                if len(fields_of_message) == 1:
                     raise
+                continue  # another message may have the fields
+            impossible += filter(None, [explain_impossible(found[message], topic_names[message])])
         if not found:
-            every = {name: kind for fields in names.values() for name, kind in fields.items()}
-            aliases = {a: f for message in names for a, f in topic_aliases_of(short[message], names[message]).items()}
-            parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)}, aliases)
-            raise BadExpression(
-                text,
-                1,
-                f"no message under {written} has all of its fields: a condition is about one message",
-            )
-        if len(never) == len(found):
-            raise BadExpression(text, 1, never[0])
+            _check_with_all_fields(text, topic_names, fields_of_message)
+            words = f"no message under {key_expression} has all of its fields: a condition is about one message"
+            raise BadExpression(text, 1, words)
+        if len(impossible) == len(found):
+            raise BadExpression(text, 1, impossible[0])
         return cls(str(next(iter(found.values()))), found)
 
     def __str__(self) -> str:
@@ -101,7 +101,7 @@ class KeyCondition:
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         return None if expression is None else expression.value(compared_in(reading.value))
 
-    def read(self, reading: Reading) -> list[str]:
+    def describe_values(self, reading: Reading) -> list[str]:
         """Return the values that the condition looks at, such as `range_m=0.5`. Empty if the message lacks a field."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         if expression is None:
@@ -110,3 +110,15 @@ class KeyCondition:
         return [
             f"{name}={'not measured' if value is None else format_literal(value)}" for name, value in values.items()
         ]
+
+
+def _check_with_all_fields(
+    text: str, topic_names: Mapping[str, str], fields_of_message: Mapping[str, Mapping[str, type]]
+) -> None:
+    """Raise BadExpression if the syntax is wrong, or if a field is in no message at all."""
+    fields = {name: kind for each in fields_of_message.values() for name, kind in each.items()}
+    aliases: dict[str, str] = {}
+    for message, each in fields_of_message.items():
+        aliases |= topic_aliases_of(topic_names[message], each)
+    # The error lists the names in this order. So fields that every message has come last.
+    parse(text, {name: fields[name] for name in sorted(fields, key=LAST.__contains__)}, aliases)

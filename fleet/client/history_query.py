@@ -15,10 +15,10 @@ MAX_HISTORY_QUERIES: Final = 4
 MAX_HISTORY_S: Final = 7 * 86_400.0
 
 
-def selector(written: str, *, last: int | None = None, since_s: float | None = None) -> str:
+def selector(key_expression: str, *, last: int | None = None, since_s: float | None = None) -> str:
     """Return the selector for the last `last` values of each key, for the last `since_s` seconds, or for both.
 
-    Raises ValueError.
+    Raises ValueError for values out of range.
     """
     if last is None and since_s is None:
         raise ValueError("a history needs last (how many), since_s (how far back), or both")
@@ -27,13 +27,13 @@ def selector(written: str, *, last: int | None = None, since_s: float | None = N
     if since_s is not None and not 0 < since_s <= MAX_HISTORY_S:
         raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {MAX_HISTORY_S:g} s")
     parameters = [] if since_s is None else [f"_time=[now(-{since_s:f}s)..]"]
-    return f"{written}?{';'.join(parameters + ([] if last is None else [f'last={last}']))}"
+    return f"{key_expression}?{';'.join(parameters + ([] if last is None else [f'last={last}']))}"
 
 
 def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
     """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
     # If a link's queue is full, a gateway drops answers and does not block. So a client that finds gaps queries again.
-    boots: dict[str, int] = {}
+    boots: dict[str, int] = {}  # gives each boot a number in the order of their arrival, as a boot_id is random
     found: dict[tuple[str, int, int], Reading] = {}
     for reading in (*earlier, *more):
         boot = boots.setdefault(reading.value.boot_id, len(boots))
@@ -64,15 +64,16 @@ def describe_shortfalls(
 ) -> list[str]:
     """Describe why there are fewer readings than requested, one line for each key and one for all states.
 
-    readings: sorted by key.
+    readings: sorted as `merge` sorts.
     """
-    lines, states = [], 0
-    every = list(readings)
-    lines += [f"{key}: {count} in between were lost on the way. Try again." for key, count in gaps(every).items()]
+    every, has_states = list(readings), False
+    lines = [f"{key}: {count} in between were lost on the way. Try again." for key, count in gaps(every).items()]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
-        if topic is None or topic.history_size <= 1:
-            states += topic is not None
+        if topic is None:
+            continue
+        if topic.history_size <= 1:
+            has_states = True
             continue
         keeps = f"its gateway keeps the last {topic.history_size}"
         oldest_s = found[0].age_s(now)
@@ -83,14 +84,14 @@ def describe_shortfalls(
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has no more"
             lines.append(f"{key}: {len(found)} of {last}, {more}")
-    if states and last != 1:
+    if has_states and last != 1:
         lines.append("Gateways keep only the latest value of a state. A recording has all (`fleet record`).")
     return lines
 
 
-def describe_missing_history(under: Iterable[topics.Topic]) -> str:
-    """Describe why these topics have no history. Return an empty string if one of them has, or if there are none."""
-    listed = list(under)
+def describe_missing_history(matched: Iterable[topics.Topic]) -> str:
+    """Describe why these topics have no history. Return an empty string if one of them has one, or without topics."""
+    listed = list(matched)
     if not listed or any(topic.history_size for topic in listed):
         return ""
     names = ", ".join(topic.name for topic in listed)

@@ -68,7 +68,7 @@ class ConditionWait:
         if holding is not None:
             holds = holding.add(reading.key, compared_in(reading.value), _ns(reading.time)).value
         if holds is None:
-            self._undecided = reading if self._condition.read(reading) else self._undecided
+            self._undecided = reading if self._condition.describe_values(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time or arrived_s is not None:
             self.last = reading
         # A reading that was published just now is fresh whatever its stamp, as in `CarState`: clocks differ, and the
@@ -78,14 +78,14 @@ class ConditionWait:
         span = holding.span if holding is not None else None
         return span is not None and span.length_s >= self._for_s
 
-    def timeout_error(self, written: str, after_s: float, now: datetime) -> NotInTime:
-        """Return the error for a timeout. `written` is the key expression of the wait."""
+    def timeout_error(self, key_expression: str, after_s: float, now: datetime) -> NotInTime:
+        """Return the error for a timeout."""
         lasting = f" for {self._for_s:g} s" if self._for_s else ""
         words = f"{self._condition} did not hold{lasting} within {after_s:g} s"
         last = self.last or self._undecided
         if last is None:
-            return NotInTime(f"{words}: nothing came under {written}", None)
-        values = ", ".join(self._condition.read(last))
+            return NotInTime(f"{words}: nothing came under {key_expression}", None)
+        values = ", ".join(self._condition.describe_values(last))
         age = f"{last.age_s(now):.1f} s ago{' (stale)' if last.stale(now) else ''}"
         return NotInTime(f"{words}: {last.key} had {values}, {age}", last)
 

@@ -240,23 +240,25 @@ def get(
 
     `red` means every sensor of red. `*` stands for any single part of a key.
     """
-    written = check_key(written_out(keyexpr, fleet))
-    under = topics_under(written)
+    key_expression = check_key(written_out(keyexpr, fleet))
+    matched = topics_under(key_expression)
     if as_csv and as_json:
         raise click.UsageError("--csv and --json exclude each other: give one of them")
-    if as_csv and len(under) != 1:
-        meant = ", ".join(topic.name for topic in under) or "no message"
-        raise click.UsageError(f"--csv needs one message type, but {written} means {meant}.")
+    if as_csv and len(matched) != 1:
+        meant = ", ".join(topic.name for topic in matched) or "no message"
+        raise click.UsageError(f"--csv needs one message type, but {key_expression} means {meant}.")
     past = last is not None or since is not None
-    why_not = history_query.describe_missing_history(under) if past else ""
+    why_not = history_query.describe_missing_history(matched) if past else ""
     if why_not:
         raise click.UsageError(why_not)
     with open_observer(connect, fleet, keyexpr) as client:
         readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
-            raise click.ClickException(describe_missing(client, written, f"nothing under {written}{within}"))
-    _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json, past=past)
+            raise click.ClickException(
+                describe_missing(client, key_expression, f"nothing under {key_expression}{within}")
+            )
+    _show(readings, csv_of=matched[0] if as_csv else None, as_json=as_json, past=past)
     if past:
         _print_shortfalls(history_query.describe_shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
 
@@ -296,11 +298,11 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     comparison. A comparison with a value that was not measured is unknown. Only readings for which CONDITION is true
     are shown.
     """
-    written = check_key(written_out(keyexpr, fleet))
+    key_expression = check_key(written_out(keyexpr, fleet))
     if when is not None:
-        KeyCondition.of(when, written)
+        KeyCondition.of(when, key_expression)
     with open_observer(connect, fleet, keyexpr) as client:
-        warn_if_missing(written, client.cars())
+        warn_if_missing(key_expression, client.cars())
         reported = shown = 0
         with client.watch(keyexpr, when=when) as readings:
             for reading in readings:
@@ -336,12 +338,12 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     A rate is "-" if fewer than two messages came during the measurement. An age is "-" if no message came.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
-    written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
+    expressions = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
     with open_observer(connect, fleet, keyexpr or "") as client:
-        found = _alive(client, written, look_s)
+        found = _alive(client, expressions, look_s)
         if not found:
-            what = f"under {written[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
-            raise click.ClickException(describe_missing(client, written[0], f"no key {what} is alive"))
+            what = f"under {expressions[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
+            raise click.ClickException(describe_missing(client, expressions[0], f"no key {what} is alive"))
     if as_json:
         for each in found:
             click.echo(json.dumps(_row(each)))
@@ -349,11 +351,11 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
         show_table(_KEY_COLUMNS, [_cells(each) for each in found])
 
 
-def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[KeyInfo]:
+def _alive(client: Fleet, expressions: Sequence[str], look_s: float) -> list[KeyInfo]:
     """Survey the keys for `look_s`."""
 
     def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
-        subscribers = [client.bus.subscribe(each, take) for each in written]
+        subscribers = [client.bus.subscribe(each, take) for each in expressions]
 
         def end() -> None:
             for subscriber in subscribers:
@@ -363,14 +365,15 @@ def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[KeyInfo
 
     survey, until = KeySurvey(look_s), time.monotonic() + look_s
     with Watch().begin(subscribe) as stream:
-        for each in written:
+        for each in expressions:
             for reading in client.get(each):
                 survey.add(reading, datetime.now(UTC))
         while (left := until - time.monotonic()) > 0:
             coming = stream.within(left)
             if coming is not None:
                 survey.add(coming, datetime.now(UTC))
-    silent = [key for key in event_keys(client.name, client.cars()) if any(intersects(each, key) for each in written)]
+    events = event_keys(client.name, client.cars())
+    silent = [key for key in events if any(intersects(each, key) for each in expressions)]
     return survey.keys(silent, datetime.now(UTC))
 
 
@@ -450,12 +453,12 @@ def wait(
     if len(words) != 2:
         raise click.UsageError("give a KEY and one CONDITION in quotes, as: red/sensor/range 'range_m < 0.3'")
     keyexpr, condition = words
-    written = written_out(keyexpr, fleet)
-    KeyCondition.of(condition, written)
+    key_expression = written_out(keyexpr, fleet)
+    KeyCondition.of(condition, key_expression)
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
         raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
     with open_observer(connect, fleet, keyexpr) as client:
-        warn_if_missing(written, client.cars())
+        warn_if_missing(key_expression, client.cars())
         try:
             reading = client.wait(keyexpr, condition, timeout_s=timeout_s, for_s=for_s or 0.0)
         except NotInTime as late:

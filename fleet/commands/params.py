@@ -352,15 +352,16 @@ def describe_other_fleets(client: Fleet) -> str:
     return f'No fleet "{client.name}" is on this bus. There is: {", ".join(sorted(there))}.'
 
 
-def describe_missing(client: Fleet, written: str, what: str) -> str:
+def describe_missing(client: Fleet, key_expression: str, what: str) -> str:
     """Return a text for a key without a value. It names the likely car, the car's readings, or the connected cars."""
-    under = topics_under(written)
-    if under and all(topic.family == "sim" for topic in under):
-        return f"{what}; a simulated car's true state is not stored. Watch it: fleet watch {written.partition('/')[2]}"
+    matched = topics_under(key_expression)
+    if matched and all(topic.family == "sim" for topic in matched):
+        short = key_expression.partition("/")[2]
+        return f"{what}; a simulated car's true state is not stored. Watch it: fleet watch {short}"
     cars = client.cars()
     if not cars:
         return no_cars(client).message
-    key = keys.parse(written)
+    key = keys.parse(key_expression)
     if key is not None and key.car in cars:
         begin = len(f"{client.name}/{key.car}/")
         found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
@@ -376,9 +377,9 @@ def _likely_car(name: str, cars: Sequence[str]) -> str:
     return near or (f"Did you mean '*/{topic}'?" if topic else f"Connected: {', '.join(cars)}.")
 
 
-def warn_if_missing(written: str, cars: Sequence[str]) -> None:
+def warn_if_missing(key_expression: str, cars: Sequence[str]) -> None:
     """Warn if the named car is not on the bus: the name may be misspelled."""
-    key = keys.parse(written)
+    key = keys.parse(key_expression)
     if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
         there = _likely_car(key.car, cars) if cars else "No car is connected."
         click.echo(f'fleet: No car "{key.car}" is connected yet. {there} Waiting.', err=True)

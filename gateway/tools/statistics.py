@@ -10,7 +10,7 @@ from gateway.drivers.yahboom.estimate.platform import PlatformDetector
 from gateway.drivers.yahboom.protocol.measurements import measured
 from gateway.drivers.yahboom.protocol.modes import candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
-from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
+from gateway.drivers.yahboom.protocol.sensors import RejectedField, Sensors
 from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import FrameVerdict, Platform
 
@@ -133,5 +133,5 @@ def _measured(event: Sensors, profile: Profile) -> dict[str, Any]:
     return fields | _rejected(profile.rejects(event))
 
 
-def _rejected(rejects: Sequence[Reject]) -> dict[str, Any]:
+def _rejected(rejects: Sequence[RejectedField]) -> dict[str, Any]:
     return {"rejected": {reject.word: reject.text for reject in rejects}} if rejects else {}

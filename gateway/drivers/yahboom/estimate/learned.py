@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Reject, Sensors
+from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, RejectedField, Sensors
 from schemas.words import Blocking, Mode, Shows
 
 KEPT_INTERVALS: Final = 9
@@ -250,7 +250,7 @@ class Learned:
         """Return the fields whose values were often out of range, and never in range."""
         return tuple(word for word, count in self.rejected.items() if count >= ALWAYS and word not in self.extremes)
 
-    def on_fields(self, event: Sensors, rejects: tuple[Reject, ...]) -> None:
+    def on_fields(self, event: Sensors, rejects: tuple[RejectedField, ...]) -> None:
         """Record the values of the fields of a report of mode 0. `rejects` are out of the range of this car."""
         rejected = {reject.word for reject in rejects}
         for name in rejected:

@@ -23,9 +23,8 @@ from schemas.words import Cause
 
 MAX_FRAME: Final = 256  # docs/reference/protocol.md#bad-input: a frame longer than this is cut off as noise
 _MIN_FRAME: Final = 64  # a sensors frame in its longest observed spelling has 46 bytes
-MISSING_END_SILENCE_S: Final = (
-    0.050  # docs/reference/protocol.md#readings: a missing `#` is accepted when nothing follows for 50 ms
-)
+MISSING_END_SILENCE_S: Final = 0.050
+"""Silence after which a frame is accepted without its `#` (docs/reference/protocol.md#readings)."""
 # After an outage, a link joins the beginning of one frame and the end of another. Such a frame is no measurement, so
 # end an incomplete frame after a silence. A radio link repeats lost bytes in less time than this.
 CUT_FRAME_SILENCE_S: Final = 0.5
@@ -45,7 +44,7 @@ _PROTOCOL_WORD = re.compile(rb"(?<![A-Za-z])(?:4WD|CSB|PV|GS|LF|HW|GM|J[1-6]|MPU
 
 
 class Decoder:
-    """Decodes the bytes of one connection. Make a new one for a new link, which must not complete an old frame."""
+    """Decodes the bytes of one link. Make a new decoder for a new link: its bytes must not complete an old frame."""
 
     def __init__(self, max_frame: int = MAX_FRAME, *, head: str = STANDARD_HEAD) -> None:
         """`head` is the first word of the frames of this car."""
@@ -54,8 +53,8 @@ class Decoder:
         self._max = max_frame
         self.use_head(head)
         self._buffer = bytearray()  # a frame from its `$` on, or junk from its first byte that is not a separator
-        self._last = 0.0  # time of the last byte in the buffer
-        self._silence_s = inf  # silence after the last byte that would complete an event
+        self._last_at = 0.0  # time of the last byte in the buffer
+        self._silence_s = inf  # how long nothing must arrive after that byte for the buffer to become an event
         self._late_end = False  # True if silence ended the last frame: its `#` may still come
         self._is_mid_line = False  # True if an earlier event has the beginning of this line
         self._sent: dict[bytes, float] = {}
@@ -87,17 +86,17 @@ class Decoder:
 
     def tick(self, now: float) -> list[Event]:
         """Return the events that the silence until `now` completes. `feed` calls this first."""
-        if now < self._last + self._silence_s:
+        if now < self._last_at + self._silence_s:
             return []
         self._silence_s = inf
         if self._buffer[0] != _START:
-            return self._junk()
+            return self._take_junk()
         self._late_end = True
-        return self._unended(by_silence=True)
+        return self._take_unended(by_silence=True)
 
     def deadline(self) -> float | None:
         """Return the time at which to call `tick`, on the clock of `now`. None if a silence would complete no event."""
-        return self._last + self._silence_s if self._buffer else None
+        return self._last_at + self._silence_s if self._buffer else None
 
     def sent(self, data: bytes, now: float) -> None:
         """Remember a frame as written, to recognize its echo for 2 s."""
@@ -111,7 +110,7 @@ class Decoder:
         self._silence_s, self._late_end = inf, False
         events: list[Event] = []
         if self._buffer:
-            events = self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
+            events = self._take_unended(by_silence=True) if self._buffer[0] == _START else self._take_junk()
         self._is_mid_line = False
         return events
 
@@ -126,8 +125,9 @@ class Decoder:
             self._late_end = False
             if data[pos] == _END:
                 return pos + 1
-        start = data.find(b"$", pos, pos + self._max - len(self._buffer))
-        stop = min(len(data), pos + self._max - len(self._buffer)) if start < 0 else start
+        limit = min(len(data), pos + self._max - len(self._buffer))
+        start = data.find(b"$", pos, limit)
+        stop = limit if start < 0 else start
         if stop > pos:
             piece = data[pos:stop]
             if not self._buffer:
@@ -135,13 +135,13 @@ class Decoder:
                 if self._is_mid_line and not _LINE_END_BYTES.isdisjoint(data[pos : stop - len(piece)]):
                     self._is_mid_line = False
             self._buffer += piece
-            self._last = now
+            self._last_at = now
         if start >= 0:
-            events += self._junk()
+            events += self._take_junk()
             self._begin(now)
             return start + 1
         if len(self._buffer) == self._max:
-            events += self._junk()
+            events += self._take_junk()
         return stop
 
     def _inside(self, data: bytes, pos: int, now: float, events: list[Event]) -> int:
@@ -149,24 +149,25 @@ class Decoder:
         room = self._max - len(self._buffer)
         mark = _MARK.search(data, pos, pos + room)
         if mark and data[mark.start()] == _END:
-            events.append(self._ended(self._take(data[pos : mark.end()]), now))
+            events.append(self._event_of_ended(self._take(data[pos : mark.end()]), now))
             return mark.end()
         stop = mark.start() if mark else min(len(data), pos + room)
         if stop > pos:
             self._buffer += data[pos:stop]
-            self._last = now
+            self._last_at = now
+        # The search ends where the buffer is full. So look at the next byte, too: a `$` there begins another frame.
         if mark or (stop < len(data) and data[stop] == _START):
-            events += self._unended()
+            events += self._take_unended()
             self._begin(now)
             return stop + 1
         if stop < len(data):
             self._is_mid_line = True
-            events.append(Rejected(self._take(b""), self._last, Cause.OVERLONG, f"no end in {self._max} bytes"))
+            events.append(Rejected(self._take(b""), self._last_at, Cause.OVERLONG, f"no end in {self._max} bytes"))
         return stop
 
     def _begin(self, now: float) -> None:
         self._buffer.append(_START)
-        self._last = now
+        self._last_at = now
         self._is_mid_line = False
 
     def _take(self, rest: bytes) -> bytes:
@@ -174,8 +175,8 @@ class Decoder:
         self._buffer.clear()
         return raw
 
-    def _junk(self) -> list[Event]:
-        """Return the events of the buffered junk: its whole lines of text, and the runs between them."""
+    def _take_junk(self) -> list[Event]:
+        """Empty the buffer of junk. Return its events: whole lines of text, and the runs between them."""
         raw = self._take(b"")
         if not raw:
             return []
@@ -184,30 +185,32 @@ class Decoder:
         for found in _LINE.finditer(raw):
             text = found[0].rstrip(_SEPARATORS)
             if is_whole and self._is_text(text):
-                events += self._run(raw[begin : found.start()])
-                events.append(TextLine(found[0], self._last))
+                events += self._events_of_run(raw[begin : found.start()])
+                events.append(TextLine(found[0], self._last_at))
                 begin = found.end()
             is_whole = True
-        events += self._run(raw[begin:])
+        events += self._events_of_run(raw[begin:])
         self._is_mid_line = raw[-1] not in _LINE_END_BYTES
         return events
 
     def _is_text(self, line: bytes) -> bool:
         return bool(_TEXT.fullmatch(line)) and not _PROTOCOL_WORD.search(line) and self._head_bytes not in line
 
-    def _run(self, junk: bytes) -> list[Event]:
+    def _events_of_run(self, junk: bytes) -> list[Event]:
+        """Return the event of a run of junk that is not text. Separators alone are no event."""
         raw = junk.strip(_SEPARATORS)
         if not raw:
             return []
-        if self._is_echo(raw, self._last):
-            return [Echo(raw, self._last)]
-        return [Rejected(raw, self._last, Cause.NO_START, f"{len(raw)} bytes outside a frame")]
+        if self._is_echo(raw, self._last_at):
+            return [Echo(raw, self._last_at)]
+        return [Rejected(raw, self._last_at, Cause.NO_START, f"{len(raw)} bytes outside a frame")]
 
-    def _ended(self, raw: bytes, at: float) -> Event:
+    def _event_of_ended(self, raw: bytes, at: float) -> Event:
         return Echo(raw, at) if self._is_echo(raw, at) else parse(raw, at, self._head)
 
-    def _unended(self, *, by_silence: bool = False) -> list[Event]:
-        raw, at = self._take(b""), self._last
+    def _take_unended(self, *, by_silence: bool = False) -> list[Event]:
+        """Empty the buffer of a frame without `#`. Return its event."""
+        raw, at = self._take(b""), self._last_at
         if self._is_echo(raw, at):
             return [Echo(raw, at)]
         found = self._matcher.fullmatch_unended(raw)

@@ -11,7 +11,7 @@ from gateway.drivers.yahboom.protocol.sensors import (
     SENSOR_FIELDS,
     SENSOR_WORDS,
     FrameWords,
-    Reject,
+    RejectedField,
     read_sensors,
     sensors_matcher,
 )
@@ -60,7 +60,7 @@ def parse(raw: bytes, at: float, head: str) -> Event:
             return Rejected(raw, at, Cause.BAD_NUMBER, f"{word.decode()} {_printable(text)}")
     if table is _ARM:
         degs = [float(text) for text in texts]
-        rejects = (Reject(f"J{i}", texts[i - 1].decode()) for i, deg in enumerate(degs, 1) if deg > JOINT_MAX)
+        rejects = (RejectedField(f"J{i}", texts[i - 1].decode()) for i, deg in enumerate(degs, 1) if deg > JOINT_MAX)
         return ArmReading(raw, at, tuple(deg if deg <= JOINT_MAX else None for deg in degs), tuple(rejects))
     gx, gy, gz, ax, ay, az = map(float, texts)
     return ImuReading(raw, at, (gx, gy, gz), (ax, ay, az))

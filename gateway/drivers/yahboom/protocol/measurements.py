@@ -9,7 +9,7 @@ from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Fields, Sens
 from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
 from schemas.words import FrameVerdict, Mode
 
-_PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.published) for each in SENSOR_FIELDS)
+_PUBLISHED = tuple((each.measurement, each.attribute, each.topic, each.to_message) for each in SENSOR_FIELDS)
 _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", "accel_z_raw")
 
 

@@ -24,7 +24,7 @@ from gateway.drivers.yahboom.protocol.frames import (
     parse_sent,
 )
 from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES, candidate_modes
-from gateway.drivers.yahboom.protocol.sensors import ATTRIBUTES, Reject, Sensors
+from gateway.drivers.yahboom.protocol.sensors import ATTRIBUTES, RejectedField, Sensors
 from gateway.drivers.yahboom.protocol.timing import (
     DIGITLESS_OPEN_S,
     FRAME_S,
@@ -312,11 +312,11 @@ class Profile:
             names -= _STM32_CONSTANTS
         return frozenset(names - self._out_of_range(event))
 
-    def rejects(self, event: Sensors) -> tuple[Reject, ...]:
+    def rejects(self, event: Sensors) -> tuple[RejectedField, ...]:
         """Return the rejected fields of a frame, and those that are out of range only for this kind of car."""
         words = {"battery": ("PV", event.voltage_v), "grayscale": ("GS", event.grayscale)}
         own = (words[name] for name in sorted(self._out_of_range(event)))
-        return (*event.rejects, *(Reject(word, f"{value:g}") for word, value in own))
+        return (*event.rejects, *(RejectedField(word, f"{value:g}") for word, value in own))
 
     def _out_of_range(self, event: Sensors) -> set[str]:
         """Return the fields that are out of the range of this car."""

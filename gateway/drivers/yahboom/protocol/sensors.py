@@ -1,7 +1,7 @@
-"""The sensors frame: one row per field, in wire order, the reading of a frame, and its parser.
+"""The sensors frame: a table of its fields in wire order, its reading (`Sensors`), and the parser that makes one.
 
-The rows drive the parser, the fillers of `modes`, and the published messages. A new field is a row of `SENSOR_FIELDS`,
-an attribute of `Sensors`, and a variable in `read_sensors`.
+The parser, the published messages and the signatures of the modes (`modes`) follow from the table. A new field is a row
+of `SENSOR_FIELDS`, an attribute of `Sensors`, and a variable in `read_sensors`.
 """
 
 import re
@@ -24,9 +24,10 @@ _BITS_4: Final = {left + right: (*_BITS_2[left], *_BITS_2[right]) for left in _B
 class SensorField:
     """One field of the sensors frame.
 
-    `measurement` is its name in modes, profiles and conditions, and of its topic `sensor/<measurement>`. `attribute` is
-    its name in `Sensors`. `read` returns None for bits that are neither 0 nor 1. `published` turns the value into the
-    fields of the message. `maximum` is the upper end of the range of a number; the lower end is 0.
+    `measurement` is its name in modes, profiles, conditions and in its topic `sensor/<measurement>`. `attribute` is its
+    name in `Sensors`, `word` its name in the frame. `pattern` matches the text of its value. `read` turns that text
+    into the value, or into None for bits that are neither 0 nor 1. `to_message` turns the value into the fields of its
+    message. `maximum` is the upper end of the range of a number; the lower end is 0.
     """
 
     measurement: str
@@ -34,7 +35,7 @@ class SensorField:
     word: bytes
     pattern: bytes
     read: Callable[[bytes], Any]
-    published: Callable[[Any], Fields]
+    to_message: Callable[[Any], Fields]
     maximum: float | None = None
 
     @property
@@ -61,9 +62,9 @@ def _sides(bits: tuple[bool, bool]) -> Fields:
     return {"left": bits[0], "right": bits[1]}
 
 
-# docs/reference/protocol.md#ranges and docs/reference/protocol.md#spellings. A number is unsigned, with decimals only
-# in CSB and PV. Bits are digits. `[0-9]` in a bytes pattern is ASCII only. The ranges are those of all cars: a battery
-# of three cells, a grayscale of 12 bits. `Profile` has those of one car.
+# docs/reference/protocol.md#ranges and docs/reference/protocol.md#spellings. Numbers have no sign, and only CSB and PV
+# have decimals. A field of bits may contain any digit here; `read` rejects those that are not 0 or 1. The maxima are
+# the highest of any car: a battery of three cells, a grayscale of 12 bits. `Profile` has the maxima of one car.
 SENSOR_FIELDS: Final = (
     SensorField("range", "range_cm", b"CSB", rb"[0-9]+(?:\.[0-9]+)?", float, _range, 1200.0),
     SensorField(
@@ -96,8 +97,8 @@ ATTRIBUTES: Final = {field.measurement: field.attribute for field in SENSOR_FIEL
 
 
 @dataclass(frozen=True, slots=True)
-class Reject:
-    """One field of a good frame whose value is out of its range."""
+class RejectedField:
+    """One field of a good frame whose value is out of its range. `word` is its name in the frame."""
 
     word: str
     text: str
@@ -108,8 +109,9 @@ class Sensors(NamedTuple):
     """The sensors frame, each field as on the wire. None where the field was rejected.
 
     `at` is the time of its last byte. `range_cm` 0 means no echo, not a distance. `line` is left-outer, left-inner,
-    right-inner, right-outer. `obstacle` is as on the wire; `Profile.obstacle` undoes the inversion of following.
-    `Profile.measured` tells measurements from filler. `modes.candidate_modes` tells which modes send this text.
+    right-inner, right-outer. In mode following, the car sends `obstacle` inverted; `Profile.obstacle` undoes that. In
+    most modes, some fields are constant filler; `Profile.measured` tells which fields are measured.
+    `modes.candidate_modes` tells which modes send this text.
     """
 
     # A named tuple: creating a frozen dataclass of this size costs as much as decoding the frame.
@@ -121,13 +123,15 @@ class Sensors(NamedTuple):
     line: tuple[bool, bool, bool, bool] | None
     obstacle: tuple[bool, bool] | None
     light: tuple[bool, bool] | None
-    rejects: tuple[Reject, ...] = ()
-    terminated: bool = True  # by `#`
-    by_silence: bool = False  # not terminated, and nothing followed for 50 ms or to the end: a `#` may be late
+    rejects: tuple[RejectedField, ...] = ()
+    terminated: bool = True
+    """True if the frame ends with `#`."""
+    by_silence: bool = False
+    """True if there is no `#`, but no other byte either for 50 ms or until the link ended. The `#` may still come."""
 
 
-# These are unpacked by hand below, because a loop over the table would take 1.5 us more per frame: a third of the
-# decoding.
+# `read_sensors` reads the fields one by one, because a loop over the table would take 1.5 us more per frame: a third of
+# the decoding.
 _RANGE, _BATTERY, _GRAYSCALE, _LINE, _OBSTACLE, _LIGHT = SENSOR_FIELDS
 _CSB_MAX, _PV_MAX, _GS_MAX = _RANGE.maximum or 0.0, _BATTERY.maximum or 0.0, _GRAYSCALE.maximum or 0.0
 # Bind these once here, because looking a method up in the function takes longer in CPython 3.11.
@@ -138,17 +142,18 @@ assert tuple(field.attribute for field in SENSOR_FIELDS) == Sensors._fields[2:8]
 
 
 def read_sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, by_silence: bool = False) -> Sensors:
-    """Return the reading of a match of a sensors pattern; reject each field that is out of range."""
+    """Return the reading of a match of `sensors_pattern`. Fields out of range are None, and listed in `rejects`."""
     csb, pv, gs, lf, hw, gm = texts = found.groups()
     range_cm, voltage_v, grayscale = float(csb), float(pv), int(gs)
     line, obstacle, light = _read_line(lf), _read_obstacle(hw), _read_light(gm)
     reading = Sensors(found[0], at, range_cm, voltage_v, grayscale, line, obstacle, light, (), terminated, by_silence)
+    # Each field of bits is a tuple, which is true even if all its bits are False, or None if it cannot be read.
     if range_cm <= _CSB_MAX and voltage_v <= _PV_MAX and grayscale <= _GS_MAX and line and obstacle and light:
         return reading
     rejected = [(field, text) for field, text in zip(SENSOR_FIELDS, texts, strict=True) if not field.accepts(text)]
-    rejects = tuple(Reject(field.word.decode(), text.decode()) for field, text in rejected)
-    without: dict[str, Any] = dict.fromkeys((field.attribute for field, _ in rejected), None)
-    return reading._replace(rejects=rejects, **without)
+    rejects = tuple(RejectedField(field.word.decode(), text.decode()) for field, text in rejected)
+    removed: dict[str, Any] = dict.fromkeys((field.attribute for field, _ in rejected), None)
+    return reading._replace(rejects=rejects, **removed)
 
 
 def sensors_pattern(filler: Mapping[str, bytes] | None = None, *, head: bytes = b"[0-9A-Za-z]+") -> bytes:
@@ -165,7 +170,7 @@ def sensors_pattern(filler: Mapping[str, bytes] | None = None, *, head: bytes = 
 
 
 class SensorsMatcher:
-    """Matches the sensors frames of cars with one head."""
+    """Matches the sensors frames that begin with one head: the first word of a frame, such as `4WD`."""
 
     def __init__(self, head: str) -> None:
         text = sensors_pattern(head=re.escape(head.encode()))
@@ -185,7 +190,7 @@ def sensors_matcher(head: str) -> SensorsMatcher:
     return SensorsMatcher(head)
 
 
-_ANY_HEAD: Final = re.compile(rb"\$([A-Za-z0-9]{2,8})" + sensors_pattern(head=b"")[2:] + rb"#?")
+_ANY_HEAD: Final = re.compile(sensors_pattern(head=rb"([A-Za-z0-9]{2,8})") + rb"#?")
 
 
 def head_of(raw: bytes) -> str | None:

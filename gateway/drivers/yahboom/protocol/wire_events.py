@@ -7,7 +7,7 @@ has, are in `gateway.control.driver`. Everything that depends on the platform is
 from dataclasses import dataclass
 
 from gateway.control.driver import Echo, Rejected, TextLine
-from gateway.drivers.yahboom.protocol.sensors import Reject, Sensors
+from gateway.drivers.yahboom.protocol.sensors import RejectedField, Sensors
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class ArmReading:
     raw: bytes
     at: float
     joint_deg: tuple[float | None, ...]
-    rejects: tuple[Reject, ...] = ()
+    rejects: tuple[RejectedField, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
