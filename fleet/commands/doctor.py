@@ -13,12 +13,12 @@ from fleet.client.refused_by_hub import why_refused
 from fleet.commands.fleets import open_client
 from fleet.commands.group import hint_options, say
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.output import echo_safely, watched
+from fleet.commands.output import echo_safely, with_progress
 from fleet.commands.params import SessionPath, complete_car, no_cars
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import is_session
 from fleet.recording.tools.session_findings import SessionCheckup
-from fleet.recording.tools.summary import growing, total
+from fleet.recording.tools.summary import growth_check, total
 from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean
 
@@ -98,8 +98,8 @@ def _show_session(path: Path, car: str, *, as_json: bool) -> None:
         session = Session(path)
     except NoSession as error:
         raise click.ClickException(str(error)) from None
-    checkup, progress = SessionCheckup(car=car), watched("doctor", total(session))
-    verdict = verify(session, lambda rows: checkup.watch(progress(rows)), growing(session))
+    checkup, progress = SessionCheckup(car=car), with_progress("doctor", total(session))
+    verdict = verify(session, lambda rows: checkup.watch(progress(rows)), growth_check(session))
     if car and car not in checkup.cars:
         near = did_you_mean(car, checkup.cars) or f"Cars: {', '.join(sorted(checkup.cars))}."
         raise click.ClickException(f'No car "{car}" in {session.name}. {near}')

@@ -50,8 +50,8 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
         found = ask_status(bus, fleet)
         if not found:
             raise not_running(fleet, connect)
-        records = not as_json and any(each.session and not each.unrecorded for each in found)
-        warning = _warning_of_recorder(bus, fleet) if records else ""
+        is_recorded = any(each.session and not each.unrecorded for each in found)
+        warning = _warning_of_recorder(bus, fleet) if is_recorded and not as_json else ""
     for each in found:
         if as_json:
             click.echo(messages.to_json(each))
@@ -129,16 +129,16 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:
     """Wait for the end of the shutdown. Return the last status, and whether the supervisor is gone."""
-    deadline, seen = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
+    deadline, last_sign_at = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
     count, gone = 0, False
     while time.monotonic() < deadline and not gone:
         if len(received) != count:
-            count, seen = len(received), time.monotonic()
+            count, last_sign_at = len(received), time.monotonic()
             if received[-1].state == RunState.ENDED:
                 break
         elif bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
-            seen = time.monotonic()
-        gone = time.monotonic() - seen > SUPERVISOR_LOST_S
+            last_sign_at = time.monotonic()
+        gone = time.monotonic() - last_sign_at > SUPERVISOR_LOST_S
         time.sleep(FLEET_DOWN_POLL_S)
     return received[-1] if received else None, gone
 
@@ -172,11 +172,12 @@ def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str)
     fleet = ctx.params.get("fleet") or ctx.find_root().params.get("fleet") or keys.DEFAULT_FLEET
     connect = ctx.params.get("connect") or ctx.find_root().params.get("connect")
     with suppress(click.ClickException, ValueError, OSError):
-        return [name for name in _logged(_last_run(connect, fleet)) if name.startswith(incomplete)]
+        return [name for name in _names_of_logs(_last_run(connect, fleet)) if name.startswith(incomplete)]
     return []
 
 
-def _logged(directory: Path) -> list[str]:
+def _names_of_logs(directory: Path) -> list[str]:
+    """Return the cars and services that have a log in this directory."""
     return sorted({each.name.partition(".")[0].lstrip("@") for each in directory.glob("*.log*")})
 
 
@@ -190,11 +191,12 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
 
     Services: supervisor, hub, simulator, coordinator, recorder.
     """
-    directory = _directory(connect, keys.check_name(fleet, "fleet name"))
-    found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
-    path = next((each for each in found if each.parent == directory and _either(each)), None)
+    directory = _log_directory(connect, keys.check_name(fleet, "fleet name"))
+    candidates = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
+    # A name with a `/` could be that of a file elsewhere.
+    path = next((each for each in candidates if each.parent == directory and _has_log(each)), None)
     if path is None:
-        there = _logged(directory)
+        there = _names_of_logs(directory)
         near = did_you_mean(name, there) or f"There are: {', '.join(there) or 'none'}."
         raise click.UsageError(f'There is no log of "{name}". {near}')
     with signals.sigterm_interrupts():
@@ -205,7 +207,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
             raise SystemExit(startup.INTERRUPTED) from None
 
 
-def _directory(connect: str | None, fleet: str) -> Path:
+def _log_directory(connect: str | None, fleet: str) -> Path:
     """Return the log directory of the running fleet if it is on this machine, else of the last run."""
     try:
         with Bus.open(connect) as bus:
@@ -222,13 +224,14 @@ def _last_run(connect: str | None, fleet: str) -> Path:
     """Return the log directory of the last run here."""
     place = runs_directory(fleet, resolve_endpoint(connect))
     # A run that was refused has no logs.
-    newest = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
-    if not newest:
+    runs = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
+    if not runs:
         raise click.ClickException(f"No logs yet: {keys.describe_fleet(fleet)} has not run here. `fleet up` starts it.")
-    return newest[-1]
+    return runs[-1]
 
 
-def _either(path: Path) -> bool:
+def _has_log(path: Path) -> bool:
+    """Return True if the log exists, or the older file to which a rollover has renamed it."""
     return path.exists() or path.with_suffix(".log.1").exists()
 
 
@@ -267,5 +270,5 @@ def _is_rolled_over(path: Path, file: IO[str]) -> bool:
     try:
         now = path.stat()
     except FileNotFoundError:
-        return False  # between two files
+        return False  # it was renamed, and the next line creates the new file
     return (there.st_dev, there.st_ino) != (now.st_dev, now.st_ino)

@@ -1,4 +1,4 @@
-"""Output of readings: as a line, a JSON object or a table."""
+"""What commands print: readings as lines or JSON objects, tables, CSV, and progress bars."""
 
 import csv
 import io
@@ -9,7 +9,7 @@ import sys
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import chain, islice, repeat
 from typing import Any, Final, TypeVar
 
@@ -26,10 +26,9 @@ from schemas.process import stdio
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
 ROWS_AT_ONCE: Final = 1024
-"""Maximum number of rows of a table that are Python objects at the same time."""
+"""Rows of a block. Tables are made and printed in blocks, because a million rows would fill the memory."""
 MAX_CELL: Final = 60
-"""Maximum characters of a cell. There is a limit because anybody may have written the names and texts of a
-recording."""
+"""Maximum characters of a cell of a recording. Anybody may have written its names and texts, of any length."""
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -66,13 +65,14 @@ def show_table(
 
     colors: the color of each row, as #rrggbb. On a terminal, each row begins with a dot of its color.
     """
-    dots = [f"{_dot(color)} " for color in colors] if stdio.shows_colors(sys.stdout) else []
-    dots = dots or [""] * len(rows)
+    has_dots = bool(colors) and stdio.shows_colors(sys.stdout)
+    dots = [f"{_dot(color)} " for color in colors] if has_dots else [""] * len(rows)
+    margin = "  " if has_dots else ""
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
     if sys.stdout.isatty() or "COLUMNS" in os.environ:  # a pipe gets every column
-        widths = fit_columns(widths, shutil.get_terminal_size().columns - 2 * any(dots), optional)
+        widths = fit_columns(widths, shutil.get_terminal_size().columns - len(margin), optional)
     header = "  ".join(name.upper().ljust(width) for name, width in widths.items()).rstrip()
-    click.echo(f"{'  ' * any(dots)}{click.style(header, bold=True)}")
+    click.echo(f"{margin}{click.style(header, bold=True)}")
     for row, dot in zip(rows, dots, strict=True):
         cells = "  ".join(_shortened(row[name], width) for name, width in widths.items())
         click.echo(f"{dot}{cells.rstrip()}")
@@ -81,12 +81,11 @@ def show_table(
 def aligned(rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield one line for each row, with aligned columns.
 
-    The rows are read in blocks, because a million rows would not fit into memory. A later block may make a column
-    wider, but never narrower.
+    The rows are read in blocks of ROWS_AT_ONCE. A later block may make a column wider, but never narrower.
     """
-    left = iter(rows)
+    remaining = iter(rows)
     widths: Iterable[int] = repeat(0)
-    while block := list(islice(left, ROWS_AT_ONCE)):
+    while block := list(islice(remaining, ROWS_AT_ONCE)):
         columns = zip(*block, strict=True)
         widths = [max(width, *map(_width, column)) for width, column in zip(widths, columns, strict=False)]
         for row in block:
@@ -113,8 +112,8 @@ def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     On a terminal, control characters are printed as escapes. Files and pipes get the cells unchanged.
     """
     on_terminal = sys.stdout.isatty()
-    left = chain((header,), rows)
-    while block := [["" if cell is None else cell for cell in row] for row in islice(left, ROWS_AT_ONCE)]:
+    remaining = chain((header,), rows)
+    while block := [["" if cell is None else cell for cell in row] for row in islice(remaining, ROWS_AT_ONCE)]:
         lines = io.StringIO(newline="")
         csv.writer(lines, lineterminator="\n" if on_terminal else "\r\n").writerows(block)
         text = lines.getvalue()
@@ -140,21 +139,18 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
     bar: Any = None
     began = time.monotonic()
     done = 0
+    with ExitStack() as stack:
 
-    def advance(count: int) -> None:
-        nonlocal bar, done
-        done += count
-        if bar is not None:
-            bar.update(count)
-        elif total and sys.stderr.isatty() and time.monotonic() - began > PROGRESS_BAR_DELAY_S:
-            bar = click.progressbar(length=total, label=label, file=sys.stderr).__enter__()
-            bar.update(done)
+        def advance(count: int) -> None:
+            nonlocal bar, done
+            done += count
+            if bar is not None:
+                bar.update(count)
+            elif total and sys.stderr.isatty() and time.monotonic() - began > PROGRESS_BAR_DELAY_S:
+                bar = stack.enter_context(click.progressbar(length=total, label=label, file=sys.stderr))
+                bar.update(done)
 
-    try:
         yield advance
-    finally:
-        if bar is not None:
-            bar.render_finish()
 
 
 def _value(value: object) -> str:
@@ -166,17 +162,18 @@ def _value(value: object) -> str:
 
 
 def _unit(unit: str) -> str:
+    """Return a unit with the blank before it. Empty for a field without a unit, or with unit 1 (a share)."""
     return f" {unit}" if unit not in ("", "1") else ""
 
 
-def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
-    """Return a function that passes on items and shows a progress bar."""
+def with_progress(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
+    """Return a function that passes on items and shows a progress bar for them."""
 
-    def watch(items: Iterable[T]) -> Iterator[T]:
+    def pass_on(items: Iterable[T]) -> Iterator[T]:
         with progress_bar(label, total) as advance:
             for count, item in enumerate(items, 1):
                 yield item
                 if count % _PROGRESS_STEP == 0:
                     advance(_PROGRESS_STEP)
 
-    return watch
+    return pass_on

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from schemas.rights import People
 
 POLL_INTERVAL_S: Final = 0.25
-
-
 _WEEK_S: Final = 7 * 86_400.0
 
 
@@ -135,7 +133,7 @@ conditions under `pin:` in the fleet file, are removed last. Files of marked ses
     "--site",
     default="",
     metavar="SITE",
-    help="Record at this site, beside the fleet's main recorder. While that one can be reached, it answers commands.",
+    help="Record at this site, beside the fleet's main recorder, which answers all commands while it can be reached.",
 )
 @connect_option()
 @fleet_option()
@@ -181,7 +179,7 @@ def run(
     try:
         identity = service(Service.RECORDER, keys.check_name(site, "site") if site else "")
         with Bus.open(connect, start_hub=True, identity=identity) as bus:
-            pins, people = _of_file(fleet_file)
+            pins, people = _pins_and_people(fleet_file)
             recorder = Recorder(bus, fleet, place, options, site=site, pins=pins, people=people, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
@@ -206,7 +204,6 @@ def run(
         raise click.ClickException(
             f"No session can be created in {place}: {error.strerror}. Name another place with --sessions."
         ) from None
-    lost = {"drops": dict(outcome.drops), "missed": dict(outcome.missed)}
     session = outcome.session  # a new session may have begun meanwhile
     _say(
         as_json,
@@ -215,7 +212,8 @@ def run(
             "state": RecorderState.CLOSED,
             "messages": outcome.messages,
             "bytes": outcome.bytes,
-            **lost,
+            "drops": dict(outcome.drops),
+            "missed": dict(outcome.missed),
         },
         f"{session}: {outcome.messages} messages, {outcome.bytes} bytes, "
         f"{_count(outcome.drops, 'dropped here')}, {_count(outcome.missed, 'missed on the bus')}",
@@ -235,10 +233,10 @@ def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FB
     click.echo(json.dumps(values) if as_json else words)
 
 
-def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[], People | None]]":
-    """Return the pin rules of a fleet file, and a function that reads its people again at each call.
+def _pins_and_people(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[], People | None]]":
+    """Return the pin rules of a fleet file, and a function that reads the people of the file again at each call.
 
-    If the file has mistakes, recording continues without pins.
+    If the file has mistakes, there are no rules, and the recording continues without pins.
     """
     from fleet.fleetfile.fleet_file import people_table, read_fleet, read_people
 
@@ -250,6 +248,7 @@ def _of_file(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Callable[[]
         return None if listed is None else people_table(listed)
 
     try:
+        # Only the rules count here: cars without a link, or a plan that is not beside the file, do no harm.
         return read_fleet(fleet_file, unbound=True, moved=True).pins, people
     except ValueError as error:  # a BadFile
         _warn(f"no condition under pin: in {fleet_file} is pinned: {error}")
@@ -267,8 +266,8 @@ def _count(lost: Mapping[str, int], what: str) -> str:
     return f"{sum(lost.values())} {what} (most on {worst}: {lost[worst]})"
 
 
-def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
-    """Send a command to the recorder and return its status. Raises click's errors."""
+def _connect_and_ask(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
+    """Connect to the bus, then do as `_ask`."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         return _ask(bus, the_fleet(bus, fleet), verb, **fields)
@@ -304,7 +303,7 @@ def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
             worst = max(counts, key=lambda key: counts[key])
             echo_safely(f"{sum(counts.values())} {words}, most of {worst}: {counts[worst]}")
     if found.recovered:
-        echo_safely(f"{sum(found.recovered.values())} were missed at first and had again from their publishers")
+        echo_safely(f"{sum(found.recovered.values())} were missed at first, and recorded later from their publishers")
     for words in (found.error, found.warning):
         if words:
             say(printable_lines(words))
@@ -315,7 +314,7 @@ def _show_status(found: Any, *, as_json: bool, site: str = "") -> None:
 @bus_options
 def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Start a new session after `fleet record stop`."""
-    _show_status(_query(RecorderVerb.START, connect, fleet), as_json=as_json)
+    _show_status(_connect_and_ask(RecorderVerb.START, connect, fleet), as_json=as_json)
 
 
 @record.command(epilog="\b\nexample:\n  fleet record stop")
@@ -323,7 +322,7 @@ def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Close the session. The recorder keeps running and waits for `fleet record start`."""
-    _show_status(_query(RecorderVerb.STOP, connect, fleet), as_json=as_json)
+    _show_status(_connect_and_ask(RecorderVerb.STOP, connect, fleet), as_json=as_json)
 
 
 @record.command(epilog="\b\nexample:\n  fleet record status")
@@ -351,7 +350,7 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and more than blanks")
-    found = _query(RecorderVerb.MARK, connect, fleet, text=text, by=by or default_sender(chosen_person()))
+    found = _connect_and_ask(RecorderVerb.MARK, connect, fleet, text=text, by=by or default_sender(chosen_person()))
     if why := why_unrecorded(found):
         raise click.ClickException(f"The mark is not in a file yet: {why}. `fleet record status` shows when it is.")
     click.echo(f"marked in {found.session}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import echo_safely, watched
+from fleet.commands.output import echo_safely, with_progress
 from fleet.commands.params import car_option, session_argument
 from fleet.commands.session_part import part_of
 from schemas import keys
@@ -100,7 +100,7 @@ class _RedecodeReport:
         part_of(session, None, None, self._cars)  # raises for unknown cars
         self.start_ns = overview(session).start_ns
         expressions = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in FRAME_KEYS]
-        self._items = of_session(watched("redecode", None)(session.messages(keys=expressions)), self._unread)
+        self._items = of_session(with_progress("redecode", None)(session.messages(keys=expressions)), self._unread)
 
     def differences(self) -> Iterator["ReadingDifference"]:
         """Yield the differences. Raises NoPlatform, and ClickException if there is nothing to decode."""

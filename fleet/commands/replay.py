@@ -49,7 +49,7 @@ def replay(
         found = Session(session)
         found.check()
         if save is not None:
-            refuse_target(save, found.segments)
+            check_target(save, found.segments)
         elif not has_display():
             raise click.ClickException(
                 f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
@@ -57,14 +57,14 @@ def replay(
         part = _part(found, cars, start, end)
         with tempfile.TemporaryDirectory() as scratch:
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
-            intact = True
+            must_say_damage = True
             try:
                 _export(found, out, part, cars)
-            except NoSession:  # the error names the damage itself
-                intact = False
+            except NoSession:
+                must_say_damage = False  # this error says it
                 raise
-            finally:
-                if found.damage and intact:
+            finally:  # only an export finds all damage
+                if found.damage and must_say_damage:
                     click.echo(printable_lines(f"{found.damage_words}; showing only the intact part"), err=True)
             if save is None:
                 sys.exit(_view(out))
@@ -72,8 +72,8 @@ def replay(
         raise click.ClickException(str(error)) from None
 
 
-def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
-    """Reject a target that is a recording, a device, or no .rrd file."""
+def check_target(save: Path, segments: Iterable[Path] = ()) -> None:
+    """Raise a UsageError for a target that is a recording, a device, or no .rrd file."""
     if save.suffix != ".rrd":
         raise click.UsageError(
             f"--save {save}: Rerun opens only files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
@@ -107,8 +107,8 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
     from fleet.replay.rerun.rrd_export import ExportFailed, export
 
     try:
-        with _bar(session) as seen:
-            replayed = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", seen=seen)
+        with _progress_bar(session) as advance:
+            replayed = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", on_read=advance)
     except ExportFailed as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
@@ -122,7 +122,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
 
 
 @contextmanager
-def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
+def _progress_bar(session: "Session") -> Iterator[Callable[[int], None]]:
     """Show a progress bar. Yield the function to call with the number of newly read messages."""
     from fleet.replay.rerun.rrd_export import count_of
 

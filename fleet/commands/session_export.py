@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from fleet.commands.output import echo_safely, watched
+from fleet.commands.output import echo_safely, with_progress
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools import one_schema, table_export
 from fleet.recording.tools.summary import total
@@ -20,7 +20,7 @@ def export_tables(session: Session, out: Path, form: str, *, nanoseconds: bool =
     """Write tables in the format `csv` or `parquet`."""
     sink = ParquetNsSink if nanoseconds else FORMATS[form]
     with atomic_directory(out) as new:
-        done = table_export.export(watched(f"export {form}", total(session))(session.rows()), new, sink)
+        done = table_export.export(with_progress(f"export {form}", total(session))(session.rows()), new, sink)
         if not done.rows:
             raise NoSession(f"{session.path} has no intact message: {session.damage_words or 'it is empty'}")
     click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
@@ -39,7 +39,7 @@ def export_ros2(session: Session, out: Path) -> None:
 
     with atomic_directory(out) as new:
         new.rmdir()  # the writer creates the directory itself
-        bag = write_bag(watched("export ros2", total(session))(session.rows()), new)
+        bag = write_bag(with_progress("export ros2", total(session))(session.rows()), new)
         if not bag.messages:
             why = session.damage_words or "it is empty, or nothing in it is protobuf"
             raise NoSession(f"{session.path} has no message for a bag: {why}")
@@ -52,7 +52,7 @@ def export_ros2(session: Session, out: Path) -> None:
 def export_foxglove(session: Session, out: Path) -> None:
     """Write one MCAP file with one schema per topic, and a layout for the cars of the session."""
     with atomic_directory(out) as new:
-        rows = watched("export foxglove", total(session))(session.rows())
+        rows = with_progress("export foxglove", total(session))(session.rows())
         done = one_schema.write(rows, session.extras(), new / f"{session.name.removesuffix('.mcap')}.mcap")
         if not done.messages:
             raise NoSession(f"{session.path} has no intact message: {session.damage_words or 'it is empty'}")

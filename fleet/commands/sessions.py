@@ -12,7 +12,7 @@ import click
 
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
-from fleet.commands.output import aligned, echo_safely, watched
+from fleet.commands.output import aligned, echo_safely, with_progress
 from fleet.commands.params import SessionPath, car_option, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.commands.session_part import part_of
@@ -48,15 +48,15 @@ sessions.add_command(vector)
 
 _COLUMNS: Final = ("session", "start", "state", "length", "size", "messages", "lost", "stops", "marks", "cars")
 
-_new_session = partial(
+_new_session_option = partial(
     click.option,
     "-o",
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
 )
-out_option = _new_session(help="Write the new session to DIR (default: SESSION-recovered, beside the session).")
-required_out_option = _new_session(required=True, help="Write the new session to DIR.")
+out_option = _new_session_option(help="Write the new session to DIR (default: SESSION-recovered, beside the session).")
+required_out_option = _new_session_option(required=True, help="Write the new session to DIR.")
 
 
 @contextmanager
@@ -196,12 +196,12 @@ def info(session: Path, *, as_json: bool) -> None:
         about.marks = marks_of(found, about)
         about.stops = stops_of(found, about)
         description = found.description
-        nothing = not about.messages and about.state in (SessionState.CUT, SessionState.DAMAGED)
+        is_unreadable = not about.messages and about.state in (SessionState.CUT, SessionState.DAMAGED)
     origin = description.origin if description is not None else {}
     if as_json:
         more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}
         click.echo(json.dumps({**about.to_dict(), **more, "origin": origin}))
-        raise SystemExit(1 if nothing else 0)
+        raise SystemExit(1 if is_unreadable else 0)
     echo_safely(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
     if description is not None:
         versions = ", ".join(f"{name} {version}" for name, version in description.versions.items())
@@ -209,7 +209,7 @@ def info(session: Path, *, as_json: bool) -> None:
     if made := origin_words(origin):
         echo_safely(f"  made by {made}")
     _say_contents(about)
-    raise SystemExit(1 if nothing else 0)
+    raise SystemExit(1 if is_unreadable else 0)
 
 
 def _say_contents(about: "SessionSummary") -> None:
@@ -218,8 +218,8 @@ def _say_contents(about: "SessionSummary") -> None:
     click.echo(f"  from {began}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost")
     if about.clock_back_s:
         click.echo(
-            f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is the time that passed "
-            "on that clock"
+            f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length counts the time before and "
+            "after that step"
         )
     click.echo(f"  cars: {', '.join(map(printable, about.cars)) or 'none'}; stops: {about.stops}")
     for mark in about.marks:
@@ -247,12 +247,12 @@ def verify(session: Path, *, as_json: bool) -> None:
 
     The command lists exactly what is missing.
     """
-    from fleet.recording.tools.summary import growing, total
-    from fleet.recording.tools.verify import verify as look
+    from fleet.recording.tools.summary import growth_check, total
+    from fleet.recording.tools.verify import verify as verify_session
 
     with _session_errors():
         found = _open(session)
-        verdict = look(found, watched("verify", total(found)), growing(found))
+        verdict = verify_session(found, with_progress("verify", total(found)), growth_check(found))
     if as_json:
         click.echo(json.dumps(verdict.to_dict()))
     else:
@@ -266,14 +266,14 @@ def verify(session: Path, *, as_json: bool) -> None:
 @out_option
 def recover(session: Path, out: Path | None) -> None:
     """Repair a damaged recording: copy everything readable into a new session."""
+    from fleet.recording.tools import transform
     from fleet.recording.tools.summary import total
-    from fleet.recording.tools.transform import recover as make
 
     with _session_errors():
         found = _open(session)
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _session_errors(out):
-        count, words = make(found, out, watched("recover", total(found)))
+        count, words = transform.recover(found, out, with_progress("recover", total(found)))
     echo_safely(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
 
 
@@ -290,15 +290,15 @@ def merge(several: tuple[Path, ...], out: Path) -> None:
 
     A message that several recorders received is written once. The recorders' clocks decide the order of the messages.
     """
-    from fleet.recording.tools.transform import merge as make
+    from fleet.recording.tools import transform
 
     if len({each.resolve() for each in several}) < 2:
         raise click.UsageError("name several sessions: fleet sessions merge ONE OTHER --out DIR")
     with _session_errors():
         found = [_open(each) for each in several]
     with _session_errors(out):
-        count, twice, lost = make(found, out, watched("merge", None))
-    echo_safely(f"{out}: {count} messages; {twice} more came again{f'; lost: {lost}' if lost else ''}")
+        count, duplicates, lost = transform.merge(found, out, with_progress("merge", None))
+    echo_safely(f"{out}: {count} messages; {duplicates} duplicates left out{f'; lost: {lost}' if lost else ''}")
 
 
 @sessions.command(
@@ -315,13 +315,13 @@ examples:
 @required_out_option
 def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
     """Copy a part of a session into a new session."""
-    from fleet.recording.tools.transform import cut as make
+    from fleet.recording.tools import transform
 
     with _session_errors():
         found = _open(session)
         selection = part_of(found, start, end, cars)
     with _session_errors(out):
-        count = make(found, out, selection, cars, watched("cut", None))
+        count = transform.cut(found, out, selection, cars, with_progress("cut", None))
     echo_safely(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 
@@ -361,9 +361,9 @@ def export(
     """Write a session to a new directory: as tidy tables, as a ROS 2 bag, or as a file for Foxglove.
 
     There is one table for each type of message. Its columns are key, car, log_time, publish_time, sequence, then the
-    fields. Times are UTC, in Parquet in microseconds. The names of columns contain the units. In Parquet, the units are
-    also in the metadata of the fields. Messages that are not protobuf are in the table `other`. A bag contains only
-    standard messages (docs/how-to/look-at-a-recording.md).
+    fields. Times are UTC; Parquet has them in microseconds. The names of columns contain the units. In Parquet, the
+    units are also in the metadata of the fields. Messages that are not protobuf are in the table `other`. A bag
+    contains only standard messages (docs/how-to/look-at-a-recording.md).
     """
     from fleet.commands.session_export import export_foxglove, export_ros2, export_tables
 

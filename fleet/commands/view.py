@@ -14,7 +14,7 @@ import click
 
 from fleet.commands.options import bus_options
 from fleet.commands.params import Duration
-from fleet.commands.replay import quiet_rerun, refuse_target
+from fleet.commands.replay import check_target, quiet_rerun
 from schemas import keys
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, co
         raise click.UsageError(f"--memory {memory} is not allowed: write 500MB, 1GiB or 25%")
     keys.check_name(fleet, "fleet name")
     if save is not None:
-        refuse_target(save)
+        check_target(save)
         if not save.resolve().parent.is_dir():
             raise click.UsageError(f"--save {save}: there is no directory {save.parent}")
     quiet_rerun()

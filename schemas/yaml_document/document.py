@@ -28,6 +28,7 @@ MAX_YAML_DEPTH: Final = 24
 MAX_YAML_VALUES: Final = 20_000
 """Maximum number of values with all aliases expanded: nine levels of nine aliases would make 387 million."""
 _MAX_INTEGER: Final = 2**53
+"""Up to this, a float has every integer exactly. JSON readers may use floats for all numbers (JavaScript does)."""
 _TOO_LARGE: Final = f"the file has more than {MAX_YAML_BYTES // 1024} KiB, which is the limit"
 _COLLECTIONS: Final = {yaml.MappingNode: "tag:yaml.org,2002:map", yaml.SequenceNode: "tag:yaml.org,2002:seq"}
 _MAX_PROBLEMS_LISTED: Final = 50
@@ -107,8 +108,8 @@ def name_special_file(path: Path) -> str:
     return kinds.get(stat.S_IFMT(mode), "device")
 
 
-def _similar_file(path: Path) -> str:
-    """Return a question with the likely YAML file of the same directory. Empty if there is none."""
+def _suggest_file(path: Path) -> str:
+    """Return `Did you mean fleet.yaml?` for a likely file of the same directory. Empty if there is none."""
     with suppress(OSError):
         names = sorted(each.name for each in path.parent.iterdir() if each.suffix == ".yaml" and each.exists())
         return did_you_mean(path.name, names)
@@ -120,26 +121,30 @@ def read_text(path: Path, source: str | None = None) -> str:
     source = str(path) if source is None else source
     try:
         kind = name_special_file(path)
-        data = b""
-        if not kind:
-            with path.open("rb") as file:
-                data = file.read(MAX_YAML_BYTES + 1)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        if isinstance(error, FileNotFoundError):
-            raise _bad_file(source, f"there is no such file. {_similar_file(path)}".rstrip(" ."), 0, 0) from None
-        words = error.strerror if isinstance(error, OSError) else None
-        raise _bad_file(source, f"cannot be read: {words or error}") from None
+        data = b"" if kind else _read_start(path)
+    except FileNotFoundError:
+        raise _bad_file(source, f"there is no such file. {_suggest_file(path)}".rstrip(" ."), 0, 0) from None
+    except OSError as error:
+        raise _bad_file(source, f"cannot be read: {error.strerror or error}") from None
+    except ValueError as error:  # a NUL in the path
+        raise _bad_file(source, f"cannot be read: {error}") from None
     if kind:
         raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that file")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if len(data) > MAX_YAML_BYTES:
+        if len(data) > MAX_YAML_BYTES:  # the read may have cut a character in two
             raise _bad_file(source, _TOO_LARGE) from None
         line = data.count(b"\n", 0, error.start) + 1
         column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
         words = f"byte 0x{data[error.start]:02x} is not UTF-8. Save the file as UTF-8."
         raise _bad_file(source, words, line, column) from None
+
+
+def _read_start(path: Path) -> bytes:
+    """Return a file's bytes, at most one more than a file may have."""
+    with path.open("rb") as file:
+        return file.read(MAX_YAML_BYTES + 1)
 
 
 class Document:
@@ -153,8 +158,8 @@ class Document:
         self._problems: list[Problem] = []
         self._faulty: set[Where] = set()
         self._places: dict[Where, tuple[yaml.Mark | None, yaml.Node]] = {}
-        self._partial = PartialTree(None)
-        self._values = 0
+        self._partial = PartialTree(None)  # of the last `validate_partial`: translates its places to those of the text
+        self._value_count = 0
         self.tree: Any = None
         if len(text.encode(errors="surrogatepass")) > MAX_YAML_BYTES:
             raise _bad_file(source, _TOO_LARGE)
@@ -194,22 +199,25 @@ class Document:
         Call it after `validate`. `missing` has values for missing required fields. Returns None if too little remains.
         """
         dropped, added = set(self._faulty), dict[Where, object]()
+        # Without a faulty value, the value around it may be faulty in turn. So this can take one round for each level.
         for _ in range(MAX_YAML_DEPTH):
             self._partial = PartialTree(self.tree, dropped, added)
             try:
                 return model.model_validate_json(json.dumps(self._partial.tree), strict=True)
             except ValidationError as error:
-                for where, _, each in self._locate(error):
-                    if each["type"] == "missing" and where[-1] in missing:
+                for where, _on_key, each in self._locate(error):
+                    if each["type"] != "missing":
+                        dropped.add(where)
+                    elif where[-1] in missing:
                         added[where] = missing[str(where[-1])]
                     else:
-                        dropped.add(where[:-1] if each["type"] == "missing" else where)
+                        dropped.add(where[:-1])
             if () in dropped:
                 break
         return None
 
     def faulty_within(self, where: Where) -> bool:
-        """Return True if a field at this place is faulty. Then other faults at the place may only follow from that."""
+        """Return True if a field at this place is faulty. Other faults there may be only consequences of it."""
         place = self._partial.original(where)
         return any(each[:-1] == place for each in self._faulty if each)
 
@@ -228,16 +236,16 @@ class Document:
 
     def _add_problems(self, error: ValidationError, model: type[BaseModel]) -> None:
         schema = model.model_json_schema()
-        heads: dict[tuple[Where, bool, str], list[str]] = {}
+        allowed_of: dict[tuple[Where, bool, str], list[str]] = {}  # each member of a union allows something else
         for where, on_key, each in self._locate(error):
             if where in self._faulty:
                 continue
-            head, allowed = describe_error(each["type"], each, where, schema)
-            heads.setdefault((where, on_key, head), []).append(allowed)
-        for (where, on_key, head), allowed_words in heads.items():
-            allowed = " ".join(dict.fromkeys(word for word in allowed_words if word))
-            self._problems.append(self._problem_at(where, f"{head}. {allowed}" if allowed else head, on_key=on_key))
-        self._faulty.update(where for where, _, _ in heads)
+            fault, allowed = describe_error(each["type"], each, where, schema)
+            allowed_of.setdefault((where, on_key, fault), []).append(allowed)
+        for (where, on_key, fault), each_allowed in allowed_of.items():
+            allowed = " ".join(dict.fromkeys(words for words in each_allowed if words))
+            self._problems.append(self._problem_at(where, f"{fault}. {allowed}" if allowed else fault, on_key=on_key))
+        self._faulty.update(where for where, _on_key, _fault in allowed_of)
 
     def _locate(self, error: ValidationError) -> list[tuple[Where, bool, Any]]:
         """Return pydantic's errors, each with its place, and True if it is about the key there."""
@@ -245,10 +253,11 @@ class Document:
         for each in error.errors(include_url=False):
             where, on_key = self._place_of(each["loc"], missing=each["type"] == "missing")
             errors.append((where, on_key or each["type"] == "extra_forbidden", each))
-        # A type error of a union's member is noise if another member has reported faults inside the value.
-        inner = {where[:depth] for where, _, _ in errors for depth in range(len(where))}
-        inner |= {where for where, _, each in errors if not each["type"].endswith("_type")}
-        return [each for each in errors if each[0] not in inner or not each[2]["type"].endswith("_type")]
+        # A value of a union gets errors from each member. That it has the wrong type for one member is noise if another
+        # member accepts the type, and reports a fault inside the value or another fault of the value.
+        accepted = {where[:depth] for where, _, _ in errors for depth in range(len(where))}
+        accepted |= {where for where, _, each in errors if not each["type"].endswith("_type")}
+        return [each for each in errors if each[0] not in accepted or not each[2]["type"].endswith("_type")]
 
     def _place_of(self, loc: Sequence[str | int], *, missing: bool) -> tuple[Where, bool]:
         """Return the place of pydantic's loc (which also names members of unions), and True if it is that of a key."""
@@ -280,14 +289,14 @@ class Document:
     def _construct(self, where: Where, key: yaml.Mark | None, node: yaml.Node) -> Any:
         """Return plain data with all aliases expanded. Raises BadFile if it has too many values or levels."""
         self._places[where] = (key, node)
-        self._values += 1
-        if self._values > MAX_YAML_VALUES or len(where) > MAX_YAML_DEPTH:
-            much = (
+        self._value_count += 1
+        if self._value_count > MAX_YAML_VALUES or len(where) > MAX_YAML_DEPTH:
+            excess = (
                 f"nested more than {MAX_YAML_DEPTH} deep"
                 if len(where) > MAX_YAML_DEPTH
                 else f"more than {MAX_YAML_VALUES} values"
             )
-            raise BadFile(self.source, [self._problem_at(where[:3], f"{much}, aliases written out", on_key=True)])
+            raise BadFile(self.source, [self._problem_at(where[:3], f"{excess}, aliases written out", on_key=True)])
         if isinstance(node, yaml.ScalarNode):
             return self._construct_scalar(where, node)
         assert isinstance(node, yaml.CollectionNode)
@@ -331,8 +340,10 @@ class Document:
                 self.report(where, f"{text} is not a finite number")
             elif isinstance(value, int) and abs(value) > _MAX_INTEGER:
                 self.report(where, f"{text} is too large a number")
-            elif value is None and node.end_mark.buffer is not None:
-                if color := _COLOR_COMMENT.match(node.end_mark.buffer, node.end_mark.pointer - 1):
+            elif value is None:
+                # After `color:`, a color without quotes is a comment. So the value seems to be missing.
+                mark = node.end_mark
+                if mark.buffer is not None and (color := _COLOR_COMMENT.match(mark.buffer, mark.pointer - 1)):
                     self.report(where, _quote_color(color[1]))
             else:
                 return value

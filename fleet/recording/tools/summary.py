@@ -173,7 +173,7 @@ class _Span:
         return self._before_ns + (self._run[1] - self._run[0] if self._run is not None else 0)
 
 
-def growing(session: Session) -> Callable[[], bool]:
+def growth_check(session: Session) -> Callable[[], bool]:
     """Return a function that returns whether an unclosed session has grown since. It waits up to MAX_GROWTH_WAIT_S."""
     began, before = time.monotonic(), _size(session.segments)
 

@@ -51,13 +51,13 @@ Progress = Callable[[Iterable[Row]], Iterable[Row]]
 """Passes messages through and shows the progress."""
 
 
-def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int, str]:
+def recover(session: Session, out: Path, with_progress: Progress = iter) -> tuple[int, str]:
     """Write every intact message, attachment and metadata record to a new session.
 
     Return the number of messages, and the losses in words. Raises Exists, OSError, and NoSession if none is intact.
     """
     with atomic_directory(out) as new:
-        count = _copy(watched(session.rows()), new, session)
+        count = _copy(with_progress(session.rows()), new, session)
         # Get the damage after reading, because then it names the lost times. A check of all CRCs would add nothing.
         words = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
@@ -94,7 +94,9 @@ def _sum(counts: Iterable[object]) -> int | None:
     return total
 
 
-def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Progress = iter) -> int:
+def cut(
+    session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), with_progress: Progress = iter
+) -> int:
     """Write a part to a new session, and return its number of messages. With `cars`: messages of these and of services.
 
     Raises Exists, OSError, and NoSession if the part is empty.
@@ -108,7 +110,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
                 yield row
 
     with atomic_directory(out) as new:
-        count = _copy(watched(part()), new, session)
+        count = _copy(with_progress(part()), new, session)
         lost = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
             raise NoSession(f"{session.path} has no messages there")
@@ -119,7 +121,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
     return count
 
 
-def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> tuple[int, int, str]:
+def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter) -> tuple[int, int, str]:
     """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
 
     A message that several recorders received is written once. It is recognized by its key, number, publish time and
@@ -151,7 +153,7 @@ def merge(sessions: Sequence[Session], out: Path, watched: Progress = iter) -> t
 
     with atomic_directory(out) as new:
         extras = [extra for each in sessions for extra in each.extras()]
-        count = _copy(watched(once()), new, sessions[0], extras)
+        count = _copy(with_progress(once()), new, sessions[0], extras)
         named = zip(sessions, counts, strict=True)
         lost = "; ".join(f"{each.name}: {words}" for each, own in named if (words := _losses(each, own)))
         if not count:

@@ -233,13 +233,13 @@ def _owner(key: str) -> str:
 
 def verify(
     session: Session,
-    watched: Callable[[Iterable[Row]], Iterable[Row]] = iter,
+    with_progress: Callable[[Iterable[Row]], Iterable[Row]] = iter,
     recording: Callable[[], bool] = lambda: False,
 ) -> SessionVerdict:
-    """Verify every byte and message. `watched` shows the progress; `recording` is called at the end."""
+    """Verify every byte and message. `with_progress` shows the progress; `recording` is called at the end."""
     verdict = SessionVerdict(str(session.path))
     verifier = _Verifier(verdict)
-    for row in watched(session.rows()):
+    for row in with_progress(session.rows()):
         verifier.add(row)
     verifier.end()
     read = dict(session.damage)

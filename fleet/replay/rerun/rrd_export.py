@@ -111,12 +111,12 @@ def export(
     part: Part = WHOLE_SESSION,
     *,
     tab: str = "",
-    seen: Callable[[int], None] = lambda _: None,
+    on_read: Callable[[int], None] = lambda _: None,
 ) -> Replayed:
     """Write `out`, and return which messages it shows.
 
     Raises OSError, ExportFailed, and NoSession if there is no message of a fleet. tab: the car whose tab is in front.
-    seen: called with the number of messages read since the last call.
+    on_read: called with the number of messages read since the last call.
     """
     whole = part == WHOLE_SESSION
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
@@ -127,7 +127,7 @@ def export(
         if prepared is not None:
             readers = [part.reader(segment) for segment in prepared.files]
             try:
-                replayed = _write(session, rrd, out, prepared, readers, part, tab, seen)
+                replayed = _write(session, rrd, out, prepared, readers, part, tab, on_read)
             except _SchemaRefused as error:
                 refused.add(error.name)
         while replayed is None:
@@ -141,7 +141,7 @@ def export(
                 raise NoSession(f"{session.path} has no intact message{part.words}{damage}")
             readers = [WHOLE_SESSION.reader(each) for each in copies.files]
             try:
-                replayed = _write(session, rrd, out, copies, readers, part, tab, seen, final=True)
+                replayed = _write(session, rrd, out, copies, readers, part, tab, on_read, final=True)
             except _SchemaRefused as error:
                 if error.name in refused:
                     raise ExportFailed(f"Rerun cannot read {session.path}: {error}") from None
@@ -158,7 +158,7 @@ def _write(
     readers: list[rrc.McapReader],
     part: Part,
     tab: str,
-    seen: Callable[[int], None],
+    on_read: Callable[[int], None],
     *,
     final: bool = False,
 ) -> Replayed | None:
@@ -166,7 +166,7 @@ def _write(
     drawing = Drawing(car_colors=read_colors(session.path / FLEET_FILE))
     tally = _Tally()
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
-    stream = rrc.LazyChunkStream.from_iter(drawing.follow(tally.follow(stream, seen))).lenses(
+    stream = rrc.LazyChunkStream.from_iter(drawing.follow(tally.follow(stream, on_read))).lenses(
         lenses(), output_mode="forward_all"
     )
     # Only a file that a recording stream writes has a layout. The layout is sent last, because it depends on all
@@ -227,7 +227,7 @@ class _Tally:
         self._keys: dict[str, set[str]] = {}
         """Keys by entity. Keys that differ only in unusual characters may have the same entity in Rerun."""
 
-    def follow(self, chunks: Iterable[rrc.Chunk], seen: Callable[[int], None]) -> Iterator[rrc.Chunk]:
+    def follow(self, chunks: Iterable[rrc.Chunk], on_read: Callable[[int], None]) -> Iterator[rrc.Chunk]:
         """Pass on chunks and count their messages."""
         for chunk in chunks:
             names = chunk.to_record_batch().schema.names
@@ -242,7 +242,7 @@ class _Tally:
                 self._keys.setdefault(chunk.entity_path, set()).update(topic)
             yield chunk
             if not chunk.is_static:
-                seen(chunk.num_rows)
+                on_read(chunk.num_rows)
 
     def compare(self, prepared: Prepared) -> tuple[Replayed, Counter[str]]:
         """Return what became of the recorded messages, and how many Rerun did not yield, by key."""

@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 from fleet.cli import cli
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
-from fleet.recording.tools.summary import SessionState, growing, overview
+from fleet.recording.tools.summary import SessionState, growth_check, overview
 from fleet.recording.writing.segment_writer import Segment
 
 START = 1_790_000_000_000_000_000
@@ -117,7 +117,7 @@ def test_session_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
     assert "is being recorded, nothing is missing so far" in result.output
     assert "damage" not in result.output
     assert result.exit_code == 0
-    assert not growing(Session(path))()
+    assert not growth_check(Session(path))()
     killed = run("verify", path)
     assert killed.exit_code == 1
     assert "the recorder did not close it" in killed.output

@@ -281,7 +281,7 @@ def test_ctrl_c_does_not_blame_the_recording(
         monkeypatch.setattr(lenses, "_words", interrupt)
     with pytest.raises(KeyboardInterrupt):
         rrd_export.export(
-            Session(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
+            Session(made[0]), tmp_path / "out.rrd", on_read=interrupt if where == "between chunks" else lambda _: None
         )
     assert list(tmp_path.iterdir()) == []
 
